@@ -1,0 +1,293 @@
+//! One CAN frame of any kind, laid out as the kernel lays it out.
+//!
+//! ```text
+//!   struct can_frame, 16 bytes                     struct canfd_frame, 72 bytes
+//!   byte 0..3  identifier and flags, host order    byte 0..3   the same
+//!        4     length 0..=8                             4      length 0..=64
+//!        5     padding                                  5      flags: 1 BRS, 2 ESI, 4 FDF
+//!        6     reserved (embedded bus: 1 = own)         6      reserved (embedded bus: 1 = own)
+//!        7     raw DLC 9..=15 or 0                      7      reserved
+//!        8..15 data                                     8..71  data
+//! ```
+
+use thiserror::Error;
+
+/// Set in an identifier of 29 bits.
+pub const EXTENDED: u32 = 0x8000_0000;
+/// Set in a remote frame.
+pub const REMOTE: u32 = 0x4000_0000;
+/// Set in an error frame, which is a message of the driver and never was on the wire.
+pub const ERROR: u32 = 0x2000_0000;
+/// The bits of an 11-bit identifier.
+pub const STANDARD_MASK: u32 = 0x7FF;
+/// The bits of a 29-bit identifier.
+pub const EXTENDED_MASK: u32 = 0x1FFF_FFFF;
+
+/// FD flag: the data phase ran at the data bit rate.
+pub const BIT_RATE_SWITCH: u8 = 1;
+/// FD flag: the sender is error passive.
+pub const ERROR_STATE: u8 = 2;
+/// FD flag: "this is an FD frame"; kernels set it from 6.1 on.
+pub const FD_FORMAT: u8 = 4;
+
+/// Bytes of `struct can_frame`.
+pub const CLASSIC_BYTES: usize = 16;
+/// Bytes of `struct canfd_frame`.
+pub const FD_BYTES: usize = 72;
+
+/// Classic CAN or CAN FD.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum Format {
+    /// Up to 8 bytes, one bit rate.
+    Classic,
+    /// Up to 64 bytes, and a faster data phase when the bit rate switches.
+    Fd,
+}
+
+/// A CAN frame: data, remote or error; classic or FD.
+#[derive(Clone, Copy, Eq, Hash, PartialEq)]
+pub struct Frame {
+    id: u32,
+    format: Format,
+    flags: u8,
+    raw_dlc: u8,
+    len: u8,
+    data: [u8; 64],
+}
+
+/// Bytes that are no frame of the kernel's.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum FrameError {
+    /// Neither `struct can_frame` nor `struct canfd_frame`.
+    #[error("{got} bytes are no CAN frame: a classic one has 16, an FD one 72")]
+    Size {
+        /// Bytes that came.
+        got: usize,
+    },
+    /// More data than the format carries.
+    #[error("{got} data bytes do not fit: at most {max}")]
+    Length {
+        /// Bytes wanted.
+        got: usize,
+        /// Bytes that fit.
+        max: usize,
+    },
+}
+
+impl Frame {
+    /// A classic data frame. `id` carries the flag [`EXTENDED`] for 29 bits.
+    ///
+    /// # Errors
+    /// When there are more than 8 bytes.
+    pub fn classic(id: u32, data: &[u8]) -> Result<Self, FrameError> {
+        Self::with_data(id, Format::Classic, 0, data)
+    }
+
+    /// An FD data frame with the given FD flags; the FDF flag is set as the kernel sets it.
+    ///
+    /// # Errors
+    /// When there are more than 64 bytes.
+    pub fn fd(id: u32, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
+        Self::with_data(id, Format::Fd, flags | FD_FORMAT, data)
+    }
+
+    /// A frame with every field given; what captures are read into.
+    ///
+    /// # Errors
+    /// When the data does not fit the format.
+    pub fn with_data(id: u32, format: Format, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
+        let max = match format {
+            Format::Classic => 8,
+            Format::Fd => 64,
+        };
+        let too_long = FrameError::Length { got: data.len(), max };
+        let mut frame = Self { id, format, flags, raw_dlc: 0, len: 0, data: [0; 64] };
+        frame.len = u8::try_from(data.len()).ok().filter(|&len| usize::from(len) <= max).ok_or(too_long)?;
+        frame.data.get_mut(..data.len()).ok_or(too_long)?.copy_from_slice(data);
+        Ok(frame)
+    }
+
+    /// A remote frame that asks for `len` bytes.
+    ///
+    /// # Errors
+    /// When more than 8 bytes are asked for.
+    pub fn remote(id: u32, len: u8) -> Result<Self, FrameError> {
+        if len > 8 {
+            return Err(FrameError::Length { got: usize::from(len), max: 8 });
+        }
+        let mut frame = Self::with_data(id | REMOTE, Format::Classic, 0, &[])?;
+        frame.len = len;
+        Ok(frame)
+    }
+
+    /// The same classic frame with the DLC as it was on the wire (9 to 15, when the length is 8).
+    #[must_use]
+    pub const fn with_raw_dlc(mut self, raw_dlc: u8) -> Self {
+        self.raw_dlc = raw_dlc;
+        self
+    }
+
+    /// Identifier and flags, as the kernel keeps them in one word.
+    #[must_use]
+    pub const fn raw_id(&self) -> u32 {
+        self.id
+    }
+
+    /// The identifier without its flags.
+    #[must_use]
+    pub const fn id(&self) -> u32 {
+        if self.is_extended() || self.is_error() { self.id & EXTENDED_MASK } else { self.id & STANDARD_MASK }
+    }
+
+    /// Whether the identifier has 29 bits.
+    #[must_use]
+    pub const fn is_extended(&self) -> bool {
+        self.id & EXTENDED != 0
+    }
+
+    /// Whether this asks for data instead of bringing it.
+    #[must_use]
+    pub const fn is_remote(&self) -> bool {
+        self.id & REMOTE != 0
+    }
+
+    /// Whether this is the driver's report of an error.
+    #[must_use]
+    pub const fn is_error(&self) -> bool {
+        self.id & ERROR != 0
+    }
+
+    /// Classic or FD.
+    #[must_use]
+    pub const fn format(&self) -> Format {
+        self.format
+    }
+
+    /// The FD flags; 0 in a classic frame.
+    #[must_use]
+    pub const fn flags(&self) -> u8 {
+        self.flags
+    }
+
+    /// The DLC as it was on the wire, when it said 9 to 15 for 8 bytes; else 0.
+    #[must_use]
+    pub const fn raw_dlc(&self) -> u8 {
+        self.raw_dlc
+    }
+
+    /// How many bytes it carries, or asks for when remote.
+    #[must_use]
+    pub const fn len(&self) -> u8 {
+        self.len
+    }
+
+    /// Whether it carries nothing.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The bytes it carries; none in a remote frame.
+    #[must_use]
+    pub fn data(&self) -> &[u8] {
+        let len = if self.is_remote() { 0 } else { usize::from(self.len) };
+        self.data.get(..len).unwrap_or_default()
+    }
+
+    /// The kernel's struct; only the first [`Frame::byte_len`] bytes are its own.
+    #[must_use]
+    pub fn to_bytes(&self) -> [u8; FD_BYTES] {
+        let [a, b, c, d] = self.id.to_ne_bytes();
+        let mut bytes = [0; FD_BYTES];
+        let (head, data) = bytes.split_at_mut(8);
+        let (flags, dlc) = match self.format {
+            Format::Classic => (0, self.raw_dlc),
+            Format::Fd => (self.flags, 0),
+        };
+        head.copy_from_slice(&[a, b, c, d, self.len, flags, 0, dlc]);
+        data.copy_from_slice(&self.data);
+        bytes
+    }
+
+    /// How many bytes the kernel's struct has: 16 or 72.
+    #[must_use]
+    pub const fn byte_len(&self) -> usize {
+        match self.format {
+            Format::Classic => CLASSIC_BYTES,
+            Format::Fd => FD_BYTES,
+        }
+    }
+
+    /// Reads the kernel's struct. Never panics.
+    ///
+    /// # Errors
+    /// When the size is that of neither struct, or the length byte is above what the format carries.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, FrameError> {
+        let format = match bytes.len() {
+            CLASSIC_BYTES => Format::Classic,
+            FD_BYTES => Format::Fd,
+            got => return Err(FrameError::Size { got }),
+        };
+        let Some((&[a, b, c, d, len, flags, _reserved, dlc], data)) = bytes.split_first_chunk() else {
+            return Err(FrameError::Size { got: bytes.len() });
+        };
+        let got = usize::from(len);
+        let body = data.get(..got).ok_or(FrameError::Length { got, max: data.len() })?;
+        let id = u32::from_ne_bytes([a, b, c, d]);
+        match format {
+            Format::Classic => Self::with_data(id, format, 0, body).map(|frame| frame.with_raw_dlc(dlc)),
+            Format::Fd => Self::with_data(id, format, flags, body),
+        }
+    }
+}
+
+impl core::fmt::Debug for Frame {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        crate::candump::write_frame(f, self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn the_layout_is_the_kernels() {
+        let frame = Frame::fd(0x22C, BIT_RATE_SWITCH, &[0xAA, 0xBB]).unwrap();
+        let bytes = frame.to_bytes();
+        assert_eq!(bytes[..4], 0x22C_u32.to_ne_bytes());
+        assert_eq!(bytes[4..10], [2, BIT_RATE_SWITCH | FD_FORMAT, 0, 0, 0xAA, 0xBB]);
+        assert_eq!(frame.byte_len(), 72);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused() {
+        assert_eq!(Frame::classic(1, &[0; 9]), Err(FrameError::Length { got: 9, max: 8 }));
+        assert_eq!(Frame::fd(1, 0, &[0; 65]), Err(FrameError::Length { got: 65, max: 64 }));
+        assert_eq!(Frame::from_bytes(&[0; 12]), Err(FrameError::Size { got: 12 }));
+        let mut bytes = [0; CLASSIC_BYTES];
+        bytes[4] = 9;
+        assert_eq!(Frame::from_bytes(&bytes), Err(FrameError::Length { got: 9, max: 8 }));
+    }
+
+    proptest! {
+        #[test]
+        fn every_frame_comes_back(id: u32, fd: bool, flags in 0_u8..8, dlc in 9_u8..16, data in proptest::collection::vec(any::<u8>(), 0..=64)) {
+            let id = id & !REMOTE;
+            let frame = if fd {
+                Frame::with_data(id, Format::Fd, flags, &data).unwrap()
+            } else {
+                let data = &data[..data.len().min(8)];
+                Frame::classic(id, data).unwrap().with_raw_dlc(if data.len() == 8 { dlc } else { 0 })
+            };
+            prop_assert_eq!(Frame::from_bytes(&frame.to_bytes()[..frame.byte_len()]), Ok(frame));
+        }
+
+        #[test]
+        fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
+            let _ = Frame::from_bytes(&bytes);
+        }
+    }
+}

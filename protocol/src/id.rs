@@ -1,0 +1,298 @@
+//! Who speaks, and of what: the eleven bits of an identifier.
+//!
+//! ```text
+//!   bit   10 9 8 | 7 6 5 4 3 2 1 0
+//!          kind  |  node, or what is commanded
+//! ```
+//!
+//! Identifiers are fixed per cell and kind, so that a kernel filter matches exactly one of them. The
+//! lower identifier wins arbitration: halt, joints, sums and torques come first.
+
+use thiserror::Error;
+
+/// The number of a cell on its bus, 1 to 254; 0 is the gateway and 255 is everyone.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct CellId(u8);
+
+/// A number that is no cell's.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[error("{got} is no cell number: 1 to {max} are (0 is the gateway, 255 everyone)", max = CellId::MAX.0)]
+pub struct CellIdOutOfRange {
+    /// The number that was asked for.
+    pub got: i64,
+}
+
+impl CellId {
+    /// The greatest cell number.
+    pub const MAX: Self = Self(254);
+    /// How many cells a bus can have.
+    pub const COUNT: usize = 254;
+
+    /// The cell with this number.
+    ///
+    /// # Errors
+    /// When the number is not in 1..=254.
+    pub fn new(number: i64) -> Result<Self, CellIdOutOfRange> {
+        match u8::try_from(number) {
+            Ok(number @ 1..=254) => Ok(Self(number)),
+            _ => Err(CellIdOutOfRange { got: number }),
+        }
+    }
+
+    /// The number.
+    #[must_use]
+    pub const fn get(self) -> u8 {
+        self.0
+    }
+
+    /// Where this cell stands in a table of all cells of a bus: 0 to 253.
+    #[must_use]
+    pub const fn index(self) -> usize {
+        self.0 as usize - 1
+    }
+
+    /// All cell numbers, in order.
+    pub fn all() -> impl Iterator<Item = Self> {
+        (1..=Self::MAX.0).map(Self)
+    }
+}
+
+impl core::fmt::Display for CellId {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// Whom the node field names.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum Node {
+    /// 0.
+    Gateway,
+    /// 1 to 254.
+    Cell(CellId),
+    /// 255.
+    Everyone,
+}
+
+impl Node {
+    /// Whom a node field names.
+    #[must_use]
+    pub const fn from_byte(byte: u8) -> Self {
+        match byte {
+            0 => Self::Gateway,
+            255 => Self::Everyone,
+            number => Self::Cell(CellId(number)),
+        }
+    }
+
+    /// The node field.
+    #[must_use]
+    pub const fn to_byte(self) -> u8 {
+        match self {
+            Self::Gateway => 0,
+            Self::Cell(cell) => cell.0,
+            Self::Everyone => 255,
+        }
+    }
+
+    /// Whether `cell` is meant.
+    #[must_use]
+    pub fn names(self, cell: CellId) -> bool {
+        self == Self::Cell(cell) || self == Self::Everyone
+    }
+}
+
+impl core::fmt::Display for Node {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::Gateway => f.pad("gateway"),
+            Self::Cell(cell) => cell.fmt(f),
+            Self::Everyone => f.pad("everyone"),
+        }
+    }
+}
+
+/// What a packet is about.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+#[repr(u8)]
+pub enum Kind {
+    /// From the gateway's side to everyone; the node field says what is commanded.
+    Command = 0,
+    /// A partial sum of torques.
+    Sum = 1,
+    /// One cell's own torque.
+    Torque = 2,
+    /// What a cell measures.
+    Sensors = 3,
+    /// Heartbeat, counters, tree.
+    Network = 4,
+    /// Writes or reads a parameter of a cell.
+    Configure = 5,
+    /// A cell's answer to that.
+    Configured = 6,
+    /// What a cell shall feel.
+    Stimulus = 7,
+}
+
+impl Kind {
+    /// All kinds, by number.
+    pub const ALL: [Self; 8] = [
+        Self::Command,
+        Self::Sum,
+        Self::Torque,
+        Self::Sensors,
+        Self::Network,
+        Self::Configure,
+        Self::Configured,
+        Self::Stimulus,
+    ];
+
+    /// The kind's name, as every table and every error prints it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Command => "command",
+            Self::Sum => "sum",
+            Self::Torque => "torque",
+            Self::Sensors => "sensors",
+            Self::Network => "network",
+            Self::Configure => "configure",
+            Self::Configured => "configured",
+            Self::Stimulus => "stimulus",
+        }
+    }
+
+    const fn from_bits(bits: u16) -> Self {
+        match bits & 7 {
+            0 => Self::Command,
+            1 => Self::Sum,
+            2 => Self::Torque,
+            3 => Self::Sensors,
+            4 => Self::Network,
+            5 => Self::Configure,
+            6 => Self::Configured,
+            _ => Self::Stimulus,
+        }
+    }
+}
+
+/// What a command packet commands: the node field of kind 0.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+#[repr(u8)]
+pub enum Command {
+    /// Stop answering until [`Command::Resume`].
+    Halt = 0,
+    /// The joint positions of a new epoch.
+    Joints = 1,
+    /// Answer with a heartbeat when all that the last joints asked for is done.
+    Sync = 2,
+    /// Leave the halted state.
+    Resume = 3,
+    /// Answer with the pages of counters.
+    Report = 4,
+}
+
+impl Command {
+    /// All commands, by number.
+    pub const ALL: [Self; 5] = [Self::Halt, Self::Joints, Self::Sync, Self::Resume, Self::Report];
+
+    /// The command with this number, if there is one.
+    #[must_use]
+    pub const fn from_byte(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Halt),
+            1 => Some(Self::Joints),
+            2 => Some(Self::Sync),
+            3 => Some(Self::Resume),
+            4 => Some(Self::Report),
+            _ => None,
+        }
+    }
+
+    /// The command's name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Halt => "halt",
+            Self::Joints => "joints",
+            Self::Sync => "sync",
+            Self::Resume => "resume",
+            Self::Report => "report",
+        }
+    }
+}
+
+/// An 11-bit identifier: the kind and the node field.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct Id {
+    /// What it is about.
+    pub kind: Kind,
+    /// The node field; in a command, what is commanded.
+    pub node: u8,
+}
+
+impl Id {
+    /// The identifier of a command.
+    #[must_use]
+    pub const fn command(command: Command) -> Self {
+        Self { kind: Kind::Command, node: command as u8 }
+    }
+
+    /// The identifier of a packet from or to a node.
+    #[must_use]
+    pub const fn new(kind: Kind, node: Node) -> Self {
+        Self { kind, node: node.to_byte() }
+    }
+
+    /// The eleven bits.
+    #[must_use]
+    pub const fn to_bits(self) -> u16 {
+        ((self.kind as u16) << 8) | self.node as u16
+    }
+
+    /// Reads eleven bits; what is above them is ignored.
+    #[must_use]
+    pub const fn from_bits(bits: u16) -> Self {
+        let [node, _] = bits.to_le_bytes();
+        Self { kind: Kind::from_bits(bits >> 8), node }
+    }
+}
+
+impl core::fmt::Display for Id {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "{:03X}", self.to_bits())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_2048_identifiers_come_back() {
+        for bits in 0..0x800 {
+            assert_eq!(Id::from_bits(bits).to_bits(), bits);
+        }
+    }
+
+    #[test]
+    fn halt_wins_arbitration_then_joints_then_torques_and_stimuli_lose() {
+        let cell = Node::Cell(CellId::new(1).unwrap());
+        let order = [
+            Id::command(Command::Halt),
+            Id::command(Command::Joints),
+            Id::new(Kind::Sum, cell),
+            Id::new(Kind::Torque, cell),
+            Id::new(Kind::Stimulus, cell),
+        ];
+        assert!(order.is_sorted_by_key(|id| id.to_bits()));
+    }
+
+    #[test]
+    fn cell_numbers_are_1_to_254() {
+        assert_eq!(CellId::all().count(), CellId::COUNT);
+        assert!(CellId::all().all(|cell| Node::from_byte(cell.get()) == Node::Cell(cell)));
+        let error = CellId::new(255).unwrap_err().to_string();
+        assert_eq!(error, "255 is no cell number: 1 to 254 are (0 is the gateway, 255 everyone)");
+    }
+}

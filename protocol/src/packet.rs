@@ -1,0 +1,327 @@
+//! The packet: sixteen bytes in one CAN FD frame, or in two classic frames.
+//!
+//! ```text
+//!   byte   0   1   2   3   4   5   6   7   8   9  10  11    12     13     14  15
+//!        +---+---+---+---+---+---+---+---+---+---+---+---+-------+-------+---+---+
+//!        | word0 | word1 | word2 | word3 | word4 | word5 | epoch | count |  CRC  |
+//!        +---+---+---+---+---+---+---+---+---+---+---+---+-------+-------+---+---+
+//!          six i16, little endian                                          little endian
+//!          '---- first classic frame ----' '---- second classic frame -----------'
+//! ```
+//!
+//! The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF, nothing reflected, no final
+//! XOR) over the identifier as two bytes, little endian, and bytes 0 to 13. The identifier is in it so
+//! that a packet which arrives under another cell's name is refused.
+
+use thiserror::Error;
+
+use crate::can::{self, Format, Frame};
+use crate::id::Id;
+use crate::time::{Micros, Span};
+
+/// CRC-16/CCITT-FALSE, which the catalogue of CRCs calls IBM-3740.
+const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_IBM_3740);
+
+/// Words in a packet; joints that a robot can have.
+pub const WORDS: usize = 6;
+/// Bytes in a packet.
+pub const BYTES: usize = 16;
+/// Bytes in each of its two classic frames.
+const HALF_BYTES: usize = BYTES / 2;
+
+/// The CRC of this protocol over some bytes.
+#[must_use]
+pub fn crc16(bytes: &[u8]) -> u16 {
+    CRC.checksum(bytes)
+}
+
+/// The number of a joint broadcast, modulo 256.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub struct Epoch(pub u8);
+
+impl Epoch {
+    /// The epoch after this one.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        self.plus(1)
+    }
+
+    /// The epoch `steps` later.
+    #[must_use]
+    pub const fn plus(self, steps: u8) -> Self {
+        Self(self.0.wrapping_add(steps))
+    }
+
+    /// How many epochs this one comes after `earlier`, in [-128, 127].
+    #[must_use]
+    pub const fn since(self, earlier: Self) -> i8 {
+        self.0.wrapping_sub(earlier.0).cast_signed()
+    }
+}
+
+impl core::fmt::Display for Epoch {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// A packet whose CRC was right; what its words mean is [`crate::message`]'s business.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub struct Packet {
+    /// Kind and node.
+    pub id: Id,
+    /// Six words of 16 bits.
+    pub words: [i16; WORDS],
+    /// The joint broadcast it belongs to.
+    pub epoch: Epoch,
+    /// Cells whose torque is in the words, or what the kind says.
+    pub count: u8,
+}
+
+/// Why a frame is not a packet.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum PacketError {
+    /// A 29-bit identifier, a remote frame or an error frame.
+    #[error("not a data frame with an 11-bit identifier")]
+    Foreign,
+    /// Wrong length.
+    #[error("{got} data bytes, not {expected}")]
+    Length {
+        /// Bytes that the format has.
+        expected: usize,
+        /// Bytes that came.
+        got: usize,
+    },
+    /// Wrong checksum.
+    #[error("CRC {got:04X}, not {expected:04X}")]
+    Crc {
+        /// What the bytes give.
+        expected: u16,
+        /// What the packet says.
+        got: u16,
+    },
+}
+
+impl Packet {
+    /// The sixteen bytes.
+    #[must_use]
+    pub fn encode(&self) -> [u8; BYTES] {
+        let mut bytes = [0; BYTES];
+        let (words, tail) = bytes.as_chunks_mut::<2>().0.split_at_mut(WORDS);
+        for (bytes, word) in words.iter_mut().zip(self.words) {
+            *bytes = word.to_le_bytes();
+        }
+        if let [end, crc] = tail {
+            *end = [self.epoch.0, self.count];
+            *crc = checksum(self.id, words, *end).to_le_bytes();
+        }
+        bytes
+    }
+
+    /// Reads sixteen bytes that came under `id`. Never panics.
+    ///
+    /// # Errors
+    /// When the length or the CRC is wrong.
+    pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
+        let length = PacketError::Length { expected: BYTES, got: bytes.len() };
+        let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| length)?;
+        let (chunks, _) = bytes.as_chunks::<2>();
+        let [words @ .., end, crc] = chunks else {
+            return Err(length);
+        };
+        let (expected, got) = (checksum(id, words, *end), u16::from_le_bytes(*crc));
+        if expected != got {
+            return Err(PacketError::Crc { expected, got });
+        }
+        let mut packet = Self { id, words: [0; WORDS], epoch: Epoch(end[0]), count: end[1] };
+        for (word, bytes) in packet.words.iter_mut().zip(words) {
+            *word = i16::from_le_bytes(*bytes);
+        }
+        Ok(packet)
+    }
+
+    /// The frames that carry this packet: one FD frame with bit-rate switch, or two classic ones.
+    pub fn frames(&self, format: Format) -> impl Iterator<Item = Frame> + use<> {
+        let id = u32::from(self.id.to_bits());
+        let bytes = self.encode();
+        let (first, second) = match format {
+            Format::Fd => (Frame::fd(id, can::BIT_RATE_SWITCH, &bytes).ok(), None),
+            Format::Classic => {
+                let (head, tail) = bytes.split_at(HALF_BYTES);
+                (Frame::classic(id, head).ok(), Frame::classic(id, tail).ok())
+            }
+        };
+        first.into_iter().chain(second)
+    }
+
+    /// Reads an FD frame. Never panics.
+    ///
+    /// # Errors
+    /// When it is not an FD data frame with an 11-bit identifier, or not a packet.
+    pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
+        if frame.format() != Format::Fd {
+            return Err(PacketError::Length { expected: BYTES, got: frame.data().len() });
+        }
+        Self::decode(data_id(frame)?, frame.data())
+    }
+}
+
+/// The identifier of a frame that could be one of ours.
+///
+/// # Errors
+/// When it is a remote or error frame, or has a 29-bit identifier.
+pub fn data_id(frame: &Frame) -> Result<Id, PacketError> {
+    if frame.is_extended() || frame.is_remote() || frame.is_error() {
+        return Err(PacketError::Foreign);
+    }
+    u16::try_from(frame.id()).map(Id::from_bits).map_err(|_| PacketError::Foreign)
+}
+
+fn checksum(id: Id, words: &[[u8; 2]], end: [u8; 2]) -> u16 {
+    let mut digest = CRC.digest();
+    digest.update(&id.to_bits().to_le_bytes());
+    digest.update(words.as_flattened());
+    digest.update(&end);
+    digest.finalize()
+}
+
+/// What became of a classic frame.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Paired {
+    /// A first half; its second one is awaited.
+    Waiting,
+    /// Both halves were there and the CRC is right.
+    Whole(Packet),
+    /// Two halves that do not belong together, or a first half that waited too long: the older half
+    /// is dropped, and the newer one is now the first.
+    Incomplete,
+}
+
+/// The waiting first half of a packet in two classic frames, one of these per identifier.
+///
+/// Halves come in order and within [`Half::WITHIN`] of each other. When the CRC of a pair fails, only
+/// the older half is dropped, so that a lost frame costs one packet and not every later one.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Half {
+    waiting: Option<([u8; 8], Micros)>,
+}
+
+impl Half {
+    /// The longest time between the two halves.
+    pub const WITHIN: Span = Span::from_millis(4);
+
+    /// Nothing waiting.
+    pub const NONE: Self = Self { waiting: None };
+
+    /// Takes the next classic frame of this identifier.
+    ///
+    /// # Errors
+    /// When it does not carry 8 bytes; a waiting half keeps waiting.
+    pub fn push(&mut self, at: Micros, id: Id, data: &[u8]) -> Result<Paired, PacketError> {
+        let length = PacketError::Length { expected: HALF_BYTES, got: data.len() };
+        let data: [u8; 8] = data.try_into().map_err(|_| length)?;
+        let Some((older, since)) = self.waiting.replace((data, at)) else {
+            return Ok(Paired::Waiting);
+        };
+        if at.since(since) > Self::WITHIN {
+            return Ok(Paired::Incomplete);
+        }
+        let mut bytes = [0; BYTES];
+        let (head, tail) = bytes.split_at_mut(older.len());
+        head.copy_from_slice(&older);
+        tail.copy_from_slice(&data);
+        let Ok(packet) = Packet::decode(id, &bytes) else {
+            return Ok(Paired::Incomplete);
+        };
+        self.waiting = None;
+        Ok(Paired::Whole(packet))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::id::{Command, Kind};
+    use proptest::prelude::*;
+
+    fn packet() -> impl Strategy<Value = Packet> {
+        (0_u16..0x800, any::<[i16; WORDS]>(), any::<u8>(), any::<u8>()).prop_map(
+            |(id, words, epoch, count)| Packet { id: Id::from_bits(id), words, epoch: Epoch(epoch), count },
+        )
+    }
+
+    #[test]
+    fn the_crc_is_ccitt_false() {
+        assert_eq!(crc16(b"123456789"), 0x29B1, "the check value of the catalogue");
+    }
+
+    #[test]
+    fn epochs_are_compared_around_the_corner() {
+        assert_eq!(Epoch(2).since(Epoch(254)), 4);
+        assert_eq!(Epoch(254).since(Epoch(2)), -4);
+        assert_eq!(Epoch(255).next(), Epoch(0));
+    }
+
+    #[test]
+    fn a_lost_half_costs_one_packet() {
+        let id = Id::command(Command::Joints);
+        let make = |epoch| Packet { id, words: [7; WORDS], epoch: Epoch(epoch), count: 6 };
+        let halves = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
+        let mut half = Half::NONE;
+        let mut push = |at, frame: &Frame| half.push(Micros(at), id, frame.data()).unwrap();
+        assert_eq!(push(0, &halves(1)[0]), Paired::Waiting);
+        // The second half of epoch 1 is lost.
+        assert_eq!(push(1_000, &halves(2)[0]), Paired::Incomplete);
+        assert_eq!(push(1_100, &halves(2)[1]), Paired::Whole(make(2)));
+        assert_eq!(push(9_000, &halves(3)[0]), Paired::Waiting);
+        assert_eq!(push(13_001, &halves(3)[1]), Paired::Incomplete, "more than 4 ms apart");
+    }
+
+    #[test]
+    fn frames_of_other_kinds_are_foreign() {
+        let extended = Frame::fd(0x123 | can::EXTENDED, 0, &[0; 16]).unwrap();
+        assert_eq!(Packet::from_fd(&extended), Err(PacketError::Foreign));
+        assert_eq!(data_id(&Frame::remote(0x123, 8).unwrap()), Err(PacketError::Foreign));
+        let error = Frame::classic(can::ERROR | 4, &[0; 8]).unwrap();
+        assert_eq!(data_id(&error), Err(PacketError::Foreign));
+        let short = Frame::fd(0x123, 0, &[0; 12]).unwrap();
+        assert_eq!(Packet::from_fd(&short), Err(PacketError::Length { expected: 16, got: 12 }));
+    }
+
+    proptest! {
+        #[test]
+        fn a_packet_comes_back_from_either_format(packet in packet()) {
+            let fd: Vec<_> = packet.frames(Format::Fd).collect();
+            prop_assert_eq!(fd.len(), 1);
+            prop_assert_eq!(Packet::from_fd(&fd[0]), Ok(packet));
+            let mut half = Half::NONE;
+            let mut last = Paired::Waiting;
+            for frame in packet.frames(Format::Classic) {
+                last = half.push(Micros(0), packet.id, frame.data()).unwrap();
+            }
+            prop_assert_eq!(last, Paired::Whole(packet));
+        }
+
+        #[test]
+        fn a_packet_under_another_identifier_is_refused(packet in packet(), other in 0_u16..0x800) {
+            prop_assume!(other != packet.id.to_bits());
+            prop_assert!(Packet::decode(Id::from_bits(other), &packet.encode()).is_err());
+        }
+
+        #[test]
+        fn one_to_three_wrong_bits_are_always_noticed(packet in packet(), bits in proptest::collection::btree_set(0_usize..128, 1..=3)) {
+            let mut bytes = packet.encode();
+            for bit in bits {
+                bytes[bit / 8] ^= 1 << (bit % 8);
+            }
+            prop_assert!(Packet::decode(packet.id, &bytes).is_err());
+        }
+
+        #[test]
+        fn no_bytes_panic(kind in 0_u16..0x800, bytes in proptest::collection::vec(any::<u8>(), 0..70)) {
+            let _ = Packet::decode(Id::from_bits(kind), &bytes);
+            let _ = Half::default().push(Micros(0), Id { kind: Kind::Sum, node: 0 }, &bytes);
+        }
+    }
+}

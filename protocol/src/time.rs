@@ -1,0 +1,45 @@
+//! Points in time and lengths of time in whole microseconds, passed in by whoever has a clock.
+//!
+//! The cores never read a clock: a test, a simulation and a microcontroller each bring their own.
+
+use core::ops::{Add, Sub};
+
+/// A point in time: microseconds since a start that the caller chose.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct Micros(pub u64);
+
+/// A length of time in microseconds.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct Span(pub u64);
+
+impl Span {
+    /// A length given in milliseconds.
+    #[must_use]
+    pub const fn from_millis(millis: u64) -> Self {
+        Self(millis * 1_000)
+    }
+}
+
+impl Micros {
+    /// How long ago `earlier` was; nothing when it lies ahead.
+    #[must_use]
+    pub const fn since(self, earlier: Self) -> Span {
+        Span(self.0.saturating_sub(earlier.0))
+    }
+}
+
+impl Add<Span> for Micros {
+    type Output = Self;
+
+    fn add(self, span: Span) -> Self {
+        Self(self.0.saturating_add(span.0))
+    }
+}
+
+impl Sub<Span> for Micros {
+    type Output = Self;
+
+    fn sub(self, span: Span) -> Self {
+        Self(self.0.saturating_sub(span.0))
+    }
+}
