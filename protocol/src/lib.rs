@@ -3,9 +3,13 @@
 
 pub mod can;
 pub mod candump;
+#[cfg(feature = "host")]
+pub mod document;
 pub mod fixed;
 pub mod id;
 pub mod message;
 pub mod packet;
 pub mod parameters;
+#[cfg(feature = "host")]
+pub mod skin;
 pub mod time;

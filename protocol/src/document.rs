@@ -1,0 +1,136 @@
+//! Files that people write, in TOML, and what is said when something in them is wrong: one line that
+//! names the file, the line, the key, the value and what is allowed.
+//!
+//! What the file says is read into a plain struct (`serde`, unknown keys refused); a `check` function
+//! makes of it what it means, or a [`Fault`]. The file is read without positions, which is quick; only
+//! when something is wrong is it read again with them.
+
+use core::fmt;
+use std::path::Path;
+
+use serde::de::DeserializeOwned;
+use thiserror::Error;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+/// One step from the file's root to a value.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Step {
+    /// Into a table.
+    Key(&'static str),
+    /// Into an array, counted from 0.
+    Index(usize),
+}
+
+/// What is wrong with a value, and where it stands.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Fault {
+    path: Vec<Step>,
+    value: String,
+    why: String,
+}
+
+impl Fault {
+    /// The value at `path` cannot be, and why; an empty value is not printed.
+    #[must_use]
+    pub fn new(path: &[Step], value: impl fmt::Display, why: impl fmt::Display) -> Self {
+        Self { path: path.to_vec(), value: value.to_string(), why: why.to_string() }
+    }
+}
+
+impl fmt::Display for Fault {
+    /// `cell[3].joint = 9: the robot has joints 1 to 6`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, step) in self.path.iter().enumerate() {
+            match step {
+                Step::Key(key) if index == 0 => write!(f, "{key}")?,
+                Step::Key(key) => write!(f, ".{key}")?,
+                Step::Index(at) => write!(f, "[{at}]")?,
+            }
+        }
+        if !self.value.is_empty() {
+            write!(f, " = {}", self.value)?;
+        }
+        write!(f, ": {}", self.why)
+    }
+}
+
+/// What is wrong with a file.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum DocumentError {
+    /// It cannot be read.
+    #[error("{path}: {reason}")]
+    Unreadable {
+        /// The file.
+        path: String,
+        /// Why.
+        reason: String,
+    },
+    /// Something in it is wrong.
+    #[error("{path}:{line}: {what}")]
+    Wrong {
+        /// The file.
+        path: String,
+        /// The line, from 1.
+        line: usize,
+        /// The key, the value, and what is allowed.
+        what: String,
+    },
+}
+
+/// The text of a file.
+///
+/// # Errors
+/// When it cannot be read as UTF-8.
+pub fn text(path: &Path) -> Result<String, DocumentError> {
+    std::fs::read_to_string(path).map_err(|error| DocumentError::Unreadable {
+        path: path.display().to_string(),
+        reason: error.to_string(),
+    })
+}
+
+/// Reads a text and checks it; `path` is what errors call it.
+///
+/// # Errors
+/// The first thing that is wrong with it.
+pub fn parse<Raw: DeserializeOwned, T>(
+    path: &str,
+    text: &str,
+    check: impl FnOnce(Raw) -> Result<T, Fault>,
+) -> Result<T, DocumentError> {
+    let wrong = |line, what| DocumentError::Wrong { path: path.to_owned(), line, what };
+    let raw = deserialize(text).map_err(|(line, what)| wrong(line, what))?;
+    check(raw).map_err(|fault| wrong(line_of(text, &fault.path), fault.to_string()))
+}
+
+/// Parses a document; the error is a line and one line of text.
+fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
+    toml::from_str(text).map_err(|error| {
+        let line = error.span().map_or(1, |span| line_at(text, span.start));
+        (line, error.message().lines().collect::<Vec<_>>().join("; "))
+    })
+}
+
+/// The line of the value at the end of the path, or of the nearest thing above it that exists.
+fn line_of(text: &str, path: &[Step]) -> usize {
+    let Ok(root) = DeTable::parse(text) else { return 1 };
+    let mut at = root.span().start;
+    let mut table = Some(root.get_ref());
+    let mut value: Option<&Spanned<DeValue<'_>>> = None;
+    for step in path {
+        let next = match step {
+            Step::Key(key) => table.and_then(|table| table.get(*key)),
+            Step::Index(index) => value.and_then(|value| value.get_ref().as_array()?.get(*index)),
+        };
+        let Some(next) = next else { break };
+        at = next.span().start;
+        table = next.get_ref().as_table();
+        value = Some(next);
+    }
+    line_at(text, at)
+}
+
+fn line_at(text: &str, at: usize) -> usize {
+    text.get(..at).unwrap_or(text).matches('\n').count() + 1
+}

@@ -1,0 +1,238 @@
+//! The description of a skin: the robot, its buses, and where every cell sits.
+//!
+//! A [`Skin`] exists only when everything in its file has been checked. Every error names the line, the key, the value and what is
+//! allowed, in one line.
+
+mod check;
+mod raw;
+
+use std::path::Path;
+
+use crate::can::Format;
+use crate::document::{self, DocumentError};
+use crate::fixed::Q1_14;
+use crate::id::CellId;
+use crate::parameters::{Contact, Parameters, Pose, Row};
+
+/// A checked description.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Skin {
+    /// The skin's name.
+    pub name: String,
+    /// The robot that wears it.
+    pub robot: Robot,
+    /// How often things happen.
+    pub timing: Timing,
+    /// The buses, in the file's order.
+    pub buses: Vec<Bus>,
+    /// What turns torques into motion.
+    pub controller: Controller,
+    /// When torques are held, and when the robot is halted.
+    pub safety: Safety,
+    /// The cells, in the file's order.
+    pub cells: Vec<Cell>,
+}
+
+/// A chain of revolute joints.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Robot {
+    /// Its name.
+    pub name: String,
+    /// Standard Denavit-Hartenberg rows, base to tip; 1 to 6 of them.
+    pub joints: Vec<DenavitHartenberg>,
+    /// Least and greatest position of each joint in rad.
+    pub limits_rad: Vec<[f64; 2]>,
+}
+
+/// One row of the robot's table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DenavitHartenberg {
+    /// Length of the link in m.
+    pub a: f64,
+    /// Twist in rad.
+    pub alpha: f64,
+    /// Offset along the joint's axis in m.
+    pub d: f64,
+    /// What is added to the joint's position, in rad.
+    pub theta_offset: f64,
+}
+
+/// How often things happen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Timing {
+    /// Ticks of the control loop in a second.
+    pub control_hz: f64,
+    /// Ticks from one joint broadcast to the next.
+    pub ticks_per_broadcast: u32,
+}
+
+impl Timing {
+    /// Length of a tick in nanoseconds.
+    #[must_use]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "1 Hz to 10 kHz: checked")]
+    pub fn tick_nanos(&self) -> u64 {
+        (1e9 / self.control_hz).round() as u64
+    }
+
+    /// Joint broadcasts in a second.
+    #[must_use]
+    pub fn broadcast_hz(&self) -> f64 {
+        self.control_hz / f64::from(self.ticks_per_broadcast)
+    }
+}
+
+/// What a bus' cells answer with.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Reply {
+    /// Each cell its own torque, Q3.12.
+    Torque,
+    /// Sums along the tree, Q7.8.
+    Sum {
+        /// Width of a slot in µs.
+        slot_us: u32,
+    },
+}
+
+/// One bus.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Bus {
+    /// The interface's name.
+    pub name: String,
+    /// What its cells answer with.
+    pub reply: Reply,
+    /// One FD frame a packet, or two classic ones.
+    pub format: Format,
+}
+
+/// What turns torques into motion.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Controller {
+    /// Which one.
+    pub kind: ControllerKind,
+    /// The greatest speed of each joint in rad/s.
+    pub max_speed_rad_s: Vec<f64>,
+}
+
+/// Which controller.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ControllerKind {
+    /// `M q'' + D q' = tau`, joint by joint: who pushes the skin moves the arm.
+    Kinesthetic {
+        /// M in kg m2.
+        inertia: Vec<f64>,
+        /// D in Nm s/rad.
+        damping: Vec<f64>,
+    },
+    /// Somebody else's program behind a Unix datagram socket.
+    External {
+        /// Path of the socket that the gateway listens on.
+        socket: String,
+    },
+}
+
+/// When torques are held, and when the robot is halted.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Safety {
+    /// Epochs for which the last torque of a cell that fell silent in contact is held.
+    pub hold_epochs: u32,
+    /// Epochs over which it then falls to zero, linearly.
+    pub decay_epochs: u32,
+    /// Bad cycles in a row that halt the robot.
+    pub bad_cycles: u32,
+}
+
+/// One cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cell {
+    /// Which bus it is on: an index into [`Skin::buses`].
+    pub bus: usize,
+    /// Its number there.
+    pub node: CellId,
+    /// Its serial number.
+    pub serial: u32,
+    /// The joint k that moves the link it sits on, from 1.
+    pub joint: u8,
+    /// Position in the frame of joint k, in m.
+    pub position: [f64; 3],
+    /// Orientation in the frame of joint k: a unit quaternion x, y, z, w.
+    pub orientation: [f64; 4],
+    /// Outward normal in the frame of joint k: the cell's z axis.
+    pub normal: [f64; 3],
+    /// What is wired to its ports.
+    pub neighbors: [Option<CellId>; 4],
+    /// Whether it is wired to the gateway's side.
+    pub root: bool,
+    /// Its gains and thresholds as words.
+    pub contact: Contact,
+}
+
+impl Skin {
+    /// Reads and checks a file.
+    ///
+    /// # Errors
+    /// When it cannot be read, or the first thing that is wrong with it.
+    pub fn read(path: &Path) -> Result<Self, DocumentError> {
+        Self::parse(&path.display().to_string(), &document::text(path)?)
+    }
+
+    /// Checks a text; `path` is what errors call it.
+    ///
+    /// # Errors
+    /// The first thing that is wrong with it.
+    pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
+        document::parse(path, text, check::skin)
+    }
+
+    /// The words that a cell computes with.
+    #[must_use]
+    #[expect(clippy::missing_panics_doc, reason = "only a checked skin exists, and checking made sure of it")]
+    pub fn parameters(&self, cell: &Cell) -> Parameters {
+        self.try_parameters(cell).expect("a checked skin fits its words")
+    }
+
+    fn try_parameters(&self, cell: &Cell) -> Option<Parameters> {
+        let mut parameters = Parameters {
+            joint: cell.joint,
+            joints: u8::try_from(self.robot.joints.len()).ok()?,
+            pose: Pose {
+                position: cell.position.map(Q1_14::nearest),
+                normal: cell.normal.map(Q1_14::nearest),
+            },
+            contact: cell.contact,
+            period_us: self.period_us()?,
+            ..Parameters::default()
+        };
+        for (row, joint) in parameters.rows.iter_mut().zip(&self.robot.joints) {
+            *row = Row {
+                a: Q1_14::nearest(joint.a),
+                d: Q1_14::nearest(joint.d),
+                alpha: Q1_14::from_radians(joint.alpha)?,
+                theta_offset: Q1_14::from_radians(joint.theta_offset)?,
+            };
+        }
+        Some(parameters)
+    }
+
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "positive; u16 decides what fits"
+    )]
+    fn period_us(&self) -> Option<u16> {
+        u16::try_from((1e6 / self.timing.broadcast_hz()).round() as u64).ok()
+    }
+
+    /// The cells of one bus, in the file's order.
+    pub fn cells_of(&self, bus: usize) -> impl Iterator<Item = &Cell> {
+        self.cells.iter().filter(move |cell| cell.bus == bus)
+    }
+
+    /// The bus of this name, as an index into [`Skin::buses`].
+    #[must_use]
+    pub fn bus_named(&self, name: &str) -> Option<usize> {
+        self.buses.iter().position(|bus| bus.name == name)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,121 @@
+//! What a skin's file says, before anybody asked whether it can be.
+
+use serde::Deserialize;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Skin {
+    pub(super) version: i64,
+    pub(super) name: String,
+    pub(super) robot: Robot,
+    pub(super) timing: Timing,
+    #[serde(default)]
+    pub(super) contact: Contact,
+    pub(super) bus: Vec<Bus>,
+    pub(super) controller: Controller,
+    #[serde(default)]
+    pub(super) safety: Safety,
+    pub(super) cell: Vec<Cell>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Robot {
+    pub(super) name: String,
+    pub(super) joints: Vec<Joint>,
+    pub(super) limits_rad: Option<Vec<[f64; 2]>>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Joint {
+    pub(super) a: f64,
+    pub(super) alpha: f64,
+    pub(super) d: f64,
+    pub(super) theta_offset: f64,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Timing {
+    pub(super) control_hz: f64,
+    pub(super) joint_broadcast_hz: f64,
+}
+
+/// Gains and thresholds; in a cell, those that differ from the skin's.
+#[derive(Clone, Copy, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Contact {
+    pub(super) alpha_c: Option<f64>,
+    pub(super) alpha_p: Option<f64>,
+    pub(super) contact_threshold_n: Option<f64>,
+    pub(super) proximity_threshold: Option<f64>,
+    pub(super) force_threshold_n: Option<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Bus {
+    pub(super) name: String,
+    pub(super) reply: String,
+    pub(super) format: String,
+    pub(super) slot_us: Option<i64>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Controller {
+    pub(super) kind: String,
+    pub(super) inertia: Option<Vec<f64>>,
+    pub(super) damping: Option<Vec<f64>>,
+    pub(super) max_speed_rad_s: Vec<f64>,
+    pub(super) socket: Option<String>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Safety {
+    pub(super) hold_epochs: i64,
+    pub(super) decay_epochs: i64,
+    pub(super) bad_cycles: i64,
+}
+
+impl Default for Safety {
+    /// Two missed replies are forgotten, four more let go; a twentieth of a second of bad cycles halts.
+    fn default() -> Self {
+        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25 }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Cell {
+    pub(super) bus: String,
+    pub(super) node: i64,
+    pub(super) serial: Option<i64>,
+    pub(super) joint: i64,
+    pub(super) position: [f64; 3],
+    pub(super) orientation: [f64; 4],
+    #[serde(default)]
+    pub(super) neighbors: [i64; 4],
+    #[serde(default)]
+    pub(super) root: bool,
+    pub(super) alpha_c: Option<f64>,
+    pub(super) alpha_p: Option<f64>,
+    pub(super) contact_threshold_n: Option<f64>,
+    pub(super) proximity_threshold: Option<f64>,
+    pub(super) force_threshold_n: Option<f64>,
+}
+
+impl Cell {
+    /// What this cell overrides.
+    pub(super) const fn contact(&self) -> Contact {
+        Contact {
+            alpha_c: self.alpha_c,
+            alpha_p: self.alpha_p,
+            contact_threshold_n: self.contact_threshold_n,
+            proximity_threshold: self.proximity_threshold,
+            force_threshold_n: self.force_threshold_n,
+        }
+    }
+}

@@ -1,0 +1,153 @@
+use super::*;
+
+const GOOD: &str = r#"version = 1
+name = "two"
+
+[robot]
+name = "elbow"
+joints = [
+  { a = 0.0, alpha = 1.5707963267948966, d = 0.1, theta_offset = 0.0 },
+  { a = 0.5, alpha = 0.0, d = 0.0, theta_offset = -0.5 },
+]
+
+[timing]
+control_hz = 500.0
+joint_broadcast_hz = 62.5
+
+[contact]
+alpha_c = 1.0
+force_threshold_n = 0.1
+
+[[bus]]
+name = "vcan0"
+reply = "torque"
+format = "fd"
+
+[controller]
+kind = "kinesthetic"
+inertia = [1.0, 1.0]
+damping = [4.0, 4.0]
+max_speed_rad_s = [2.0, 2.0]
+
+[[cell]]
+bus = "vcan0"
+node = 1
+joint = 2
+position = [0.1, 0.0, 0.06]
+orientation = [0.0, 0.0, 0.0, 1.0]
+neighbors = [2, 0, 0, 0]
+
+[[cell]]
+bus = "vcan0"
+node = 2
+joint = 1
+position = [0.0, 0.1, 0.0]
+orientation = [0.7071068, 0.0, 0.0, 0.7071068]
+alpha_c = 0.5
+"#;
+
+fn says(from: &str, to: &str) -> String {
+    assert!(GOOD.contains(from), "{from}");
+    Skin::parse("skin.toml", &GOOD.replacen(from, to, 1)).unwrap_err().to_string()
+}
+
+#[test]
+fn a_good_skin_is_read() {
+    let skin = Skin::parse("skin.toml", GOOD).unwrap();
+    assert_eq!(skin.timing.ticks_per_broadcast, 8);
+    assert_eq!(skin.timing.tick_nanos(), 2_000_000);
+    let [first, second] = skin.cells.as_slice() else { panic!("{:?}", skin.cells) };
+    assert_eq!((first.normal, first.neighbors[0]), ([0.0, 0.0, 1.0], Some(CellId::new(2).unwrap())));
+    let [x, y, z] = second.normal;
+    assert!(x.abs() < 1e-6 && (y + 1.0).abs() < 1e-6 && z.abs() < 1e-6, "turned about x by a quarter");
+
+    let parameters = skin.parameters(second);
+    assert_eq!(parameters.check(), Ok(()));
+    assert_eq!((parameters.joint, parameters.joints, parameters.period_us), (1, 2, 16_000));
+    assert_eq!(parameters.rows[0].alpha.to_bits(), 16_384, "a quarter turn is exact");
+    assert_eq!(parameters.contact.alpha_c.to_bits(), 2_048, "the cell's own");
+    assert_eq!(parameters.contact.force_threshold.to_bits(), 103, "0.1 N, rounded up");
+    assert_ne!(parameters.hash(), skin.parameters(first).hash());
+}
+
+#[test]
+fn every_error_names_line_key_value_and_what_is_allowed() {
+    assert_eq!(says("version = 1", "version = 2"), "skin.toml:1: version = 2: this program reads version 1");
+    assert_eq!(
+        says("node = 2", "node = 1"),
+        "skin.toml:40: cell[1].node = 1: cell[0] has this node on \"vcan0\" already"
+    );
+    assert_eq!(says("node = 2", "node = 255"), "skin.toml:40: cell[1].node = 255: a cell's node is 1 to 254");
+    assert_eq!(
+        says("joint = 1", "joint = 3"),
+        "skin.toml:41: cell[1].joint = 3: the robot has joints 1 to 2"
+    );
+    assert_eq!(
+        says("[0.7071068, 0.0, 0.0, 0.7071068]", "[0.5, 0.0, 0.0, 0.5]"),
+        "skin.toml:43: cell[1].orientation = [0.5, 0, 0, 0.5]: \
+         this quaternion has length 0.707107; it must be 1 within 0.001"
+    );
+    assert_eq!(
+        says("[0.1, 0.0, 0.06]", "[1.6, 0.0, 0.0]"),
+        "skin.toml:34: cell[0].position = [1.6, 0, 0]: \
+         node 1 can come 2.100 m from a joint, 0.101 m more than the 1.999 m that Q1.14 holds"
+    );
+    assert_eq!(
+        says("[controller]", "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]"),
+        "skin.toml:25: bus[1].name = \"vcan0\": this bus is named twice"
+    );
+    assert_eq!(
+        says("control_hz", "contrl_hz"),
+        "skin.toml:12: unknown field `contrl_hz`, expected `control_hz` or `joint_broadcast_hz`"
+    );
+    assert_eq!(
+        says("62.5", "60.0"),
+        "skin.toml:13: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"
+    );
+    assert_eq!(
+        says("62.5", "10.0"),
+        "skin.toml:13: timing.joint_broadcast_hz = 10: at least 15.3 Hz are possible"
+    );
+    assert_eq!(
+        says("reply = \"torque\"", "reply = \"talk\""),
+        "skin.toml:21: bus[0].reply = \"talk\": \"torque\" or \"sum\""
+    );
+    assert_eq!(
+        says("inertia = [1.0, 1.0]", "inertia = [1.0]"),
+        "skin.toml:26: controller.inertia = 1 values: one for each of the robot's 2 joints is needed"
+    );
+    assert_eq!(
+        says("inertia = [1.0, 1.0]\n", ""),
+        "skin.toml:24: controller.inertia: needed with kind = \"kinesthetic\""
+    );
+    assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: its word holds [-2, 2)");
+    assert_eq!(
+        says("alpha_c = 0.5", "alpha_c = 8.5"),
+        "skin.toml:44: cell[1].alpha_c = 8.5: its word holds [-8, 8)"
+    );
+    assert_eq!(
+        says("neighbors = [2,", "neighbors = [9,"),
+        "skin.toml:36: cell[0].neighbors[0] = 9: must be the node of another cell on the same bus, or 0"
+    );
+    assert_eq!(
+        says("name = \"vcan0\"", "name = \"a-very-long-name\""),
+        "skin.toml:20: bus[0].name = \"a-very-long-name\": \
+         an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`"
+    );
+}
+
+#[test]
+fn a_broken_file_says_where_in_one_line() {
+    let error = says("version = 1", "version = = 1");
+    assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
+    let error = says("joint = 2", "joint = \"two\"");
+    assert_eq!(error, "skin.toml:33: invalid type: string \"two\", expected i64");
+    let error = says("name = \"elbow\"\n", "");
+    assert_eq!(error, "skin.toml:4: missing field `name`");
+    assert!(
+        Skin::read(Path::new("/nonexistent/skin.toml"))
+            .unwrap_err()
+            .to_string()
+            .contains("/nonexistent/skin.toml")
+    );
+}
