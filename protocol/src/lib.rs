@@ -1,6 +1,8 @@
 #![doc = include_str!("../README.md")]
 #![cfg_attr(not(any(feature = "host", test)), no_std)]
 
+#[cfg(feature = "host")]
+pub mod bus;
 pub mod can;
 pub mod candump;
 #[cfg(feature = "host")]

@@ -1,0 +1,453 @@
+//! Opening a bus: SocketCAN, or the embedded bus where the kernel has none, behind one type.
+//!
+//! ```no_run
+//! use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
+//! use protocol::can::Frame;
+//! use protocol::id::{Command, Id};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let options = Options { filters: vec![Filter::exact(Id::command(Command::Joints))], ..Options::default() };
+//! let bus = Bus::open("vcan0", Choice::Auto, &options)?;
+//! let mut inbox = Inbox::new();
+//! while bus.wait(None)? {
+//!     bus.receive(&mut inbox)?;
+//!     for received in inbox.frames() {
+//!         bus.send(&[Frame::classic(0x201, received.frame.data())?])?;
+//!     }
+//! }
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! All of it works on `&Bus`, so one thread may receive while others send.
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use socketcan::{CanFdSocket, SocketOptions};
+use thiserror::Error;
+
+use crate::can::{Format, Frame};
+use inbox::Taken;
+
+pub mod batch;
+pub mod embedded;
+mod error;
+mod filter;
+mod inbox;
+#[expect(unsafe_code, reason = "recvmmsg, sendmmsg and two ioctls have no safe wrapper")]
+mod io;
+mod kernel;
+
+pub use error::{BusError, SendError};
+pub use filter::Filter;
+pub use inbox::{Inbox, Received};
+
+/// What carries the frames.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum BusKind {
+    /// An interface of the kernel: `can0`, `vcan0`.
+    SocketCan,
+    /// A process that serves a socket, for this user on this machine.
+    Embedded,
+}
+
+impl BusKind {
+    /// The kind's name, as it is printed and as `--bus-kind` takes it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::SocketCan => "socketcan",
+            Self::Embedded => "embedded",
+        }
+    }
+}
+
+impl std::fmt::Display for BusKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+/// Which kind of bus is wanted.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub enum Choice {
+    /// SocketCAN where the kernel has it, else the embedded bus.
+    #[default]
+    Auto,
+    /// This one and no other.
+    Only(BusKind),
+}
+
+impl Choice {
+    /// The kind that this choice comes to on this machine.
+    ///
+    /// A kernel with `CAN_RAW` sockets means SocketCAN, also when the interface is missing: that is an error
+    /// with its remedy, never a silent change of bus.
+    #[must_use]
+    pub fn resolve(self) -> BusKind {
+        match self {
+            Self::Only(kind) => kind,
+            Self::Auto if kernel::has_socketcan() => BusKind::SocketCan,
+            Self::Auto => BusKind::Embedded,
+        }
+    }
+}
+
+impl std::fmt::Display for Choice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Auto => f.pad("auto"),
+            Self::Only(kind) => kind.fmt(f),
+        }
+    }
+}
+
+/// A word that is no kind of bus.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[error("{got:?} is no kind of bus: auto, socketcan and embedded are")]
+pub struct UnknownKind {
+    /// The word.
+    pub got: String,
+}
+
+impl FromStr for Choice {
+    type Err = UnknownKind;
+
+    fn from_str(word: &str) -> Result<Self, UnknownKind> {
+        let all = [Self::Auto, Self::Only(BusKind::SocketCan), Self::Only(BusKind::Embedded)];
+        let found = all.into_iter().find(|choice| choice.to_string() == word);
+        found.ok_or_else(|| UnknownKind { got: word.to_owned() })
+    }
+}
+
+/// How a bus is opened.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Options {
+    /// What to receive; nothing at all when empty, as a sender wants it. At most [`Filter::MAX`].
+    pub filters: Vec<Filter>,
+    /// Whether to receive, marked as own, what this socket itself sends.
+    pub own_frames: bool,
+    /// Whether CAN FD frames are sent and received; an interface must then have MTU 72.
+    pub fd: bool,
+    /// Which error frames to receive, as the bits of `linux/can/error.h`.
+    pub error_mask: u32,
+    /// Bytes that may wait unread, as the kernel counts them: about 1 KiB a frame.
+    pub receive_buffer: usize,
+    /// How long [`Bus::send`] waits for room before it gives up.
+    pub send_patience: Duration,
+    /// Where embedded buses live; `None` is [`embedded::usual_directory`].
+    pub directory: Option<PathBuf>,
+}
+
+impl Default for Options {
+    /// Every data frame, classic and FD, no own ones, room for four answers of each of 254 cells.
+    fn default() -> Self {
+        Self {
+            filters: vec![Filter::ALL],
+            own_frames: false,
+            fd: true,
+            error_mask: 0,
+            receive_buffer: 4 * 254 * 1024,
+            send_patience: Duration::from_millis(100),
+            directory: None,
+        }
+    }
+}
+
+/// An open bus.
+#[derive(Debug)]
+pub struct Bus {
+    name: String,
+    kind: BusKind,
+    socket: CanFdSocket,
+    receive_buffer: usize,
+    fd: bool,
+    send_patience: Duration,
+}
+
+impl Bus {
+    /// Opens a bus. When this returns, the filters are in force.
+    ///
+    /// # Errors
+    /// When the bus cannot be used as asked; the error says what to do.
+    pub fn open(name: &str, choice: Choice, options: &Options) -> Result<Self, BusError> {
+        check_name(name)?;
+        if options.filters.len() > Filter::MAX {
+            return Err(BusError::Filters { name: name.to_owned(), got: options.filters.len() });
+        }
+        let kind = choice.resolve();
+        let (socket, receive_buffer) = match kind {
+            BusKind::SocketCan => kernel::open(name, options)?,
+            BusKind::Embedded => {
+                let (socket, granted) = embedded::connect(name, options)?;
+                (CanFdSocket::from(socket), granted)
+            }
+        };
+        let Options { fd, send_patience, .. } = *options;
+        Ok(Self { name: name.to_owned(), kind, socket, receive_buffer, fd, send_patience })
+    }
+
+    /// The name under which it was opened.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What carries the frames.
+    #[must_use]
+    pub const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    /// How many bytes may wait unread, as the kernel granted and counts them (twice what was asked for when
+    /// all was granted).
+    #[must_use]
+    pub const fn receive_buffer(&self) -> usize {
+        self.receive_buffer
+    }
+
+    /// Waits until there is something to receive; `None` waits without end. `false` when the time is over
+    /// or a signal came.
+    ///
+    /// # Errors
+    /// When the system cannot wait.
+    pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
+        self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
+    }
+
+    /// Receives what has come, at most 64 frames, and forgets what was in `inbox`; how many frames there
+    /// are now. Never waits and never allocates. 0 when nothing has come.
+    ///
+    /// # Errors
+    /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] for an embedded bus
+    /// whose server ended; frames that came before are received first.
+    pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
+        inbox.clear();
+        loop {
+            match inbox.batch.receive(&self.socket) {
+                Ok(_) => break,
+                // The server ended with frames of ours unread: what it had sent can still be read.
+                Err(error) if is(&error, Errno::CONNRESET) => {}
+                Err(error) if is(&error, Errno::AGAIN) || is(&error, Errno::INTR) => return Ok(0),
+                Err(error) => return Err(self.io_error("receive from", error)),
+            }
+        }
+        let taken = inbox.take(self.kind);
+        match (taken, inbox.frames().len()) {
+            (Taken::End, 0) => Err(BusError::Closed { name: self.name.clone() }),
+            (Taken::End | Taken::Frames, count) => Ok(count),
+        }
+    }
+
+    /// Sends frames, in order. When the bus takes no more, waits for room, as long as
+    /// [`Options::send_patience`] says since the last frame was taken. Never allocates unless it fails.
+    ///
+    /// # Errors
+    /// The reason, and how many were sent before it.
+    pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
+        let mut sent = 0;
+        let failed = |sent, cause| SendError { sent, wanted: frames.len(), cause };
+        if !self.fd && frames.iter().any(|frame| frame.format() == Format::Fd) {
+            return Err(failed(0, BusError::FdFrame { name: self.name.clone() }));
+        }
+        let mut give_up = None;
+        while let Some(rest) = frames.get(sent..).filter(|rest| !rest.is_empty()) {
+            let error = match self.send_some(rest) {
+                Ok(count) => {
+                    sent += count;
+                    give_up = None;
+                    continue;
+                }
+                Err(error) => error,
+            };
+            let blocked = if is(&error, Errno::AGAIN) {
+                Blocked::Socket
+            } else if is(&error, Errno::NOBUFS) {
+                Blocked::Interface
+            } else if is(&error, Errno::INTR) {
+                continue;
+            } else {
+                return Err(failed(sent, self.io_error("send to", error)));
+            };
+            let now = Instant::now();
+            let left = give_up.get_or_insert(now + self.send_patience).saturating_duration_since(now);
+            if left.is_zero() {
+                return Err(failed(
+                    sent,
+                    BusError::Full { name: self.name.clone(), waited: self.send_patience },
+                ));
+            }
+            let waited = match blocked {
+                Blocked::Socket => self.poll(PollFlags::OUT, Some(left)),
+                // The interface's queue is shared and nothing tells when it has room, so look again soon.
+                Blocked::Interface => pause(left.min(RECHECK)),
+            };
+            waited.map_err(|errno| failed(sent, self.error("wait for", errno)))?;
+        }
+        Ok(())
+    }
+
+    fn send_some(&self, frames: &[Frame]) -> std::io::Result<usize> {
+        if let [frame] = frames {
+            let (bytes, len) = (frame.to_bytes(), frame.byte_len());
+            let flags = rustix::net::SendFlags::DONTWAIT | rustix::net::SendFlags::NOSIGNAL;
+            rustix::net::send(&self.socket, bytes.get(..len).unwrap_or(&bytes), flags)?;
+            return Ok(1);
+        }
+        let mut outgoing = batch::Outgoing::new();
+        for frame in frames {
+            if !outgoing.push(&frame.to_bytes(), frame.byte_len()) {
+                break;
+            }
+        }
+        outgoing.send(&self.socket)
+    }
+
+    fn poll(&self, what: PollFlags, timeout: Option<Duration>) -> Result<bool, Errno> {
+        let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
+        match poll(&mut [PollFd::new(&self.socket, what)], timeout.as_ref()) {
+            Ok(ready) => Ok(ready > 0),
+            Err(Errno::INTR) => Ok(false),
+            Err(errno) => Err(errno),
+        }
+    }
+
+    fn error(&self, doing: &'static str, errno: Errno) -> BusError {
+        let name = self.name.clone();
+        match (errno, self.kind) {
+            (Errno::NETDOWN | Errno::NETUNREACH, BusKind::SocketCan) => BusError::Down { name },
+            (Errno::NODEV | Errno::NXIO, BusKind::SocketCan) => BusError::Gone { name },
+            (Errno::PIPE | Errno::CONNRESET | Errno::NOTCONN, BusKind::Embedded) => BusError::Closed { name },
+            (errno, BusKind::SocketCan | BusKind::Embedded) => {
+                BusError::Io { name, doing, source: errno.into() }
+            }
+        }
+    }
+
+    fn io_error(&self, doing: &'static str, error: std::io::Error) -> BusError {
+        match Errno::from_io_error(&error) {
+            Some(errno) => self.error(doing, errno),
+            None => BusError::Io { name: self.name.clone(), doing, source: error },
+        }
+    }
+}
+
+impl AsFd for Bus {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+/// Why a frame was not taken at once.
+#[derive(Clone, Copy)]
+enum Blocked {
+    /// This socket's buffer is full: the kernel tells when it has room.
+    Socket,
+    /// The interface's transmit queue is full.
+    Interface,
+}
+
+/// How long a full transmit queue is left alone: a few frames at 1 Mbit/s.
+const RECHECK: Duration = Duration::from_micros(500);
+
+fn pause(time: Duration) -> Result<bool, Errno> {
+    match poll(&mut [], Timespec::try_from(time).ok().as_ref()) {
+        Ok(_) | Err(Errno::INTR) => Ok(false),
+        Err(errno) => Err(errno),
+    }
+}
+
+fn is(error: &std::io::Error, errno: Errno) -> bool {
+    error.raw_os_error() == Some(errno.raw_os_error())
+}
+
+/// Has the kernel stamp what arrives with the wall clock.
+fn set_stamps(socket: &impl AsFd) -> std::io::Result<()> {
+    SocketFd(socket.as_fd()).set_recv_timestamp(true)
+}
+
+/// A borrowed socket whose options are set.
+struct SocketFd<'a>(BorrowedFd<'a>);
+
+impl std::os::fd::AsRawFd for SocketFd<'_> {
+    fn as_raw_fd(&self) -> std::os::fd::RawFd {
+        self.0.as_raw_fd()
+    }
+}
+
+impl SocketOptions for SocketFd<'_> {}
+
+/// Sees that a bus can have this name: the rule of interfaces, so that a bench runs on either kind.
+///
+/// # Errors
+/// When it cannot.
+pub fn check_name(name: &str) -> Result<(), BusError> {
+    let fits = (1..=15).contains(&name.len()) && name != "." && name != "..";
+    let bad = |c: char| c == '/' || c == ':' || c.is_whitespace() || c.is_control();
+    if fits && !name.contains(bad) { Ok(()) } else { Err(BusError::Name { name: name.to_owned() }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_choice_is_read_as_it_is_printed() {
+        for word in ["auto", "socketcan", "embedded"] {
+            assert_eq!(word.parse::<Choice>().unwrap().to_string(), word);
+        }
+        let error = "vcan".parse::<Choice>().unwrap_err().to_string();
+        assert_eq!(error, "\"vcan\" is no kind of bus: auto, socketcan and embedded are");
+    }
+
+    #[test]
+    fn names_are_those_that_an_interface_can_have() {
+        for name in ["vcan0", "can0", "a23456789012345"] {
+            check_name(name).unwrap();
+        }
+        for name in ["", "a234567890123456", ".", "..", "a/b", "a b", "a:b"] {
+            let error = check_name(name).unwrap_err().to_string();
+            let rest = "is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'";
+            assert_eq!(error, format!("{name:?} {rest}"));
+        }
+    }
+
+    #[test]
+    fn a_bus_that_nobody_serves_says_how_to_serve_it() {
+        let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
+        let error = Bus::open("vcan7", Choice::Only(BusKind::Embedded), &options).unwrap_err();
+        let expected = "no embedded bus vcan7 is served in /nowhere/skinbus: start `vcan-setup serve vcan7`, or \
+                        the gateway, which serves it";
+        assert_eq!(error.to_string(), expected);
+    }
+
+    #[test]
+    fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
+        let error =
+            Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
+        if kernel::has_socketcan() {
+            let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`";
+            assert_eq!(error.to_string(), expected);
+        } else {
+            assert!(matches!(error, BusError::NoSocketCan { .. }), "{error}");
+        }
+    }
+
+    #[test]
+    fn too_many_filters_are_refused_before_anything_is_opened() {
+        let options = Options { filters: vec![Filter::ALL; 513], ..Options::default() };
+        let error = Bus::open("vcan0", Choice::Auto, &options).unwrap_err();
+        assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
+    }
+
+    #[test]
+    fn a_bus_is_shared_between_threads() {
+        const fn shared<T: Send + Sync>() {}
+        const { shared::<Bus>() };
+    }
+}

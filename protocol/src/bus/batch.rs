@@ -1,0 +1,237 @@
+//! Many datagrams in one system call: what both ends of a bus receive and send with.
+//!
+//! Nothing here waits, and nothing allocates after [`Batch::new`].
+
+use std::io;
+use std::os::fd::AsFd;
+
+use super::io as calls;
+use crate::can::FD_BYTES;
+
+/// How many datagrams one call moves at most.
+pub const BATCH: usize = 64;
+
+/// Room for one datagram and what the kernel says of it.
+pub(super) struct Slot {
+    pub(super) bytes: [u8; FD_BYTES],
+    /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
+    pub(super) control: [u64; 8],
+    pub(super) len: usize,
+    pub(super) control_len: usize,
+    pub(super) flags: i32,
+}
+
+/// Buffers for up to [`BATCH`] datagrams of at most 72 bytes.
+pub struct Batch {
+    slots: Box<[Slot; BATCH]>,
+    count: usize,
+}
+
+impl Batch {
+    /// Empty buffers.
+    #[must_use]
+    pub fn new() -> Self {
+        let slot = || Slot { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
+        Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0 }
+    }
+
+    /// Takes what is waiting in a socket, and forgets what was here. Never waits.
+    ///
+    /// # Errors
+    /// What `recvmmsg` says; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
+    pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
+        self.count = 0;
+        self.count = calls::receive(fd.as_fd(), &mut self.slots)?;
+        Ok(self.count)
+    }
+
+    /// What the last [`Batch::receive`] brought, in order.
+    pub fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>> {
+        self.slots.iter().take(self.count).map(Datagram)
+    }
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl std::fmt::Debug for Batch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Batch").field("count", &self.count).finish_non_exhaustive()
+    }
+}
+
+/// One datagram in a [`Batch`].
+#[derive(Clone, Copy)]
+pub struct Datagram<'a>(&'a Slot);
+
+impl<'a> Datagram<'a> {
+    /// Its bytes, or `None` when it was longer than 72 and is cut off.
+    #[must_use]
+    pub fn bytes(self) -> Option<&'a [u8]> {
+        if self.0.flags & libc::MSG_TRUNC == 0 { self.0.bytes.get(..self.0.len) } else { None }
+    }
+
+    /// Whether the kernel says that this very socket sent it.
+    #[must_use]
+    pub const fn is_own(self) -> bool {
+        self.0.flags & libc::MSG_CONFIRM != 0
+    }
+
+    /// When it came, in nanoseconds of the wall clock, and how many the kernel had dropped before it,
+    /// each if the kernel said so.
+    #[must_use]
+    pub fn notes(self) -> Notes {
+        let words = self.0.control.map(u64::to_ne_bytes);
+        Notes::read(words.as_flattened().get(..self.0.control_len).unwrap_or_default())
+    }
+}
+
+impl std::fmt::Debug for Datagram<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Datagram").field(&self.bytes()).finish()
+    }
+}
+
+/// What the kernel notes beside a datagram.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Notes {
+    /// `SO_TIMESTAMPNS`: nanoseconds of the wall clock.
+    pub at_nanos: Option<u64>,
+    /// `SO_RXQ_OVFL`: how many the socket has dropped so far.
+    pub dropped: Option<u32>,
+}
+
+impl Notes {
+    /// Walks the control messages: length, level, type, then the data, each padded to a word.
+    fn read(mut bytes: &[u8]) -> Self {
+        const WORD: usize = size_of::<usize>();
+        const HEAD: usize = size_of::<libc::cmsghdr>();
+        let mut notes = Self::default();
+        while let Some((head, _)) = bytes.split_first_chunk::<HEAD>() {
+            let (len, rest) = head.split_at(WORD);
+            let len = len.try_into().map_or(0, usize::from_ne_bytes);
+            let number = |at| {
+                rest.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |&bytes| i32::from_ne_bytes(bytes))
+            };
+            let Some(data) = bytes.get(HEAD..len) else { break };
+            if number(0) == libc::SOL_SOCKET && number(4) == libc::SCM_TIMESTAMPNS {
+                notes.at_nanos = nanoseconds(data);
+            } else if number(0) == libc::SOL_SOCKET && number(4) == libc::SO_RXQ_OVFL {
+                notes.dropped = data.first_chunk().map(|&bytes| u32::from_ne_bytes(bytes));
+            }
+            bytes = bytes.get(len.next_multiple_of(WORD)..).unwrap_or_default();
+        }
+        notes
+    }
+}
+
+/// A `struct timespec` of two 64-bit words.
+fn nanoseconds(timespec: &[u8]) -> Option<u64> {
+    let (seconds, rest) = timespec.split_first_chunk()?;
+    let nanos = rest.first_chunk()?;
+    let seconds = u64::try_from(i64::from_ne_bytes(*seconds)).ok()?;
+    let nanos = u64::try_from(i64::from_ne_bytes(*nanos)).ok()?;
+    seconds.checked_mul(1_000_000_000)?.checked_add(nanos)
+}
+
+/// Datagrams on their way out: at most [`BATCH`] of at most 72 bytes.
+pub struct Outgoing {
+    bytes: [[u8; FD_BYTES]; BATCH],
+    lens: [usize; BATCH],
+    count: usize,
+}
+
+impl Outgoing {
+    /// Nothing to send yet.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { bytes: [[0; FD_BYTES]; BATCH], lens: [0; BATCH], count: 0 }
+    }
+
+    /// Forgets what was put in.
+    pub const fn clear(&mut self) {
+        self.count = 0;
+    }
+
+    /// Adds the first `len` of these bytes (at most 72); whether there was room.
+    pub fn push(&mut self, bytes: &[u8; FD_BYTES], len: usize) -> bool {
+        let room = self.bytes.get_mut(self.count).zip(self.lens.get_mut(self.count));
+        let Some((to, to_len)) = room else { return false };
+        *to = *bytes;
+        *to_len = len.min(FD_BYTES);
+        self.count += 1;
+        true
+    }
+
+    /// Sends them all, in order, without waiting; how many the socket took.
+    ///
+    /// # Errors
+    /// What `sendmmsg` says when it could not send even one; [`io::ErrorKind::WouldBlock`] when the socket
+    /// is full.
+    pub fn send(&self, fd: impl AsFd) -> io::Result<usize> {
+        if self.count == 0 {
+            return Ok(0);
+        }
+        let datagrams = self.bytes.iter().zip(&self.lens).take(self.count);
+        calls::send(fd.as_fd(), datagrams.map(|(bytes, &len)| bytes.get(..len).unwrap_or(bytes)))
+    }
+}
+
+impl Default for Outgoing {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl std::fmt::Debug for Outgoing {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Outgoing").field("count", &self.count).finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
+
+    #[test]
+    fn a_batch_comes_in_order_with_its_lengths() {
+        let (a, b) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
+        let mut outgoing = Outgoing::new();
+        for len in 1..=BATCH {
+            assert!(outgoing.push(&[u8::try_from(len).unwrap(); FD_BYTES], len));
+        }
+        assert!(!outgoing.push(&[0; FD_BYTES], 1), "64 fit, a 65th does not");
+        assert_eq!(outgoing.send(&a).unwrap(), BATCH);
+
+        let mut batch = Batch::new();
+        assert_eq!(batch.receive(&b).unwrap(), BATCH);
+        let lens: Vec<_> = batch.datagrams().map(|datagram| datagram.bytes().unwrap().len()).collect();
+        assert_eq!(lens, (1..=BATCH).collect::<Vec<_>>());
+        assert_eq!(batch.receive(&b).unwrap_err().kind(), io::ErrorKind::WouldBlock);
+    }
+
+    #[test]
+    fn what_is_too_long_is_told_apart_from_what_fits() {
+        let (a, b) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
+        rustix::net::send(&a, &[1; 73], rustix::net::SendFlags::empty()).unwrap();
+        rustix::net::send(&a, &[2; 72], rustix::net::SendFlags::empty()).unwrap();
+        let mut batch = Batch::new();
+        assert_eq!(batch.receive(&b).unwrap(), 2);
+        let bytes: Vec<_> = batch.datagrams().map(Datagram::bytes).collect();
+        assert_eq!(bytes, [None, Some(&[2; 72][..])]);
+    }
+
+    proptest! {
+        #[test]
+        fn no_control_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
+            let _ = Notes::read(&bytes);
+        }
+    }
+}

@@ -1,0 +1,185 @@
+//! What can be wrong with a bus, in one line each: what, which value, what is allowed, what to do.
+
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use thiserror::Error;
+
+use super::Filter;
+use super::embedded::DirectoryError;
+
+/// Why a bus cannot be opened or used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BusError {
+    /// No interface can have this name.
+    #[error("{name:?} is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'")]
+    Name {
+        /// The name that was asked for.
+        name: String,
+    },
+    /// The kernel takes only so many filters.
+    #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX)]
+    Filters {
+        /// The bus.
+        name: String,
+        /// How many were asked for.
+        got: usize,
+    },
+    /// SocketCAN was asked for and the kernel has none.
+    #[error(
+        "{name}: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
+         (--bus-kind embedded)"
+    )]
+    NoSocketCan {
+        /// The bus.
+        name: String,
+    },
+    /// The kernel has SocketCAN and no such interface.
+    #[error("there is no interface {name}: make it with `vcan-setup up {name}`")]
+    NoInterface {
+        /// The bus.
+        name: String,
+    },
+    /// An interface of another sort.
+    #[error(
+        "{name} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
+    )]
+    NotCan {
+        /// The interface.
+        name: String,
+    },
+    /// A classic interface where CAN FD is wanted.
+    #[error(
+        "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
+         {name} mtu 72 up`, or use the classic format"
+    )]
+    ClassicOnly {
+        /// The interface.
+        name: String,
+        /// Its MTU in bytes.
+        mtu: i32,
+    },
+    /// The interface is down: found when it was opened, or while it was in use. It may come back.
+    #[error("{name} is down: bring it up with `vcan-setup up {name}` or `ip link set {name} up`")]
+    Down {
+        /// The interface.
+        name: String,
+    },
+    /// The interface was removed while it was in use.
+    #[error(
+        "{name} was removed while it was in use: make it again with `vcan-setup up {name}` and open it again"
+    )]
+    Gone {
+        /// The interface.
+        name: String,
+    },
+    /// Not allowed.
+    #[error("not allowed to {doing} {name}: {source}")]
+    Permission {
+        /// The bus.
+        name: String,
+        /// What was tried.
+        doing: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Nobody serves this embedded bus.
+    #[error(
+        "no embedded bus {name} is served in {}: start `vcan-setup serve {name}`, or the gateway, which \
+         serves it", directory.display()
+    )]
+    NotServed {
+        /// The bus.
+        name: String,
+        /// Where its socket would be.
+        directory: PathBuf,
+    },
+    /// The directory of embedded buses is not as private as it must be.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
+    /// The embedded bus speaks another version, or did not understand the request.
+    #[error(
+        "the embedded bus {name} refuses: it speaks version {theirs}, this program version {ours}; use both from one build"
+    )]
+    Refused {
+        /// The bus.
+        name: String,
+        /// The version of this program.
+        ours: u8,
+        /// The version of the bus.
+        theirs: u8,
+    },
+    /// The embedded bus does not answer.
+    #[error("the embedded bus {name} did not answer within {} ms: is its server stopped?", waited.as_millis())]
+    NoAnswer {
+        /// The bus.
+        name: String,
+        /// How long it was waited for.
+        waited: Duration,
+    },
+    /// The server of the embedded bus has ended. The bus has to be opened again.
+    #[error("the embedded bus {name} was closed: its server ended")]
+    Closed {
+        /// The bus.
+        name: String,
+    },
+    /// The queue stayed full.
+    #[error("{name} took no frame for {} ms: its queue is full; send less, or ask whether anybody is on the bus", waited.as_millis())]
+    Full {
+        /// The bus.
+        name: String,
+        /// How long room was waited for.
+        waited: Duration,
+    },
+    /// An FD frame for a bus that was opened for classic frames only.
+    #[error("a CAN FD frame cannot be sent on {name}, which was opened for classic frames only")]
+    FdFrame {
+        /// The bus.
+        name: String,
+    },
+    /// Anything else that the system says.
+    #[error("cannot {doing} {name}: {source}")]
+    Io {
+        /// The bus.
+        name: String,
+        /// What was tried.
+        doing: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+impl BusError {
+    /// Whether the same bus may work again later without being opened again: it is down, or full.
+    #[must_use]
+    pub const fn may_pass(&self) -> bool {
+        matches!(self, Self::Down { .. } | Self::Full { .. })
+    }
+
+    /// Whether the bus has ended and has to be opened again.
+    #[must_use]
+    pub const fn is_closed(&self) -> bool {
+        matches!(self, Self::Closed { .. } | Self::Gone { .. })
+    }
+}
+
+/// Not all frames were sent; those before were.
+#[derive(Debug, Error)]
+#[error("{cause} ({sent} of {wanted} frames sent)")]
+pub struct SendError {
+    /// How many frames were sent, from the first one on.
+    pub sent: usize,
+    /// How many there were.
+    pub wanted: usize,
+    /// What happened.
+    #[source]
+    pub cause: BusError,
+}
+
+impl From<SendError> for BusError {
+    fn from(error: SendError) -> Self {
+        error.cause
+    }
+}

@@ -1,0 +1,103 @@
+//! The system calls that have no safe wrapper: many datagrams at once, and an interface's MTU and flags.
+//! Decides nothing.
+
+use std::io;
+use std::mem;
+use std::os::fd::{AsRawFd, BorrowedFd};
+
+use super::batch::{BATCH, Slot};
+
+/// `recvmmsg`, without waiting: how many slots were filled.
+pub(super) fn receive(fd: BorrowedFd<'_>, slots: &mut [Slot; BATCH]) -> io::Result<usize> {
+    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; BATCH];
+    // SAFETY: an `mmsghdr` of zeros is a valid one: null pointers with zero lengths.
+    let mut headers: [libc::mmsghdr; BATCH] = unsafe { mem::zeroed() };
+    for ((slot, vector), header) in slots.iter_mut().zip(&mut vectors).zip(&mut headers) {
+        vector.iov_base = slot.bytes.as_mut_ptr().cast();
+        vector.iov_len = slot.bytes.len();
+        header.msg_hdr.msg_iov = vector;
+        header.msg_hdr.msg_iovlen = 1;
+        header.msg_hdr.msg_control = slot.control.as_mut_ptr().cast();
+        header.msg_hdr.msg_controllen = size_of_val(&slot.control);
+    }
+    // SAFETY: `headers` has BATCH entries, which point to buffers of the lengths given that outlive the
+    // call and that nothing else refers to; the timeout may be null.
+    let count = unsafe {
+        libc::recvmmsg(
+            fd.as_raw_fd(),
+            headers.as_mut_ptr(),
+            libc::c_uint::try_from(BATCH).unwrap_or(0),
+            libc::MSG_DONTWAIT,
+            std::ptr::null_mut(),
+        )
+    };
+    let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
+    for (slot, header) in slots.iter_mut().zip(&headers).take(count) {
+        slot.len = header.msg_len as usize;
+        slot.control_len = header.msg_hdr.msg_controllen;
+        slot.flags = header.msg_hdr.msg_flags;
+    }
+    Ok(count)
+}
+
+/// `sendmmsg`, without waiting: how many of the datagrams (at most [`BATCH`] are looked at) were sent.
+pub(super) fn send<'a>(
+    fd: BorrowedFd<'_>,
+    datagrams: impl ExactSizeIterator<Item = &'a [u8]>,
+) -> io::Result<usize> {
+    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; BATCH];
+    // SAFETY: an `mmsghdr` of zeros is a valid one: null pointers with zero lengths.
+    let mut headers: [libc::mmsghdr; BATCH] = unsafe { mem::zeroed() };
+    let wanted = datagrams.len().min(BATCH);
+    for ((datagram, vector), header) in datagrams.zip(&mut vectors).zip(&mut headers) {
+        vector.iov_base = datagram.as_ptr().cast_mut().cast();
+        vector.iov_len = datagram.len();
+        header.msg_hdr.msg_iov = vector;
+        header.msg_hdr.msg_iovlen = 1;
+    }
+    // SAFETY: the first `wanted` of the BATCH headers point to buffers of the lengths given, borrowed for
+    // longer than the call, which only reads them.
+    let count = unsafe {
+        libc::sendmmsg(
+            fd.as_raw_fd(),
+            headers.as_mut_ptr(),
+            libc::c_uint::try_from(wanted).unwrap_or(0),
+            libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL,
+        )
+    };
+    usize::try_from(count).map_err(|_| io::Error::last_os_error())
+}
+
+/// What the kernel says of an interface.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Interface {
+    /// The largest frame in bytes: 16 classic, 72 FD.
+    pub(super) mtu: i32,
+    /// Whether it is up (`IFF_UP`).
+    pub(super) up: bool,
+}
+
+/// Asks for the MTU and the flags of the interface `name`, with any socket.
+pub(super) fn interface(fd: BorrowedFd<'_>, name: &str) -> io::Result<Interface> {
+    // SAFETY: an `ifreq` of zeros is a valid one: an empty name and a union of plain numbers.
+    let mut request: libc::ifreq = unsafe { mem::zeroed() };
+    let room = request.ifr_name.len() - 1;
+    for (to, from) in request.ifr_name.iter_mut().zip(name.bytes().take(room)) {
+        *to = libc::c_char::from_ne_bytes([from]);
+    }
+    // SAFETY: both requests read the name, which ends in a zero, and write within the `ifreq`.
+    let asked = unsafe { libc::ioctl(fd.as_raw_fd(), libc::SIOCGIFMTU, &raw mut request) };
+    if asked < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: SIOCGIFMTU has filled this member of the union.
+    let mtu = unsafe { request.ifr_ifru.ifru_mtu };
+    // SAFETY: as above.
+    let asked = unsafe { libc::ioctl(fd.as_raw_fd(), libc::SIOCGIFFLAGS, &raw mut request) };
+    if asked < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: SIOCGIFFLAGS has filled this member of the union.
+    let flags = unsafe { request.ifr_ifru.ifru_flags };
+    Ok(Interface { mtu, up: i32::from(flags) & libc::IFF_UP != 0 })
+}
