@@ -1,0 +1,223 @@
+//! What a cell feels, and what that does to the joints: the paper's Algorithm 1 and `tau = J F_z`.
+//!
+//! Integers only, exact up to three roundings that each have a name: [`Force`] (16 fraction bits),
+//! [`Torque::words`] (Q3.12), and whatever a sum does with [`Torque::exact`]. Never panics, bounded work.
+
+use protocol::fixed::{Acc, Q1_14, Q3_12, Q5_10};
+use protocol::parameters::{Contact, MAX_JOINTS};
+
+/// A normal force in N, [0, 32 768) in steps of 2^-16; what pushes on the cell is above zero.
+#[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
+pub struct Force(i32);
+
+impl Force {
+    /// No contact.
+    pub const ZERO: Self = Self(0);
+
+    /// F_z of Algorithm 1, from the three contact words in N and the proximity.
+    ///
+    /// The contact force F_c is the exact sum of the three words. Contact and proximity below their
+    /// thresholds count as none, as does a fused force below its own; comparisons are exact, and what
+    /// equals its threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact at 24
+    /// fraction bits and rounded to 16 after the comparison, halves up. No touch pulls: a fused force
+    /// below zero is none, whatever the threshold.
+    #[must_use]
+    pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
+        let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.plus(word.widen()));
+        let touch = if touch < rule.contact_threshold.widen() { Acc::ZERO } else { touch };
+        let near = if proximity < rule.proximity_threshold { Q1_14::ZERO } else { proximity };
+
+        // At most 2^18 * 2^15 * 2^2 + 2^30 steps.
+        let weighed = Acc::<22>::from_steps(touch.steps() * rule.alpha_c.widen().steps());
+        let fused = weighed.finer::<24>().plus(rule.alpha_p.mul_wide::<14, 24>(near));
+        if fused < rule.force_threshold.widen().finer() {
+            return Self::ZERO;
+        }
+        Self::from_steps((fused.steps() + (1 << 7)) >> 8)
+    }
+
+    /// The force of this many steps of 2^-16 N, held within its range.
+    #[must_use]
+    pub fn from_steps(steps: i64) -> Self {
+        Self(i32::try_from(steps.max(0)).unwrap_or(i32::MAX))
+    }
+
+    /// How many steps of 2^-16 N this is; never below zero.
+    #[must_use]
+    pub const fn steps(self) -> i32 {
+        self.0
+    }
+
+    /// The force in N, exactly.
+    #[must_use]
+    pub fn to_f64(self) -> f64 {
+        f64::from(self.0) / 65_536.0
+    }
+
+    /// Whether the cell is active: there is a force. (Less than 2^-17 N is none.)
+    #[must_use]
+    pub const fn is_active(self) -> bool {
+        self.0 > 0
+    }
+}
+
+/// What one cell does to the joints.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Torque {
+    exact: [Acc<30>; MAX_JOINTS],
+}
+
+impl Torque {
+    /// `tau_l = J_l F_z` (Eq. 8), exactly: J in m, Q1.14, as a [`Kernel`](crate::kernel::Kernel) gives it.
+    #[must_use]
+    pub fn new(jacobian: &[Q1_14; MAX_JOINTS], force: Force) -> Self {
+        // At most 2^15 * 2^31 steps.
+        let product = |row: Q1_14| Acc::from_steps(row.widen().steps() * i64::from(force.0));
+        Self { exact: jacobian.map(product) }
+    }
+
+    /// The torques in Nm at full width, as they enter a sum inside the cell.
+    #[must_use]
+    pub const fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
+        self.exact
+    }
+
+    /// The torques in Nm as words for the bus, rounded once, halves up; what does not fit in [-8, 8)
+    /// becomes the greatest or the least word, which mean *saturated*. The error of the others is at
+    /// most half a step, 1.3e-4 Nm.
+    #[must_use]
+    pub fn words(&self) -> [Q3_12; MAX_JOINTS] {
+        self.exact.map(Acc::round)
+    }
+
+    /// Whether a word is saturated.
+    #[must_use]
+    pub fn is_saturated(&self) -> bool {
+        self.words().into_iter().any(Q3_12::is_saturated)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn rule() -> Contact {
+        Contact {
+            alpha_c: Q3_12::nearest(1.0),
+            alpha_p: Q5_10::nearest(0.5),
+            contact_threshold: Q5_10::nearest(0.25),
+            proximity_threshold: Q1_14::nearest(0.125),
+            force_threshold: Q5_10::nearest(0.25),
+        }
+    }
+
+    fn newtons(values: [f64; 3]) -> [Q5_10; 3] {
+        values.map(Q5_10::nearest)
+    }
+
+    #[test]
+    fn a_touch_is_the_sum_of_the_three_words() {
+        assert_eq!(Force::fuse(newtons([1.0, 0.5, 0.25]), Q1_14::ZERO, &rule()).to_f64(), 1.75);
+        let most = Force::fuse([Q5_10::MAX; 3], Q1_14::ZERO, &rule());
+        assert_eq!(most.to_f64(), 3.0 * Q5_10::MAX.to_f64(), "beyond one word's range");
+    }
+
+    #[test]
+    fn what_equals_a_threshold_counts_and_what_is_one_step_below_does_not() {
+        let touch =
+            |bits| Force::fuse([Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO], Q1_14::ZERO, &rule());
+        assert_eq!((touch(256).to_f64(), touch(255)), (0.25, Force::ZERO));
+
+        let low = Contact { force_threshold: Q5_10::ZERO, ..rule() };
+        let near = |bits| Force::fuse([Q5_10::ZERO; 3], Q1_14::from_bits(bits), &low);
+        assert_eq!((near(2_048).to_f64(), near(2_047)), (0.0625, Force::ZERO));
+
+        // 0.5 N of proximity at 0.5 is 0.25 N: the fused threshold, exactly.
+        let near = |bits| Force::fuse([Q5_10::ZERO; 3], Q1_14::from_bits(bits), &rule());
+        assert_eq!((near(8_192).to_f64(), near(8_191)), (0.25, Force::ZERO));
+    }
+
+    #[test]
+    fn nothing_and_a_pull_are_no_contact() {
+        let open = Contact {
+            alpha_c: Q3_12::nearest(1.0),
+            contact_threshold: Q5_10::MIN,
+            force_threshold: Q5_10::MIN,
+            ..rule()
+        };
+        assert!(!Force::fuse([Q5_10::ZERO; 3], Q1_14::ZERO, &open).is_active());
+        assert!(!Force::fuse([Q5_10::MIN; 3], Q1_14::ZERO, &open).is_active());
+        assert!(!Force::fuse([Q5_10::ZERO; 3], Q1_14::ZERO, &Contact::default()).is_active());
+    }
+
+    #[test]
+    fn a_torque_beyond_8_nm_saturates_and_stays_exact_inside() {
+        let arm = Q1_14::nearest(0.85);
+        let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+        jacobian[0] = arm;
+        jacobian[1] = arm.saturating_neg();
+        let torque = Torque::new(&jacobian, Force::from_steps(10 << 16));
+        assert_eq!(torque.words()[..3], [Q3_12::MAX, Q3_12::MIN, Q3_12::ZERO]);
+        assert!(torque.is_saturated());
+        assert_eq!(torque.exact()[1].to_f64(), -10.0 * arm.to_f64());
+
+        let less = Torque::new(&jacobian, Force::from_steps(9 << 16));
+        assert!(!less.is_saturated());
+        assert_eq!(less.words()[0], Q3_12::nearest(9.0 * arm.to_f64()));
+    }
+
+    proptest! {
+        #[test]
+        fn the_force_is_algorithm_1_in_real_numbers(
+            contact: [i16; 3], proximity: i16, alpha_c in 0..=i16::MAX, alpha_p in 0..=i16::MAX,
+            thresholds in any::<[u8; 3]>(),
+        ) {
+            let [c, p, z] = thresholds.map(i16::from);
+            let rule = Contact {
+                alpha_c: Q3_12::from_bits(alpha_c),
+                alpha_p: Q5_10::from_bits(alpha_p),
+                contact_threshold: Q5_10::from_bits(c),
+                proximity_threshold: Q1_14::from_bits(p),
+                force_threshold: Q5_10::from_bits(z),
+            };
+            let (contact, proximity) = (contact.map(Q5_10::from_bits), Q1_14::from_bits(proximity));
+
+            let none_below = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
+            let touch = none_below(contact.map(Q5_10::to_f64).iter().sum(), rule.contact_threshold.to_f64());
+            let near = none_below(proximity.to_f64(), rule.proximity_threshold.to_f64());
+            let fused = rule.alpha_c.to_f64() * touch + rule.alpha_p.to_f64() * near; // exact in f64
+            let wanted = none_below(fused, rule.force_threshold.to_f64());
+
+            let force = Force::fuse(contact, proximity, &rule);
+            prop_assert!((force.to_f64() - wanted).abs() <= 1.0 / 131_072.0);
+            prop_assert!(force.is_active() == (wanted >= 1.0 / 131_072.0));
+        }
+
+        #[test]
+        fn no_words_panic_and_no_torque_wraps(
+            contact: [i16; 3], proximity: i16, words: [i16; 5], jacobian: [i16; 6], steps: i64,
+        ) {
+            let [alpha_c, alpha_p, c, p, z] = words;
+            let rule = Contact {
+                alpha_c: Q3_12::from_bits(alpha_c),
+                alpha_p: Q5_10::from_bits(alpha_p),
+                contact_threshold: Q5_10::from_bits(c),
+                proximity_threshold: Q1_14::from_bits(p),
+                force_threshold: Q5_10::from_bits(z),
+            };
+            let felt = Force::fuse(contact.map(Q5_10::from_bits), Q1_14::from_bits(proximity), &rule);
+            let jacobian = jacobian.map(Q1_14::from_bits);
+            for force in [felt, Force::from_steps(steps)] {
+                prop_assert!(force.steps() >= 0);
+                let torque = Torque::new(&jacobian, force);
+                for ((row, exact), word) in jacobian.iter().zip(torque.exact()).zip(torque.words()) {
+                    let real = row.to_f64() * force.to_f64();
+                    prop_assert_eq!(exact.to_f64(), real);
+                    let held = real.clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
+                    prop_assert!((word.to_f64() - held).abs() <= 0.5 / 4_096.0);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! What one newton on the cell does to each joint: two kernels behind one interface.
+//!
+//! Both compute the paper's Eq. 8 for a cell on the link that joint k moves,
+//!
+//! ```text
+//! J_l = (z_(l-1) x (t_i - t_(l-1))) . f      for l = 1..k,   0 beyond,
+//! tau_l = J_l F_z
+//! ```
+//!
+//! where z_(l-1) is the axis of joint l, t_i the cell's position and f the direction of the force. A
+//! contact pushes *against* the outward normal, f = -normal: press a cell, and the joint gives way.
+//! J is in m, so a newton on the cell makes J_l newton metres in joint l.
+//!
+//! - [`Wrench`] carries the contact's force and moment from the cell's link down to the base. It is the
+//!   one to use: fewer than half of the operations, and the smaller error.
+//! - [`Projection`] carries the frames from the base up to the cell, as the paper does (Eq. 20 to 25).
+//!   It is the witness in tests and the other side of the comparison.
+//!
+//! Any arm of 1 to 6 revolute joints in standard Denavit-Hartenberg form will do. Angles are words that
+//! wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
+//! twists four; lengths that are zero cost nothing. Parameters that
+//! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
+
+mod scalar;
+#[cfg(any(feature = "host", test))]
+pub mod witness;
+mod wrench;
+
+pub use scalar::{PaperWord, Scalar};
+pub use wrench::Wrench;
+
+use protocol::fixed::Q1_14;
+use protocol::parameters::{MAX_JOINTS, Parameters};
+
+/// A way to compute the Jacobian of a cell's normal force.
+pub trait Kernel<S: Scalar = Q1_14>: Sized {
+    /// Prepares what does not depend on the joints: once per configuration, not in the loop.
+    ///
+    /// Never panics, whatever the words are.
+    fn new(parameters: &Parameters) -> Self;
+
+    /// J_l in m for joints l = 1..=6 (zero for l > k), from joint positions in quarter turns.
+    ///
+    /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
+    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];
+}
+
+/// How a link's twist alpha turns y and z into each other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Twist<S> {
+    /// By no turn, one, two or three quarter turns.
+    Quarters(Quarters),
+    /// By any other angle.
+    Other { sine: S, cosine: S },
+}
+
+/// Whole quarter turns.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Quarters {
+    None,
+    Ahead,
+    Half,
+    Back,
+}
+
+impl<S: Scalar> Twist<S> {
+    fn new(alpha: Q1_14) -> Self {
+        match alpha.to_bits() {
+            0 => Self::Quarters(Quarters::None),
+            0x4000 => Self::Quarters(Quarters::Ahead),
+            i16::MIN => Self::Quarters(Quarters::Half),
+            -0x4000 => Self::Quarters(Quarters::Back),
+            _ => {
+                let [sine, cosine, _] = S::fine_turn(alpha);
+                Self::Other {
+                    sine: S::settle::<{ crate::sine::FINE }>(sine),
+                    cosine: S::settle::<{ crate::sine::FINE }>(cosine),
+                }
+            }
+        }
+    }
+}

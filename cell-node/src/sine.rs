@@ -1,0 +1,201 @@
+//! Sine and cosine of an angle in quarter turns, integers only.
+//!
+//! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so 16 bits hold exactly one turn and
+//! wrap by themselves; the period of the paper's Eq. 12 is 4 of these units, not 2. Both polynomials
+//! are evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words
+//! also holds below -1. All products stay within 32 bits.
+//!
+//! | function | order | mean error | greatest error |
+//! |---|---|---|---|
+//! | [`sine`], [`cosine`] | 7 | 1.6e-5 | 6.1e-5 |
+//! | [`paper_sine`], [`paper_cosine`] | 5 | 1.9e-4 | 4.4e-4 |
+//!
+//! over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All four are exact at 0
+//! and at the quarter turns, exactly odd (or even), and never beyond 1. Never panics, bounded work.
+
+use core::f64::consts::FRAC_PI_2;
+
+use protocol::fixed::Q1_14;
+
+/// One, in the 16 fraction bits in which the polynomials are evaluated.
+const ONE: i32 = 1 << 16;
+/// A quarter turn as a word.
+const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
+
+/// The odd polynomial of seventh order for a quarter turn: coefficients of z, z^3, z^5, z^7.
+///
+/// Of the integers whose sum is one (so that the sine of a quarter turn is one) these leave the least
+/// mean error when every intermediate result is cut off, not rounded; found by search.
+const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
+
+/// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such
+/// that the sum is one.
+const FIFTH: [i32; 3] = {
+    let (a, c) = (nearest(FRAC_PI_2), nearest(FRAC_PI_2 - 1.5));
+    [a, ONE - a - c, c]
+};
+
+/// A constant above zero with 16 fraction bits.
+#[expect(clippy::cast_possible_truncation, reason = "the constants above are below 2")]
+const fn nearest(constant: f64) -> i32 {
+    (constant * 65_536.0 + 0.5) as i32
+}
+
+/// The sine of an angle in quarter turns; in [-1, 1].
+///
+/// Seventh order; the mean error over all angles is below 1.6e-5 and no error is above 6.2e-5.
+#[must_use]
+pub fn sine(angle: Q1_14) -> Q1_14 {
+    odd_polynomial(angle, SEVENTH)
+}
+
+/// The cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
+#[must_use]
+pub fn cosine(angle: Q1_14) -> Q1_14 {
+    sine(angle.wrapping_add(QUARTER))
+}
+
+/// The paper's sine (Eq. 17, 18), fifth order; in [-1, 1].
+///
+/// The mean error over all angles is below 1.9e-4 and no error is above 4.6e-4: coarser than
+/// [`sine`] by a factor of ten, and one multiplication cheaper.
+#[must_use]
+pub fn paper_sine(angle: Q1_14) -> Q1_14 {
+    odd_polynomial(angle, FIFTH)
+}
+
+/// The paper's cosine (Eq. 19): [`paper_sine`] a quarter turn later.
+#[must_use]
+pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
+    paper_sine(angle.wrapping_add(QUARTER))
+}
+
+/// The same sine as a word within [-1, 1] quarter turns.
+fn fold(angle: Q1_14) -> i32 {
+    let z = angle.to_bits();
+    let folded = if z.unsigned_abs() <= 1 << 14 { z } else { i16::MIN.wrapping_sub(z) };
+    i32::from(folded)
+}
+
+/// An odd polynomial of the folded angle whose coefficients sum up to one.
+fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
+    let z = fold(angle);
+    let square = (z * z) >> 13; // 15 fraction bits, at most 2^15
+    let factor = coefficients.into_iter().rev().reduce(|sum, c| c + ((square * sum) >> 15)).unwrap_or(0);
+    let product = z * factor; // 30 fraction bits, at most 2^30
+    let rounded = (product + (1 << 15) + (product >> 31)) >> 16; // halves away from zero, which is odd
+    Q1_14::from_bits(i16::try_from(rounded).expect("a sine is within 1"))
+}
+
+/// Fraction bits of [`fine_sine_cosine`].
+pub(crate) const FINE: u32 = 28;
+
+/// Sine and cosine with 28 fraction bits, exact at the quarter turns: for constants that are computed
+/// once. No error is above 1e-8.
+pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
+    [angle, angle.wrapping_add(QUARTER)].map(|angle| {
+        let z = i64::from(fold(angle));
+        let factor = TAYLOR.into_iter().rev().reduce(|sum, c| c + ((z * z * sum) >> 28)).unwrap_or(0);
+        let product = z * factor; // 14 + 32 fraction bits
+        (product + (1 << 17)) >> 18
+    })
+}
+
+/// The series of the sine of a quarter turn with 32 fraction bits: (pi/2)^n / n!, n = 1, 3, 5 ... 15.
+#[expect(clippy::cast_possible_truncation, reason = "all below 2^33")]
+const TAYLOR: [i64; 8] = {
+    let mut series = [0; 8];
+    let (mut term, mut n) = (FRAC_PI_2, 1.0);
+    let mut rest: &mut [i64] = &mut series;
+    while let [first, others @ ..] = rest {
+        *first = (term * (1_i64 << 32) as f64) as i64;
+        term *= -FRAC_PI_2 * FRAC_PI_2 / ((n + 1.0) * (n + 2.0));
+        n += 2.0;
+        rest = others;
+    }
+    series
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::fixed::Acc;
+
+    /// Mean and greatest error over all angles.
+    fn errors(function: impl Fn(Q1_14) -> f64, witness: impl Fn(f64) -> f64) -> (f64, f64) {
+        let mut sum = 0.0;
+        let mut greatest = 0.0_f64;
+        for bits in i16::MIN..=i16::MAX {
+            let angle = Q1_14::from_bits(bits);
+            let error = (function(angle) - witness(angle.to_radians())).abs();
+            sum += error;
+            greatest = greatest.max(error);
+        }
+        (sum / 65_536.0, greatest)
+    }
+
+    #[test]
+    fn the_errors_over_all_angles_are_within_what_the_table_says() {
+        for (name, (mean, greatest), bars) in [
+            ("sine", errors(|z| sine(z).to_f64(), f64::sin), (1.6e-5, 6.2e-5)),
+            ("cosine", errors(|z| cosine(z).to_f64(), f64::cos), (1.6e-5, 6.2e-5)),
+            ("paper's sine", errors(|z| paper_sine(z).to_f64(), f64::sin), (1.9e-4, 4.4e-4)),
+            ("paper's cosine", errors(|z| paper_cosine(z).to_f64(), f64::cos), (1.9e-4, 4.4e-4)),
+        ] {
+            println!("{name}: mean {mean:.3e}, greatest {greatest:.3e}");
+            assert!(mean <= bars.0 && greatest <= bars.1, "{name}: mean {mean:e}, greatest {greatest:e}");
+        }
+    }
+
+    #[test]
+    fn rounding_alone_costs_what_the_table_says() {
+        let (mean, _) = errors(|z| Q1_14::nearest(z.to_radians().sin()).to_f64(), f64::sin);
+        assert!((1.4e-5..1.55e-5).contains(&mean), "{mean:e}");
+    }
+
+    #[test]
+    fn the_quarter_turns_are_exact() {
+        for function in [sine, paper_sine] {
+            for (angle, wanted) in [(0, 0), (1 << 14, 1 << 14), (-1 << 14, -1 << 14), (i16::MIN, 0)] {
+                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), wanted, "at {angle}");
+            }
+        }
+        for function in [cosine, paper_cosine] {
+            for (angle, wanted) in [(0, 1 << 14), (1 << 14, 0), (-1 << 14, 0), (i16::MIN, -1 << 14)] {
+                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), wanted, "at {angle}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_symmetries_hold_at_every_angle() {
+        for (sine, cosine) in [
+            (sine as fn(Q1_14) -> Q1_14, cosine as fn(Q1_14) -> Q1_14),
+            (paper_sine as fn(Q1_14) -> Q1_14, paper_cosine as fn(Q1_14) -> Q1_14),
+        ] {
+            for bits in i16::MIN..=i16::MAX {
+                let (angle, opposite) = (Q1_14::from_bits(bits), Q1_14::from_bits(bits.wrapping_neg()));
+                let half_a_turn_on = angle.wrapping_add(Q1_14::MIN);
+                assert_eq!(sine(opposite).to_bits(), -sine(angle).to_bits(), "sine is odd at {bits}");
+                assert_eq!(sine(half_a_turn_on).to_bits(), -sine(angle).to_bits(), "half a turn from {bits}");
+                assert_eq!(cosine(opposite), cosine(angle), "cosine is even at {bits}");
+                assert!(sine(angle).to_bits().abs() <= 1 << 14, "within 1 at {bits}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_fine_ones_are_exact_at_quarter_turns_and_fine_between() {
+        let one = 1 << FINE;
+        for (angle, wanted) in
+            [(0, [0, one]), (1 << 14, [one, 0]), (-1 << 14, [-one, 0]), (i16::MIN, [0, -one])]
+        {
+            assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), wanted, "at {angle}");
+        }
+        let real = |fine: i64| Acc::<FINE>::from_steps(fine).to_f64();
+        for (index, witness) in [f64::sin, f64::cos].into_iter().enumerate() {
+            let (_, greatest) = errors(|z| real(fine_sine_cosine(z)[index]), witness);
+            assert!(greatest <= 1e-8, "{greatest:e}");
+        }
+    }
+}

@@ -1,0 +1,118 @@
+//! What the kernels are held against: the UR5, torques computed elsewhere, and Eq. 8 in real numbers.
+
+#![allow(dead_code, clippy::unwrap_used, clippy::indexing_slicing, reason = "shared; a test may stop")]
+
+use protocol::fixed::Q1_14;
+use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
+
+/// One line of `vectors/ur5_torque.csv`: computed from Eq. 8 in double precision, and in agreement with
+/// a rigid-body library on the robot's URDF to 1e-11 Nm.
+pub(crate) struct Case {
+    /// The joint that moves the cell, 1 to 6.
+    pub(crate) joint: u8,
+    /// Joint positions in rad.
+    pub(crate) positions: [f64; 6],
+    /// The cell's position in the frame of that joint, in m.
+    pub(crate) position: [f64; 3],
+    /// Where the force points, in the same frame.
+    pub(crate) direction: [f64; 3],
+    /// The force in N.
+    pub(crate) force: f64,
+    /// The torques in Nm.
+    pub(crate) torques: [f64; 6],
+}
+
+impl Case {
+    /// All cases.
+    pub(crate) fn all() -> Vec<Self> {
+        include_str!("../vectors/ur5_torque.csv").lines().skip(1).map(Self::read).collect()
+    }
+
+    fn read(line: &str) -> Self {
+        let (joint, rest) = line.split_once(',').unwrap();
+        let numbers: Vec<f64> = rest.split(',').map(|number| number.parse().unwrap()).collect();
+        Self {
+            joint: joint.parse().unwrap(),
+            positions: numbers[..6].try_into().unwrap(),
+            position: numbers[6..9].try_into().unwrap(),
+            direction: numbers[9..12].try_into().unwrap(),
+            force: numbers[12],
+            torques: numbers[13..].try_into().unwrap(),
+        }
+    }
+
+    /// The cell as its words describe it: its outward normal is where the force comes from.
+    pub(crate) fn parameters(&self) -> Parameters {
+        let pose = Pose {
+            position: self.position.map(Q1_14::nearest),
+            normal: self.direction.map(|n| Q1_14::nearest(-n)),
+        };
+        Parameters { joint: self.joint, joints: 6, pose, rows: ur5(), ..Parameters::default() }
+    }
+
+    /// The joint positions as words.
+    pub(crate) fn words(&self) -> [Q1_14; 6] {
+        self.positions.map(|angle| Q1_14::from_radians(angle).unwrap())
+    }
+}
+
+/// The UR5's table, in words.
+pub(crate) fn ur5() -> [Row; MAX_JOINTS] {
+    let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
+    let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
+    let alpha = [1.0, 0.0, 0.0, 1.0, -1.0, 0.0];
+    std::array::from_fn(|row| Row {
+        a: Q1_14::nearest(a[row]),
+        d: Q1_14::nearest(d[row]),
+        alpha: Q1_14::nearest(alpha[row]),
+        theta_offset: Q1_14::ZERO,
+    })
+}
+
+type Transform = [[f64; 4]; 4];
+
+fn product(lhs: &Transform, rhs: &Transform) -> Transform {
+    std::array::from_fn(|i| std::array::from_fn(|j| (0..4).map(|n| lhs[i][n] * rhs[n][j]).sum()))
+}
+
+fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Rz(theta) Tz(d) Tx(a) Rx(alpha), the four multiplied out one by one.
+fn transform(row: &Row, position: Q1_14) -> Transform {
+    let (st, ct) = position.wrapping_add(row.theta_offset).to_radians().sin_cos();
+    let (sa, ca) = row.alpha.to_radians().sin_cos();
+    let about_z = [[ct, -st, 0.0, 0.0], [st, ct, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    let along = [
+        [1.0, 0.0, 0.0, row.a.to_f64()],
+        [0.0, 1.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0, row.d.to_f64()],
+        [0.0, 0.0, 0.0, 1.0],
+    ];
+    let about_x = [[1.0, 0.0, 0.0, 0.0], [0.0, ca, -sa, 0.0], [0.0, sa, ca, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    product(&product(&about_z, &along), &about_x)
+}
+
+/// Eq. 8 as it stands: frames by multiplying 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`.
+pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; 6]) -> [f64; 6] {
+    let mut frames: Vec<Transform> =
+        vec![std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))];
+    for (row, &position) in parameters.chain().iter().zip(positions) {
+        frames.push(product(frames.last().unwrap(), &transform(row, position)));
+    }
+    let axis = |frame: &Transform, column: usize| -> [f64; 3] { std::array::from_fn(|i| frame[i][column]) };
+    let last = frames.last().unwrap();
+    let turn = |v: [f64; 3]| -> [f64; 3] { std::array::from_fn(|i| (0..3).map(|j| last[i][j] * v[j]).sum()) };
+    let force = turn(parameters.pose.normal.map(|n| -n.to_f64()));
+    let local = turn(parameters.pose.position.map(Q1_14::to_f64));
+    let cell: [f64; 3] = std::array::from_fn(|i| local[i] + last[i][3]);
+
+    let mut jacobian = [0.0; 6];
+    for (row, frame) in jacobian.iter_mut().zip(&frames[..frames.len() - 1]) {
+        let origin = axis(frame, 3);
+        let moment = cross(axis(frame, 2), std::array::from_fn(|i| cell[i] - origin[i]));
+        *row = moment.iter().zip(force).map(|(m, f)| m * f).sum();
+    }
+    jacobian
+}
