@@ -1,3 +1,7 @@
 //! To be written.
 
 pub mod central;
+pub mod controller;
+pub mod robot;
+#[cfg(test)]
+mod testing;

@@ -2,53 +2,7 @@ use super::*;
 use proptest::prelude::*;
 use protocol::fixed::Q5_10;
 
-const UR5: &str = r#"version = 1
-name = "bare"
-
-[robot]
-name = "UR5"
-joints = [
-  { a = 0.0, alpha = 1.5707963267948966, d = 0.089159, theta_offset = 0.0 },
-  { a = -0.425, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
-  { a = -0.39225, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
-  { a = 0.0, alpha = 1.5707963267948966, d = 0.10915, theta_offset = 0.0 },
-  { a = 0.0, alpha = -1.5707963267948966, d = 0.09465, theta_offset = 0.0 },
-  { a = 0.0, alpha = 0.0, d = 0.0823, theta_offset = 0.0 },
-]
-
-[timing]
-control_hz = 500.0
-joint_broadcast_hz = 62.5
-
-[contact]
-alpha_c = 1.0
-alpha_p = 2.0
-contact_threshold_n = 0.1
-proximity_threshold = 0.25
-force_threshold_n = 0.3
-
-[[bus]]
-name = "vcan0"
-reply = "torque"
-format = "fd"
-
-[controller]
-kind = "kinesthetic"
-inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
-damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]
-max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
-
-[[cell]]
-bus = "vcan0"
-node = 1
-joint = 3
-position = [0.2, 0.01, 0.15]
-orientation = [0.7071068, 0.0, 0.0, 0.7071068]
-"#;
-
-fn skin() -> Skin {
-    Skin::parse("skin.toml", UR5).unwrap()
-}
+use crate::testing::{SKIN, skin};
 
 fn pressed(contact: f64, proximity: f64) -> SkinSensors {
     SkinSensors {
@@ -97,9 +51,9 @@ fn words_and_numbers_agree_within_what_words_can_hold() {
 
 #[test]
 fn an_offset_turns_the_joint() {
-    let turned = UR5.replacen("d = 0.10915, theta_offset = 0.0", "d = 0.10915, theta_offset = 0.75", 1);
+    let turned = SKIN.replacen("d = 0.10915, theta_offset = 0.0", "d = 0.10915, theta_offset = 0.75", 1);
     let turned = turned.replacen("joint = 3", "joint = 4", 1);
-    let straight = UR5.replacen("joint = 3", "joint = 4", 1);
+    let straight = SKIN.replacen("joint = 3", "joint = 4", 1);
     let [turned, straight] = [turned, straight].map(|text| Skin::parse("skin.toml", &text).unwrap());
     let (q, moved) = ([0.0, -1.2, 1.0, 0.25, 0.0, 0.0], [0.0, -1.2, 1.0, 1.0, 0.0, 0.0]);
     let offset = Central::unquantised(&turned);
