@@ -1,1 +1,10 @@
-//! To be written.
+#![doc = include_str!("../README.md")]
+#![cfg_attr(not(any(feature = "host", test)), no_std)]
+
+pub mod contact;
+pub mod flash;
+#[cfg(feature = "host")]
+pub mod io;
+pub mod kernel;
+pub mod node;
+pub mod sine;

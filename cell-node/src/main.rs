@@ -1,2 +1,131 @@
-//! To be written.
-fn main() {}
+//! One skin cell as a process, or several in one.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, bail};
+use cell_node::io::{Cells, FlashFile};
+use cell_node::node::{Flash, Identity};
+use clap::Parser;
+use protocol::bus::{Bus, Choice, Filter, Options};
+use protocol::id::{CellId, Id};
+use protocol::skin::Skin;
+use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
+
+/// A tactile skin cell: hears joint positions, answers with its joint torques.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    after_help = "Examples:
+  cell-node --bus vcan0 --node 12 --skin gateway/examples/ur5-253.toml
+  cell-node --bus vcan0 --nodes 1-64 --skin gateway/examples/ur5-253.toml --flash /tmp/flash"
+)]
+struct Arguments {
+    /// The bus, one of the skin's
+    #[arg(long, value_name = "NAME")]
+    bus: String,
+    /// The cell's number on the bus, 1 to 254
+    #[arg(long, value_name = "N", required_unless_present = "nodes")]
+    node: Option<u8>,
+    /// Several cells in one process over one socket: the first and the last number
+    #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = range)]
+    nodes: Option<(u8, u8)>,
+    /// The skin's description; a cell whose flash is empty takes its parameters from it
+    #[arg(long, value_name = "FILE")]
+    skin: PathBuf,
+    /// Keep parameters in files of this directory; without it a cell forgets them when it ends
+    #[arg(long, value_name = "DIR")]
+    flash: Option<PathBuf>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    bus_kind: Choice,
+    /// End when this process, the parent, ends
+    #[arg(long, value_name = "PID")]
+    with_parent: Option<i32>,
+}
+
+fn range(text: &str) -> Result<(u8, u8), String> {
+    let parse = || {
+        let (first, last) = text.split_once('-')?;
+        Some((first.parse().ok()?, last.parse().ok()?))
+    };
+    match parse() {
+        Some((first, last)) if 1 <= first && first <= last && last <= CellId::MAX.get() => Ok((first, last)),
+        _ => Err("two numbers of 1 to 254, the lesser one first, such as 1-64".to_owned()),
+    }
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    match prepare(&arguments) {
+        Ok((mut cells, bus)) => {
+            let Err(stopped) = cells.run(&bus);
+            eprintln!("cell-node: {stopped}");
+            ExitCode::from(1)
+        }
+        Err(error) => {
+            eprintln!("cell-node: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
+    if let Some(parent) = arguments.with_parent {
+        set_parent_process_death_signal(Some(Signal::TERM))?;
+        // It may have ended before that.
+        if getppid() != Pid::from_raw(parent) {
+            bail!("process {parent} is not the parent of this one");
+        }
+    }
+    let skin = Skin::read(&arguments.skin)?;
+    let file = arguments.skin.display();
+    let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
+        let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        format!("bus {} is not in {file}, which has {names}", arguments.bus)
+    })?;
+    let format = skin.buses.get(bus_index).context("the bus that was found")?.format;
+    let (first, last) = match (arguments.node, arguments.nodes) {
+        (Some(node), _) => (node, node),
+        (None, Some(nodes)) => nodes,
+        (None, None) => bail!("--node or --nodes is needed"),
+    };
+    let mut cells = Cells::new(format);
+    let mut heard = BTreeSet::new();
+    for number in first..=last {
+        let cell = CellId::new(i64::from(number))?;
+        let described = skin.cells_of(bus_index).find(|described| described.node == cell);
+        let described =
+            described.with_context(|| format!("cell {cell} is not on {} in {file}", arguments.bus))?;
+        let identity = Identity { cell, serial: described.serial };
+        heard.extend(identity.hears());
+        let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
+        let (mut flash, damage) = flash_file.load().with_context(|| format!("flash of cell {cell}"))?;
+        if let Some(damage) = damage {
+            eprintln!(
+                "cell-node: flash of cell {cell} is not used: {damage}; write it anew or delete the file"
+            );
+        }
+        if flash == Flash::Empty {
+            let parameters = skin.parameters(described);
+            flash_file.store(&parameters).with_context(|| format!("flash of cell {cell}"))?;
+            flash = Flash::Sound(parameters);
+        }
+        cells.start(identity, &flash, flash_file);
+    }
+    let options = Options { filters: filters(&heard), ..Options::default() };
+    let bus = Bus::open(&arguments.bus, arguments.bus_kind, &options)?;
+    Ok((cells, bus))
+}
+
+/// One exact filter for each identifier; for more than a socket takes, one for each kind that is heard.
+fn filters(heard: &BTreeSet<Id>) -> Vec<Filter> {
+    if heard.len() <= Filter::MAX {
+        return heard.iter().copied().map(Filter::exact).collect();
+    }
+    let kinds: BTreeSet<_> = heard.iter().map(|id| id.kind).collect();
+    let of_kind =
+        |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
+    kinds.into_iter().map(of_kind).collect()
+}

@@ -1,0 +1,133 @@
+//! What a cell keeps when the power is off: its parameters, as bytes with a version and a CRC.
+//!
+//! ```text
+//!   byte 0..3  "SKIN"      4  version, 1      5  the cell's number
+//!        6..9  serial number, little endian
+//!       10..   the parameters' image (see `protocol::parameters`)
+//!     last 2   CRC-16 over all bytes before it, little endian
+//! ```
+
+use protocol::packet::crc16;
+use protocol::parameters::{IMAGE_BYTES, Parameters};
+use thiserror::Error;
+
+use crate::node::Identity;
+
+const MAGIC: &[u8; 4] = b"SKIN";
+const VERSION: u8 = 1;
+const HEAD_BYTES: usize = 10;
+
+/// Bytes of a flash image.
+pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
+
+/// Why an image is not used.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum FlashError {
+    /// Its size.
+    #[error("{got} bytes, not {BYTES}")]
+    Size {
+        /// Bytes that it has.
+        got: usize,
+    },
+    /// Its CRC.
+    #[error("its CRC is wrong")]
+    Damaged,
+    /// Its version.
+    #[error("version {got}, not {VERSION}")]
+    Version {
+        /// The version that it has.
+        got: u8,
+    },
+    /// Another cell's.
+    #[error("it belongs to cell {cell} with serial number {serial}")]
+    OtherCell {
+        /// Its number.
+        cell: u8,
+        /// Its serial number.
+        serial: u32,
+    },
+    /// Parameters that cannot be.
+    #[error("its parameters cannot be: {0}")]
+    Parameters(#[from] protocol::parameters::ParameterError),
+}
+
+/// The bytes to keep.
+#[must_use]
+pub fn encode(identity: Identity, parameters: &Parameters) -> [u8; BYTES] {
+    let mut bytes = [0; BYTES];
+    let serial = identity.serial.to_le_bytes();
+    let parts: [&[u8]; 4] = [MAGIC, &[VERSION, identity.cell.get()], &serial, &parameters.image()];
+    for (byte, &part) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
+        *byte = part;
+    }
+    if let Some((body, crc)) = bytes.split_last_chunk_mut::<2>() {
+        *crc = crc16(body).to_le_bytes();
+    }
+    bytes
+}
+
+/// What was kept. Never panics.
+///
+/// # Errors
+/// When the bytes are not whole, sound, of this version, of this cell, or no parameters.
+pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Parameters, FlashError> {
+    let size = FlashError::Size { got: bytes.len() };
+    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| size)?;
+    let (body, crc) = bytes.split_last_chunk::<2>().ok_or(size)?;
+    if crc16(body) != u16::from_le_bytes(*crc) || !body.starts_with(MAGIC) {
+        return Err(FlashError::Damaged);
+    }
+    let (head, image) = body.split_first_chunk::<HEAD_BYTES>().ok_or(size)?;
+    let &[_, _, _, _, version, cell, s0, s1, s2, s3] = head;
+    if version != VERSION {
+        return Err(FlashError::Version { got: version });
+    }
+    let serial = u32::from_le_bytes([s0, s1, s2, s3]);
+    if (cell, serial) != (identity.cell.get(), identity.serial) {
+        return Err(FlashError::OtherCell { cell, serial });
+    }
+    Ok(Parameters::from_image(image.try_into().map_err(|_| size)?)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::fixed::Q1_14;
+    use protocol::id::CellId;
+    use protocol::parameters::Pose;
+
+    fn identity() -> Identity {
+        Identity { cell: CellId::new(12).unwrap(), serial: 100_012 }
+    }
+
+    fn parameters() -> Parameters {
+        let pose = Pose { normal: [Q1_14::ZERO, Q1_14::ZERO, Q1_14::nearest(1.0)], ..Pose::default() };
+        Parameters { joint: 2, joints: 6, pose, period_us: 16_000, ..Parameters::default() }
+    }
+
+    #[test]
+    fn what_was_kept_comes_back_to_the_same_cell_only() {
+        let bytes = encode(identity(), &parameters());
+        assert_eq!(&bytes[..10], b"SKIN\x01\x0c\xac\x86\x01\x00");
+        assert_eq!(decode(identity(), &bytes), Ok(parameters()));
+        let other = Identity { serial: 7, ..identity() };
+        assert_eq!(decode(other, &bytes), Err(FlashError::OtherCell { cell: 12, serial: 100_012 }));
+        assert_eq!(decode(identity(), &bytes[1..]), Err(FlashError::Size { got: BYTES - 1 }));
+    }
+
+    proptest! {
+        #[test]
+        fn one_wrong_bit_is_noticed(bit in 0..BYTES * 8) {
+            let mut bytes = encode(identity(), &parameters());
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            prop_assert_eq!(decode(identity(), &bytes), Err(FlashError::Damaged));
+        }
+
+        #[test]
+        fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+            let _ = decode(identity(), &bytes);
+        }
+    }
+}

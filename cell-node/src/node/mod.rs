@@ -1,0 +1,442 @@
+//! The cell as a state machine: frames and times go in, packets and times come out.
+//!
+//! ```text
+//!   frame, now, age ─> handle_frame ───┐          ┌─> poll_transmit ─> packet
+//!              now ─> handle_timeout ──┼─ [Node] ─┼─> poll_timeout ──> when to call again
+//!       ok or not ─> handle_stored ────┘          ├─> poll_store ────> parameters for flash
+//!                                                 └─> taken ─────────> who has this number already
+//! ```
+//!
+//! It never blocks, allocates or panics, and reads no clock. A frame that it cannot use is counted by
+//! its reason, and nothing else.
+
+mod configuration;
+mod stimuli;
+
+use heapless::Deque;
+use protocol::can::{Format, Frame};
+use protocol::fixed::Q3_12;
+use protocol::id::{CellId, Command, Id, Kind, Node as Address};
+use protocol::message::{
+    Answer, From, Heard, Heartbeat, Joints, Message, NetworkPage, Refused, Request, SensorPage, State,
+    VERSION,
+};
+use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
+use protocol::parameters::{Parameter, Parameters};
+use protocol::time::{Micros, Span};
+
+use crate::contact::Torque;
+use crate::kernel::Kernel;
+use configuration::{Configuration, Written};
+use stimuli::{Arrival, Stimuli};
+
+pub use configuration::Flash;
+pub use stimuli::PENDING;
+
+/// From one heartbeat to the next.
+pub const HEARTBEAT: Span = Span::from_millis(250);
+/// How long a new cell listens for another one under its number.
+pub const CLAIM: Span = Span::from_millis(250);
+/// The shortest time between two answers to another cell under our number.
+const DEFEND: Span = Span::from_millis(10);
+
+/// Identifiers that a cell hears.
+pub const HEARD: usize = 10;
+/// Packets that wait to be sent; a shell takes them after every call.
+const OUTBOX: usize = 16;
+
+/// Who a cell is, from the factory on.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Identity {
+    /// Its number on the bus.
+    pub cell: CellId,
+    /// Its serial number.
+    pub serial: u32,
+}
+
+impl Identity {
+    /// The identifiers that this cell hears, and no others: halt, joints, sync, resume, report; its own
+    /// heartbeats' (to notice another cell under its number); what configures and presses it, alone or
+    /// with everyone.
+    #[must_use]
+    pub const fn hears(&self) -> [Id; HEARD] {
+        let cell = Address::Cell(self.cell);
+        [
+            Id::command(Command::Halt),
+            Id::command(Command::Joints),
+            Id::command(Command::Sync),
+            Id::command(Command::Resume),
+            Id::command(Command::Report),
+            Id::new(Kind::Network, cell),
+            Id::new(Kind::Configure, cell),
+            Id::new(Kind::Configure, Address::Everyone),
+            Id::new(Kind::Stimulus, cell),
+            Id::new(Kind::Stimulus, Address::Everyone),
+        ]
+    }
+}
+
+/// One cell.
+#[derive(Debug)]
+pub struct Node {
+    identity: Identity,
+    format: Format,
+    configuration: Configuration,
+    stimuli: Stimuli,
+    /// Halted, duplicate and so on; what can be derived is added when a heartbeat is made.
+    flags: State,
+    /// The last joints taken.
+    epoch: Option<Epoch>,
+    active: bool,
+    heard: Heard,
+    refused: Refused,
+    sent: u16,
+    halves: [Half; HEARD],
+    outbox: Deque<Message, OUTBOX>,
+    storing: Option<(Parameters, u8)>,
+    claiming_until: Option<Micros>,
+    next_heartbeat: Micros,
+    defended: Option<Micros>,
+    taken: Option<u32>,
+}
+
+impl Node {
+    /// A cell that starts now: it claims its number with a first heartbeat, and obeys stimuli if
+    /// `test_mode` says so.
+    #[must_use]
+    pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
+        let claimed = now + CLAIM;
+        let mut node = Self {
+            identity,
+            format,
+            configuration: Configuration::new(flash),
+            stimuli: Stimuli::default(),
+            flags: State::default()
+                .with(State::FLASH_DAMAGED, *flash == Flash::Damaged)
+                .with(State::TEST_MODE, test_mode),
+            epoch: None,
+            active: false,
+            heard: Heard::default(),
+            refused: Refused::default(),
+            sent: 0,
+            halves: [Half::NONE; HEARD],
+            outbox: Deque::new(),
+            storing: None,
+            claiming_until: Some(claimed),
+            next_heartbeat: claimed + phase(identity.cell),
+            defended: None,
+            taken: None,
+        };
+        node.push_heartbeat();
+        node
+    }
+
+    /// Who it is.
+    #[must_use]
+    pub const fn identity(&self) -> Identity {
+        self.identity
+    }
+
+    /// The serial number of the cell that has this number already; then this one must fall silent.
+    #[must_use]
+    pub const fn taken(&self) -> Option<u32> {
+        self.taken
+    }
+
+    /// The next packet to send.
+    pub fn poll_transmit(&mut self) -> Option<Packet> {
+        let mut message = self.outbox.pop_front()?;
+        // The counter says what went out before, so it is filled in when the heartbeat itself goes out.
+        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &mut message {
+            heartbeat.sent = self.sent;
+        }
+        self.sent = self.sent.wrapping_add(1);
+        Some(message.encode())
+    }
+
+    /// When [`Node::handle_timeout`] has something to do; calling it earlier does no harm.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Micros {
+        self.claiming_until.map_or(self.next_heartbeat, |until| until.min(self.next_heartbeat))
+    }
+
+    /// Parameters that have to go into flash; then comes [`Node::handle_stored`].
+    #[must_use]
+    pub fn poll_store(&self) -> Option<Parameters> {
+        self.storing.map(|(parameters, _)| parameters)
+    }
+
+    /// Flash was written, or could not be.
+    pub fn handle_stored(&mut self, written: bool) {
+        if let Some((parameters, tag)) = self.storing.take() {
+            let answer = self.configuration.stored(parameters, written);
+            self.flags =
+                self.flags.with(State::FLASH_DAMAGED, self.flags.has(State::FLASH_DAMAGED) && !written);
+            self.push(Message::Configured { from: self.identity.cell, tag, answer });
+        }
+    }
+
+    /// Takes in that time has passed. Harmless when called early.
+    pub fn handle_timeout(&mut self, now: Micros) {
+        if self.claiming_until.is_some_and(|until| now >= until) {
+            self.claiming_until = None;
+            self.push_heartbeat();
+        }
+        if now >= self.next_heartbeat {
+            self.push_heartbeat();
+            // After a hang the missed ones are skipped, and the phase is kept.
+            let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
+            self.next_heartbeat = self.next_heartbeat + Span((missed + 1) * HEARTBEAT.0);
+        }
+    }
+
+    /// Takes a frame that came `age` ago. What this cell does not hear is ignored.
+    pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
+        let Ok(id) = packet::data_id(frame) else {
+            count(&mut self.refused.foreign);
+            return;
+        };
+        let Some(slot) = self.identity.hears().iter().position(|&heard| heard == id) else { return };
+        let packet = match self.format {
+            Format::Fd => Packet::from_fd(frame),
+            Format::Classic => match self.pair(now, id, slot, frame) {
+                Some(result) => result,
+                None => return,
+            },
+        };
+        match packet {
+            Ok(packet) => self.handle_packet(now, age, &packet),
+            Err(PacketError::Length { .. }) => count(&mut self.refused.length),
+            Err(PacketError::Crc { .. }) => count(&mut self.refused.crc),
+            Err(_) => count(&mut self.refused.foreign),
+        }
+    }
+
+    /// Two classic frames make a packet; `None` while there is none.
+    fn pair(
+        &mut self,
+        now: Micros,
+        id: Id,
+        slot: usize,
+        frame: &Frame,
+    ) -> Option<Result<Packet, PacketError>> {
+        let half = self.halves.get_mut(slot)?;
+        if frame.format() != Format::Classic {
+            return Some(Err(PacketError::Length { expected: 8, got: frame.data().len() }));
+        }
+        match half.push(now, id, frame.data()) {
+            Ok(Paired::Waiting) => None,
+            Ok(Paired::Incomplete) => {
+                count(&mut self.refused.incomplete);
+                None
+            }
+            Ok(Paired::Whole(packet)) => Some(Ok(packet)),
+            Err(error) => Some(Err(error)),
+        }
+    }
+
+    fn handle_packet(&mut self, now: Micros, age: Span, packet: &Packet) {
+        let Ok(message) = Message::decode(packet) else {
+            count(&mut self.refused.meaning);
+            return;
+        };
+        match message {
+            Message::Joints { epoch, joints } => self.take_joints(age, epoch, &joints),
+            Message::Halt => {
+                self.flags = self.flags.with(State::HALTED, true);
+                self.active = false;
+            }
+            Message::Resume => self.flags = self.flags.with(State::HALTED, false),
+            Message::Sync => self.push_heartbeat(),
+            Message::Report => {
+                self.push_network(NetworkPage::Heard(self.heard));
+                self.push_network(NetworkPage::Refused(self.refused));
+                self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
+                self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
+            }
+            Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
+            Message::Configure { tag, request, .. } => self.configure(tag, request),
+            Message::Network { page, .. } => self.hear_own_number(now, &page),
+            // None of these is heard, see `Identity::hears`.
+            Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    /// Computes and answers; the paper's Eq. 8 and Algorithm 1.
+    fn take_joints(&mut self, age: Span, epoch: Epoch, joints: &Joints) {
+        if self.epoch == Some(epoch) {
+            count(&mut self.heard.joints_repeated);
+            return;
+        }
+        let in_use = self.configuration.in_use();
+        if in_use.is_some_and(|in_use| age.0 > u64::from(in_use.parameters.period_us)) {
+            count(&mut self.heard.joints_late);
+            return;
+        }
+        if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
+            count(&mut self.refused.meaning);
+            return;
+        }
+        self.epoch = Some(epoch);
+        count(&mut self.heard.joints);
+        self.stimuli.latch(epoch);
+        if self.claiming_until.is_some() || self.flags.has(State::HALTED) {
+            return;
+        }
+        let Some(in_use) = in_use else { return };
+        let force = in_use.force(self.stimuli.skin());
+        if !force.is_active() {
+            self.end_contact();
+            return;
+        }
+        let torque = Torque::new(&in_use.kernel.jacobian(&joints.positions), force);
+        let saturated = self.flags.has(State::SATURATED) || torque.is_saturated();
+        self.flags = self.flags.with(State::SATURATED, saturated);
+        self.active = true;
+        self.push_torque(epoch, torque.words());
+    }
+
+    /// One zero torque says that a contact has ended.
+    fn end_contact(&mut self) {
+        if let (true, Some(epoch)) = (self.active, self.epoch) {
+            self.active = false;
+            self.push_torque(epoch, [Q3_12::ZERO; WORDS]);
+        }
+    }
+
+    fn push_torque(&mut self, epoch: Epoch, torque: [Q3_12; WORDS]) {
+        count(&mut self.heard.torques);
+        self.push(Message::Torque { from: self.identity.cell, epoch, torque });
+    }
+
+    fn push_sensors(&mut self, page: SensorPage) {
+        let (from, epoch) = (self.identity.cell, self.epoch.unwrap_or_default());
+        self.push(Message::Sensors { from, epoch, page });
+    }
+
+    fn take_stimulus(&mut self, from: From, page: SensorPage) {
+        if !self.flags.has(State::TEST_MODE) {
+            count(&mut self.refused.stimuli);
+            return;
+        }
+        match self.stimuli.push(from, page, self.epoch) {
+            Arrival::InTime => count(&mut self.heard.stimuli),
+            Arrival::Late => {
+                count(&mut self.heard.stimuli);
+                count(&mut self.heard.stimuli_late);
+            }
+            Arrival::Refused => count(&mut self.refused.stimuli),
+        }
+    }
+
+    fn configure(&mut self, tag: u8, request: Request) {
+        let from = self.identity.cell;
+        let number = match request {
+            Request::Read { number } | Request::Write { number, .. } => number,
+        };
+        let refuse = |reason| Answer::Refused { number, reason };
+        let value = |written, words| Answer::Value { number, written, words };
+        let answer = match (Parameter::from_number(number), request) {
+            (None, _) => refuse(Answer::UNKNOWN),
+            (Some(Parameter::Identity), Request::Read { .. }) => value(false, self.identity_words()),
+            (Some(Parameter::Mode), Request::Read { .. }) => {
+                value(false, [i16::from(self.flags.has(State::TEST_MODE)), 0, 0, 0, 0, 0])
+            }
+            (Some(Parameter::Mode), Request::Write { words, .. }) => {
+                self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
+                self.stimuli.clear();
+                value(true, words)
+            }
+            (Some(parameter), Request::Read { .. }) => value(false, self.configuration.read(parameter)),
+            (Some(parameter), Request::Write { words, .. }) => {
+                match self.configuration.write(parameter, words) {
+                    Written::Answer(answer) => answer,
+                    Written::Store(parameters) => {
+                        self.storing = Some((parameters, tag));
+                        return;
+                    }
+                }
+            }
+        };
+        self.push(Message::Configured { from, tag, answer });
+    }
+
+    fn identity_words(&self) -> [i16; WORDS] {
+        let [a, b, c, d] = self.identity.serial.to_le_bytes();
+        [
+            i16::from_le_bytes([a, b]),
+            i16::from_le_bytes([c, d]),
+            i16::from(VERSION),
+            self.configuration.hash().cast_signed(),
+            self.state().0.cast_signed(),
+            0,
+        ]
+    }
+
+    /// Somebody else spoke under our number. While we claim it we give way, unless the other claims it
+    /// too and has the greater serial number; afterwards we say that it is ours.
+    fn hear_own_number(&mut self, now: Micros, page: &NetworkPage) {
+        self.flags = self.flags.with(State::DUPLICATE, true);
+        let other = match page {
+            NetworkPage::Heartbeat(other) => Some(other),
+            NetworkPage::Heard(_) | NetworkPage::Refused(_) => None,
+        };
+        let stays = other
+            .is_some_and(|other| other.state.has(State::CLAIMING) && other.serial > self.identity.serial);
+        if self.claiming_until.is_some() && !stays {
+            self.taken = Some(other.map_or(0, |other| other.serial));
+        } else if self.defended.is_none_or(|at| now.since(at) >= DEFEND) {
+            self.defended = Some(now);
+            self.push_heartbeat();
+        }
+    }
+
+    fn state(&self) -> State {
+        let joint = self.configuration.in_use().map_or(0, |in_use| in_use.parameters.joint);
+        self.flags
+            .with(State::CONFIGURED, self.configuration.in_use().is_some())
+            .with(State::ACTIVE, self.active)
+            .with(State::CLAIMING, self.claiming_until.is_some())
+            .with_joint(joint)
+    }
+
+    fn push_heartbeat(&mut self) {
+        let Refused { length, crc, foreign, meaning, incomplete, stimuli } = self.refused;
+        let rejected =
+            [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
+        let heartbeat = Heartbeat {
+            serial: self.identity.serial,
+            configuration: self.configuration.hash(),
+            sent: 0, // filled in when it goes out
+            rejected,
+            state: self.state(),
+        };
+        self.flags = self.flags.with(State::SATURATED, false).with(State::DUPLICATE, false);
+        self.push_network(NetworkPage::Heartbeat(heartbeat));
+    }
+
+    fn push_network(&mut self, page: NetworkPage) {
+        let from = Address::Cell(self.identity.cell);
+        self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
+    }
+
+    /// A shell that does not take what is sent loses what no longer fits; it is not counted as sent.
+    fn push(&mut self, message: Message) {
+        let _ = self.outbox.push_back(message);
+    }
+}
+
+/// Heartbeats of a bus are spread over the period by node number.
+const fn phase(cell: CellId) -> Span {
+    Span(HEARTBEAT.0 * cell.get() as u64 / 255)
+}
+
+const fn count(counter: &mut u16) {
+    *counter = counter.wrapping_add(1);
+}
+
+#[cfg(test)]
+mod tests;

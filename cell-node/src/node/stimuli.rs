@@ -1,0 +1,125 @@
+//! What a cell feels, and what it shall feel from a later epoch on.
+//!
+//! A stimulus is not felt when it arrives but when the joints of its epoch do, so that a torque is a
+//! function of one joints frame and not of who was quicker on the bus.
+
+use heapless::Deque;
+use protocol::fixed::Q3_12;
+use protocol::message::{From, SensorPage, SkinSensors};
+use protocol::packet::Epoch;
+
+/// How many stimuli can wait for their epoch.
+pub const PENDING: usize = 8;
+
+/// What became of a stimulus.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Arrival {
+    /// It waits for its joints.
+    InTime,
+    /// The joints of its epoch were taken already; it waits for the next.
+    Late,
+    /// There was no room for it.
+    Refused,
+}
+
+/// The sensors of a cell in test mode.
+#[derive(Debug, Default)]
+pub(super) struct Stimuli {
+    pending: Deque<(From, SensorPage), PENDING>,
+    skin: SkinSensors,
+    acceleration: [Q3_12; 3],
+}
+
+impl Stimuli {
+    /// What is felt now.
+    #[must_use]
+    pub(super) const fn skin(&self) -> &SkinSensors {
+        &self.skin
+    }
+
+    /// The acceleration felt now, in g.
+    #[must_use]
+    pub(super) const fn acceleration(&self) -> [Q3_12; 3] {
+        self.acceleration
+    }
+
+    /// Takes a stimulus that shall hold from some joints on; `last` are the last joints taken.
+    pub(super) fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) -> Arrival {
+        let (from, arrival) = match (from, last) {
+            (From::Epoch(first), Some(last)) if last.since(first) >= 0 => (From::Next, Arrival::Late),
+            (from @ (From::Epoch(_) | From::Next), _) => (from, Arrival::InTime),
+        };
+        if self.pending.push_back((from, page)).is_ok() { arrival } else { Arrival::Refused }
+    }
+
+    /// Feels, in the order of their arrival, all stimuli that hold from `epoch` on or earlier.
+    pub(super) fn latch(&mut self, epoch: Epoch) {
+        for _ in 0..self.pending.len() {
+            let Some((from, page)) = self.pending.pop_front() else { break };
+            let due = match from {
+                From::Next => true,
+                From::Epoch(first) => epoch.since(first) >= 0,
+            };
+            if !due {
+                // There is room: it was there a moment ago.
+                let _ = self.pending.push_back((from, page));
+                continue;
+            }
+            match page {
+                SensorPage::Skin(skin) => self.skin = skin,
+                SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
+            }
+        }
+    }
+
+    /// Forgets everything: nothing touches the cell.
+    pub(super) fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::fixed::Q5_10;
+
+    fn press(newtons: f64) -> SensorPage {
+        SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
+    }
+
+    fn felt(stimuli: &Stimuli) -> f64 {
+        stimuli.skin().contact[0].to_f64()
+    }
+
+    #[test]
+    fn a_stimulus_waits_for_its_epoch_even_around_the_corner() {
+        let mut stimuli = Stimuli::default();
+        let last = Some(Epoch(253));
+        assert_eq!(stimuli.push(From::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
+        assert_eq!(stimuli.push(From::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
+        let course = [254, 255, 0, 1, 2].map(|epoch| {
+            stimuli.latch(Epoch(epoch));
+            felt(&stimuli)
+        });
+        assert!(course.iter().eq(&[0.0, 1.0, 1.0, 2.0, 2.0]), "{course:?}");
+    }
+
+    #[test]
+    fn a_late_stimulus_holds_from_the_next_joints() {
+        let mut stimuli = Stimuli::default();
+        stimuli.latch(Epoch(7));
+        assert_eq!(stimuli.push(From::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
+        assert!(felt(&stimuli) < 0.5, "not before the next joints");
+        stimuli.latch(Epoch(40));
+        assert!(felt(&stimuli) > 0.5);
+    }
+
+    #[test]
+    fn the_ninth_waiting_stimulus_is_refused() {
+        let mut stimuli = Stimuli::default();
+        for _ in 0..PENDING {
+            assert_eq!(stimuli.push(From::Next, press(1.0), None), Arrival::InTime);
+        }
+        assert_eq!(stimuli.push(From::Next, press(1.0), None), Arrival::Refused);
+    }
+}

@@ -1,0 +1,329 @@
+use super::*;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::message::SkinSensors;
+use protocol::parameters::{Contact, Pose, Row};
+
+/// A wheel: one joint about z, a cell on its rim that looks along the direction of motion.
+fn wheel() -> Parameters {
+    let [zero, one] = [Q1_14::ZERO, Q1_14::nearest(1.0)];
+    let mut parameters = Parameters {
+        joint: 1,
+        joints: 1,
+        pose: Pose { position: [Q1_14::nearest(0.5), zero, zero], normal: [zero, one, zero] },
+        contact: Contact {
+            alpha_c: Q3_12::nearest(1.0),
+            force_threshold: Q5_10::nearest(0.5),
+            ..Contact::default()
+        },
+        period_us: 16_000,
+        ..Parameters::default()
+    };
+    parameters.rows[0] = Row::default();
+    parameters
+}
+
+fn identity() -> Identity {
+    Identity { cell: CellId::new(12).unwrap(), serial: 100_012 }
+}
+
+/// A cell that has claimed its number and said so.
+fn settled(flash: Flash) -> Node {
+    let mut node = Node::new(identity(), Format::Fd, &flash, true, Micros(0));
+    node.handle_timeout(Micros(CLAIM.0));
+    drain(&mut node);
+    node
+}
+
+fn drain(node: &mut Node) -> Vec<Message> {
+    core::iter::from_fn(|| node.poll_transmit()).map(|packet| Message::decode(&packet).unwrap()).collect()
+}
+
+const NOW: Micros = Micros(300_000);
+
+fn tell(node: &mut Node, message: &Message) -> Vec<Message> {
+    for frame in message.encode().frames(Format::Fd) {
+        node.handle_frame(NOW, Span(0), &frame);
+    }
+    drain(node)
+}
+
+fn joints(epoch: u8) -> Message {
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 } }
+}
+
+fn press(newtons: f64, from: From) -> Message {
+    let contact = [Q5_10::nearest(newtons), Q5_10::ZERO, Q5_10::ZERO];
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    Message::Stimulus { to: Address::Cell(identity().cell), from, page }
+}
+
+fn torque(epoch: u8, nm: f64) -> Message {
+    let mut torque = [Q3_12::ZERO; WORDS];
+    torque[0] = Q3_12::nearest(nm);
+    Message::Torque { from: identity().cell, epoch: Epoch(epoch), torque }
+}
+
+fn heartbeat(messages: &[Message]) -> Heartbeat {
+    match messages {
+        [Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. }] => *heartbeat,
+        other => panic!("one heartbeat expected, not {other:?}"),
+    }
+}
+
+fn heard(node: &mut Node) -> (Heard, Refused) {
+    match tell(node, &Message::Report).as_slice() {
+        [
+            Message::Network { page: NetworkPage::Heard(heard), .. },
+            Message::Network { page: NetworkPage::Refused(refused), .. },
+            Message::Sensors { .. },
+            Message::Sensors { .. },
+        ] => (*heard, *refused),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_pressed_cell_answers_each_joints_frame_and_says_once_that_the_contact_has_ended() {
+    let mut node = settled(Flash::Sound(wheel()));
+    assert_eq!(tell(&mut node, &joints(0)), [], "quiet: nothing touches it");
+    assert_eq!(tell(&mut node, &press(4.0, From::Epoch(Epoch(2)))), []);
+    assert_eq!(tell(&mut node, &joints(1)), [], "not yet");
+    // It is pushed against its normal, 4 N at 0.5 m: the wheel gives way.
+    assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
+    assert_eq!(tell(&mut node, &joints(3)), [torque(3, -2.0)]);
+    assert_eq!(tell(&mut node, &press(0.0, From::Next)), []);
+    assert_eq!(tell(&mut node, &joints(4)), [torque(4, 0.0)]);
+    assert_eq!(tell(&mut node, &joints(5)), []);
+    let (heard, refused) = heard(&mut node);
+    assert_eq!(heard, Heard { joints: 6, stimuli: 2, torques: 3, ..Heard::default() });
+    assert_eq!(refused, Refused::default());
+}
+
+#[test]
+fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
+    let mut node = settled(Flash::Sound(wheel()));
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(7)).len(), 1);
+    assert_eq!(tell(&mut node, &joints(7)), []);
+    for frame in joints(8).encode().frames(Format::Fd) {
+        node.handle_frame(NOW, Span(16_001), &frame);
+    }
+    assert_eq!(drain(&mut node), []);
+    assert_eq!(tell(&mut node, &joints(200)).len(), 1);
+    assert_eq!(tell(&mut node, &joints(3)).len(), 1);
+    let (heard, _) = heard(&mut node);
+    assert_eq!((heard.joints, heard.joints_repeated, heard.joints_late), (3, 1, 1));
+}
+
+#[test]
+fn a_halted_cell_is_silent_until_a_resume() {
+    let mut node = settled(Flash::Sound(wheel()));
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(0)).len(), 1);
+    assert_eq!(tell(&mut node, &Message::Halt), []);
+    assert_eq!(tell(&mut node, &joints(1)), []);
+    let state = heartbeat(&tell(&mut node, &Message::Sync)).state;
+    assert!(state.has(State::HALTED) && !state.has(State::ACTIVE));
+    assert_eq!(tell(&mut node, &Message::Resume), []);
+    assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
+}
+
+#[test]
+fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
+    let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
+    let first = heartbeat(&drain(&mut node));
+    assert!(first.state.has(State::CLAIMING) && first.sent == 0 && first.serial == 100_012);
+    let mut times = vec![];
+    while times.len() < 4 {
+        let at = node.poll_timeout();
+        node.handle_timeout(at - Span(1));
+        assert_eq!(drain(&mut node), [], "early is harmless");
+        node.handle_timeout(at);
+        times.push((at.0, heartbeat(&drain(&mut node)).sent));
+    }
+    assert_eq!(times, [(250_000, 1), (261_764, 2), (511_764, 3), (761_764, 4)]);
+    // A hang of a second costs its heartbeats and keeps the phase.
+    node.handle_timeout(Micros(2_000_000));
+    assert_eq!(node.poll_timeout(), Micros(2_011_764));
+}
+
+#[test]
+fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
+    let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
+    drain(&mut node);
+    let mut other = settled(Flash::Sound(wheel()));
+    // The newcomer's claim reaches the one that is there, which says that the number is its own.
+    let mut newcomer = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
+    let claim = drain(&mut newcomer);
+    let defence = tell(&mut other, &claim[0]);
+    assert!(heartbeat(&defence).state.has(State::DUPLICATE));
+    assert_eq!(newcomer.taken(), None);
+    tell(&mut newcomer, &defence[0]);
+    assert_eq!(newcomer.taken(), Some(100_012));
+    assert_eq!(other.taken(), None);
+}
+
+#[test]
+fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
+    let start =
+        |serial| Node::new(Identity { serial, ..identity() }, Format::Fd, &Flash::Empty, true, Micros(0));
+    let (mut low, mut high) = (start(1), start(2));
+    let (from_low, from_high) = (drain(&mut low), drain(&mut high));
+    tell(&mut low, &from_high[0]);
+    tell(&mut high, &from_low[0]);
+    assert_eq!((low.taken(), high.taken()), (None, Some(1)));
+}
+
+#[test]
+fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
+    let mut node = settled(Flash::Damaged);
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(0)), []);
+    let heartbeat = heartbeat(&tell(&mut node, &Message::Sync));
+    assert!(heartbeat.state.has(State::FLASH_DAMAGED) && !heartbeat.state.has(State::CONFIGURED));
+    assert_eq!((heartbeat.configuration, heartbeat.state.joint()), (0, 0));
+}
+
+#[test]
+fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
+    let mut node = settled(Flash::Damaged);
+    let to = Address::Cell(identity().cell);
+    let ask = |node: &mut Node, request| {
+        let answer = tell(node, &Message::Configure { to, tag: 77, request });
+        match answer.as_slice() {
+            [Message::Configured { tag: 77, answer, .. }] => Some(*answer),
+            [] => None,
+            other => panic!("{other:?}"),
+        }
+    };
+    for parameter in Parameter::STORED {
+        let (number, words) = (parameter.number(), wheel().words(parameter));
+        let answer = ask(&mut node, Request::Write { number, words });
+        assert_eq!(answer, Some(Answer::Value { number, written: true, words }));
+        assert_eq!(
+            ask(&mut node, Request::Read { number }),
+            Some(Answer::Value { number, written: false, words })
+        );
+    }
+    let commit = |hash: u16| Request::Write { number: 127, words: [hash.cast_signed(), 0, 0, 0, 0, 0] };
+    let refused = |reason| Some(Answer::Refused { number: 127, reason });
+    assert_eq!(ask(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
+    assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");
+
+    assert_eq!(ask(&mut node, commit(wheel().hash())), None, "flash first");
+    assert_eq!(node.poll_store(), Some(wheel()));
+    node.handle_stored(false);
+    let failed = Message::Configured {
+        from: identity().cell,
+        tag: 77,
+        answer: refused(Answer::FLASH_FAILED).unwrap(),
+    };
+    assert_eq!(drain(&mut node), [failed]);
+
+    ask(&mut node, commit(wheel().hash()));
+    node.handle_stored(true);
+    assert_eq!(drain(&mut node).len(), 1);
+    assert_eq!(node.poll_store(), None);
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)]);
+    let state = heartbeat(&tell(&mut node, &Message::Sync)).state;
+    assert!(state.has(State::CONFIGURED) && !state.has(State::FLASH_DAMAGED), "mended");
+
+    // What cannot be is refused, and what was in use stays in use.
+    let mut words = wheel().words(Parameter::Mount);
+    words[0] = 2;
+    ask(&mut node, Request::Write { number: 1, words });
+    let hash = Parameters { joint: 2, ..wheel() }.hash();
+    assert_eq!(ask(&mut node, commit(hash)), refused(3));
+    assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
+    assert_eq!(
+        ask(&mut node, Request::Read { number: 99 }),
+        Some(Answer::Refused { number: 99, reason: Answer::UNKNOWN })
+    );
+}
+
+#[test]
+fn a_cell_that_measures_refuses_stimuli() {
+    let mut node = settled(Flash::Sound(wheel()));
+    let to = Address::Everyone;
+    tell(
+        &mut node,
+        &Message::Configure { to, tag: 0, request: Request::Write { number: 5, words: [0; WORDS] } },
+    );
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(0)), []);
+    assert_eq!(heard(&mut node).1.stimuli, 1);
+}
+
+#[test]
+fn what_cannot_be_used_is_counted_by_its_reason() {
+    let mut node = settled(Flash::Sound(wheel()));
+    let mut hear = |frame: Frame| node.handle_frame(NOW, Span(0), &frame);
+    let good = joints(0).encode().frames(Format::Fd).next().unwrap();
+    let mut wrong_crc = *good.data().first_chunk::<16>().unwrap();
+    wrong_crc[15] ^= 1;
+    hear(Frame::fd(0x001, 1, &wrong_crc).unwrap());
+    hear(Frame::fd(0x001, 1, &good.data()[..12]).unwrap());
+    hear(Frame::classic(0x001, &good.data()[..8]).unwrap());
+    hear(Frame::remote(0x001, 8).unwrap());
+    hear(Packet { count: 7, ..joints(0).encode() }.frames(Format::Fd).next().unwrap());
+    hear(Packet { count: 2, ..joints(0).encode() }.frames(Format::Fd).next().unwrap()); // a robot of two joints
+    hear(Frame::fd(0x2FF, 1, &[0; 16]).unwrap()); // not for this cell
+    let (_, refused) = heard(&mut node);
+    assert_eq!(refused, Refused { length: 2, crc: 1, foreign: 1, meaning: 2, incomplete: 0, stimuli: 0 });
+    assert_eq!(heartbeat(&tell(&mut node, &Message::Sync)).rejected, 6);
+}
+
+#[test]
+fn a_torque_that_does_not_fit_is_marked_as_saturated() {
+    let mut node = settled(Flash::Sound(wheel()));
+    tell(&mut node, &press(31.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(0)), [torque(0, -100.0)]);
+    assert!(heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::SATURATED));
+    assert!(!heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::SATURATED), "since the last one");
+}
+
+#[test]
+fn the_classic_format_works_in_halves() {
+    let flash = Flash::Sound(wheel());
+    let mut node = Node::new(identity(), Format::Classic, &flash, true, Micros(0));
+    node.handle_timeout(Micros(CLAIM.0));
+    drain(&mut node);
+    let hear = |node: &mut Node, message: &Message| {
+        for frame in message.encode().frames(Format::Classic) {
+            node.handle_frame(NOW, Span(0), &frame);
+        }
+        drain(node)
+    };
+    assert_eq!(hear(&mut node, &press(4.0, From::Next)), []);
+    assert_eq!(hear(&mut node, &joints(0)), [torque(0, -2.0)]);
+    // Half a packet is lost: that packet is lost, the next one is not.
+    let first = joints(1).encode().frames(Format::Classic).next().unwrap();
+    node.handle_frame(NOW, Span(0), &first);
+    assert_eq!(hear(&mut node, &joints(2)), [torque(2, -2.0)]);
+}
+
+#[test]
+fn no_frame_whatever_brings_a_cell_down() {
+    use proptest::prelude::*;
+    let frames =
+        proptest::collection::vec((0_u32..0x800, proptest::collection::vec(any::<u8>(), 0..=64)), 0..40);
+    proptest!(|(frames in frames)| {
+        let mut node = settled(Flash::Sound(wheel()));
+        for (id, data) in frames {
+            // With a right CRC, so that what lies behind it is reached.
+            let id = Id::from_bits(u16::try_from(id).unwrap() & 0x70F | 12);
+            let mut words = [0_i16; WORDS];
+            for (word, chunk) in words.iter_mut().zip(data.as_chunks::<2>().0) {
+                *word = i16::from_le_bytes(*chunk);
+            }
+            let (epoch, count) = (Epoch(data.first().copied().unwrap_or(0)), data.last().copied().unwrap_or(0));
+            for frame in (Packet { id, words, epoch, count }).frames(Format::Fd) {
+                node.handle_frame(NOW, Span(0), &frame);
+            }
+            node.handle_frame(NOW, Span(0), &Frame::fd(u32::from(id.to_bits()), 0, &data).unwrap());
+            node.handle_stored(true);
+            while node.poll_transmit().is_some() {}
+        }
+    });
+}
