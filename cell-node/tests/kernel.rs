@@ -10,7 +10,7 @@
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::witness::{Counted, Operations};
-use cell_node::kernel::{Kernel, Wrench};
+use cell_node::kernel::{Kernel, PaperWord, Projection, Wrench};
 use proptest::prelude::*;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
@@ -64,10 +64,119 @@ fn a_pressed_cell_lets_the_joint_give_way() {
 }
 
 #[test]
-fn the_wrench_kernel_does_what_it_says_on_a_ur5() {
+fn the_projection_kernel_errs_less_than_the_papers_0_0054_nm_on_a_ur5() {
+    let (mean, greatest) = errors(|parameters, joints| Projection::<Q1_14>::new(parameters).jacobian(joints));
+    println!("projection: mean {mean:.3e} Nm, greatest {greatest:.3e} Nm");
+    assert!(mean <= 1.4e-4 && greatest <= 1.5e-3);
+
+    let (mean, greatest) = errors(|parameters, joints| {
+        Projection::<PaperWord>::new(parameters).jacobian(joints).map(|PaperWord(row)| row)
+    });
+    println!("projection with the paper's sine: mean {mean:.3e} Nm, greatest {greatest:.3e} Nm");
+    assert!(mean <= 5.4e-3);
+}
+
+/// What a kernel does for the UR5 and a cell on its last link.
+fn operations<K: Kernel<Counted>>() -> Operations {
     let last = Case::all().into_iter().find(|case| case.joint == 6).unwrap();
-    let kernel = Wrench::<Counted>::new(&last.parameters());
-    let (_, done) = Operations::count(|| kernel.jacobian(&last.words()));
-    println!("{done:?}");
-    assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (40, 24, 5, 5));
+    let kernel = K::new(&last.parameters());
+    Operations::count(|| kernel.jacobian(&last.words())).1
+}
+
+#[test]
+fn the_operations_on_a_ur5_are_what_the_docs_say() {
+    let wrench = operations::<Wrench<Counted>>();
+    println!("{wrench:?}");
+    assert_eq!((wrench.multiplications, wrench.additions, wrench.sines, wrench.cosines), (40, 24, 5, 5));
+    let projection = operations::<Projection<Counted>>();
+    println!("{projection:?}");
+    assert_eq!(
+        (projection.multiplications, projection.additions, projection.sines, projection.cosines),
+        (103, 56, 6, 6)
+    );
+}
+
+/// The words of an arm: any at all.
+fn any_arm() -> impl Strategy<Value = Parameters> {
+    arm(any::<i16>())
+}
+
+/// An arm of 1 to 6 joints whose lengths are drawn from `length`, with quarter turns and zeros more
+/// often than by chance.
+fn arm(length: impl Strategy<Value = i16> + Clone) -> impl Strategy<Value = Parameters> {
+    let length = prop_oneof![1 => Just(0), 3 => length];
+    let alpha = prop_oneof![
+        2 => Just(0), 1 => Just(0x4000), 1 => Just(-0x4000), 1 => Just(i16::MIN), 2 => any::<i16>()
+    ];
+    let offset = prop_oneof![Just(0), any::<i16>()];
+    let row = (length.clone(), length.clone(), alpha, offset).prop_map(|(a, d, alpha, theta_offset)| Row {
+        a: Q1_14::from_bits(a),
+        d: Q1_14::from_bits(d),
+        alpha: Q1_14::from_bits(alpha),
+        theta_offset: Q1_14::from_bits(theta_offset),
+    });
+    let position = [length.clone(), length.clone(), length];
+    (prop::array::uniform6(row), 1_u8..=6, position, any::<[i16; 3]>()).prop_map(
+        |(rows, joint, position, normal)| Parameters {
+            joint,
+            joints: 6,
+            pose: Pose { position: position.map(Q1_14::from_bits), normal: normal.map(Q1_14::from_bits) },
+            rows,
+            ..Parameters::default()
+        },
+    )
+}
+
+/// An arm that fits Q1.14: no part longer than 0.15 m, a normal of unit length.
+fn sound_arm() -> impl Strategy<Value = Parameters> {
+    let direction = (-1.0..1.0_f64, -1.0..1.0_f64, -1.0..1.0_f64)
+        .prop_filter("has a direction", |(x, y, z)| (0.1..1.0).contains(&(x * x + y * y + z * z)));
+    (arm(-2_458_i16..=2_458), direction).prop_map(|(parameters, (x, y, z))| {
+        let length = (x * x + y * y + z * z).sqrt();
+        let normal = [x, y, z].map(|n| Q1_14::nearest(n / length));
+        Parameters { pose: Pose { normal, ..parameters.pose }, ..parameters }
+    })
+}
+
+/// The greatest difference of two Jacobians.
+fn apart(lhs: [f64; 6], rhs: [f64; 6]) -> f64 {
+    lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
+}
+
+fn in_words<K: Kernel>(parameters: &Parameters, joints: &[Q1_14; 6]) -> [f64; 6] {
+    K::new(parameters).jacobian(joints).map(Q1_14::to_f64)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(4_096))]
+
+    #[test]
+    fn both_kernels_are_equation_8_in_real_numbers(parameters in any_arm(), joints: [i16; 6]) {
+        let joints = joints.map(Q1_14::from_bits);
+        let wanted = equation_8(&parameters, &joints);
+        let wrench = Wrench::<f64>::new(&parameters).jacobian(&joints);
+        let projection = Projection::<f64>::new(&parameters).jacobian(&joints);
+        prop_assert!(apart(wrench, wanted) <= 1e-9, "{wrench:?} is not {wanted:?}");
+        prop_assert!(apart(projection, wanted) <= 1e-9, "{projection:?} is not {wanted:?}");
+    }
+
+    #[test]
+    fn words_err_by_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; 6]) {
+        let joints = joints.map(Q1_14::from_bits);
+        let wanted = equation_8(&parameters, &joints);
+        let wrench = in_words::<Wrench>(&parameters, &joints);
+        let projection = in_words::<Projection>(&parameters, &joints);
+        prop_assert!(apart(wrench, wanted) <= 1e-3, "{wrench:?} is not {wanted:?}");
+        prop_assert!(apart(projection, wanted) <= 1e-3, "{projection:?} is not {wanted:?}");
+    }
+
+    #[test]
+    fn no_words_panic_whether_they_make_sense_or_not(
+        parameters in any_arm(), joint: u8, joints: [i16; 6], steps: i64,
+    ) {
+        let parameters = Parameters { joint, ..parameters };
+        let joints = joints.map(Q1_14::from_bits);
+        let _ = Torque::new(&Wrench::<Q1_14>::new(&parameters).jacobian(&joints), Force::from_steps(steps));
+        let _ = Projection::<Q1_14>::new(&parameters).jacobian(&joints);
+    }
 }

@@ -21,11 +21,13 @@
 //! twists four; lengths that are zero cost nothing. Parameters that
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
+mod projection;
 mod scalar;
 #[cfg(any(feature = "host", test))]
 pub mod witness;
 mod wrench;
 
+pub use projection::Projection;
 pub use scalar::{PaperWord, Scalar};
 pub use wrench::Wrench;
 

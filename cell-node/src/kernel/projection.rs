@@ -1,0 +1,296 @@
+//! The projection kernel: the paper's own, with the frames carried up to the cell.
+//!
+//! The axes of each frame l in the base frame (Eq. 20) give the cell's position relative to each frame
+//! from the tip down (Eq. 22 to 24), and with the force in the base frame (Eq. 25) the triple product of
+//! Eq. 8:
+//!
+//! ```text
+//! x_l = c X + s Y     v_l = c Y - s X          X, Y: the axes before the turn by theta_l
+//! y_l, z_l from v_l, z_(l-1) by the twist alpha_l
+//!
+//! f = R_k f_k         p_k = R_k t_k
+//! p_(l-1) = p_l + a_l x_l + d_l z_(l-1)        J_l = (z_(l-1) x p_(l-1)) . f
+//! ```
+//!
+//! Reused as in the paper's count: `a_l x_l` is the joint's own translation without a further product;
+//! joints whose axes are parallel (alpha = 0) turn by one sum of angles, so that X and Y are those of
+//! the first of them; and components that are 0 or 1 whatever the joints ([`Component`]) are neither
+//! multiplied nor added. What no later step reads is not computed.
+
+use protocol::fixed::Q1_14;
+use protocol::parameters::{MAX_JOINTS, Parameters, Row};
+
+use super::{Kernel, Quarters, Scalar, Twist};
+
+/// The projection kernel, of one cell.
+///
+/// For a UR5 and a cell on its last link: 103 multiplications, 56 additions or subtractions, 6 sines and
+/// 6 cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Projection<S = Q1_14> {
+    /// The joint that moves the cell; 0 when there is none.
+    joint: usize,
+    /// Whether all axes are upright: then nobody reads how high the cell is and how hard it is pushed up.
+    upright: bool,
+    /// The cell in the frame of joint k.
+    position: [S; 3],
+    /// Where the contact pushes, in the same frame.
+    force: [S; 3],
+    /// From joint 1 up; those up to k are in use.
+    links: [Link<S>; MAX_JOINTS],
+}
+
+/// One row of the robot's table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Link<S> {
+    /// theta_offset.
+    offset: Q1_14,
+    twist: Twist<S>,
+    a: Option<S>,
+    /// Absent for joint 1 too: it shifts along the axis of joint 1, which has no moment about it.
+    d: Option<S>,
+    /// Whether somebody reads x_l.
+    x: bool,
+    /// Whether this ends a group of parallel axes; then somebody reads v_l.
+    ends: bool,
+}
+
+/// A component of an axis in the base frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Component<S> {
+    /// 0, whatever the joints are.
+    Zero,
+    /// 1, whatever the joints are.
+    One,
+    /// -1, whatever the joints are.
+    MinusOne,
+    /// It depends on the joints.
+    Varies(S),
+}
+
+type Axis<S> = [Component<S>; 3];
+
+/// What the way down needs of joint l: x_l and z_(l-1).
+#[derive(Clone, Copy, Debug)]
+struct Step<S> {
+    x: Axis<S>,
+    z: Axis<S>,
+}
+
+impl<S: Scalar> Kernel<S> for Projection<S> {
+    fn new(parameters: &Parameters) -> Self {
+        let chain = parameters.chain();
+        let mut links = [Link::IDLE; MAX_JOINTS];
+        for (index, (link, row)) in links.iter_mut().zip(chain).enumerate() {
+            *link = Link::new(row, index == 0, index + 1 == chain.len());
+        }
+        let (_, below) = chain.split_last().unzip();
+        let upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
+        Self {
+            joint: chain.len(),
+            upright: below.unwrap_or_default().iter().all(upright),
+            position: parameters.pose.position.map(S::word),
+            force: parameters.pose.normal.map(|word| S::word(word.saturating_neg())),
+            links,
+        }
+    }
+
+    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
+        let mut jacobian = [S::ZERO; MAX_JOINTS];
+        let links = self.links.get(..self.joint).unwrap_or_default();
+
+        let [mut x, mut y, mut z] = Component::BASE;
+        let mut steps = [Step { x, z }; MAX_JOINTS];
+        let mut group = None;
+        for ((step, link), &position) in steps.iter_mut().zip(links).zip(joints) {
+            let angle = link.angle(group, position);
+            group = (!link.ends).then_some(angle);
+            step.z = z;
+            if !link.x {
+                continue;
+            }
+            let (sine, cosine) = (S::sine(angle), S::cosine(angle));
+            step.x = combine(x, y, |x, y| Sum::Nothing.plus(cosine, x).plus(sine, y));
+            if link.ends {
+                let v = combine(x, y, |x, y| Sum::Nothing.plus(cosine, y).minus(sine, x));
+                x = step.x;
+                [y, z] = link.twist.turn_axes(v, z);
+            }
+        }
+
+        let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (x, y, z);
+        let to_base = |[a, b, c]: [S; 3]| {
+            let row = |x, y, z| Sum::Nothing.plus(a, x).plus(b, y).plus(c, z).component().number();
+            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::ZERO } else { row(x2, y2, z2) }]
+        };
+        let force = to_base(self.force);
+        let mut position = to_base(self.position);
+        for ((row, step), link) in jacobian.iter_mut().zip(&steps).zip(links).rev() {
+            position = link.shift(position, step, self.upright);
+            *row = triple_product(step.z, position, force);
+        }
+        jacobian
+    }
+}
+
+impl<S: Scalar> Link<S> {
+    const IDLE: Self = Self {
+        offset: Q1_14::ZERO,
+        twist: Twist::Quarters(Quarters::None),
+        a: None,
+        d: None,
+        x: false,
+        ends: false,
+    };
+
+    fn new(row: &Row, first: bool, last: bool) -> Self {
+        let length = |word: Q1_14| (word != Q1_14::ZERO).then(|| S::word(word));
+        let ends = last || row.alpha != Q1_14::ZERO;
+        let a = length(row.a);
+        Self {
+            offset: row.theta_offset,
+            twist: Twist::new(row.alpha),
+            a,
+            d: if first { None } else { length(row.d) },
+            x: ends || a.is_some(),
+            ends,
+        }
+    }
+
+    /// The angle from the axes before the group of parallel joints to this joint's.
+    fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
+        let own = if self.offset == Q1_14::ZERO { position } else { S::plus_angle(position, self.offset) };
+        group.map_or(own, |group| S::plus_angle(group, own))
+    }
+
+    /// p_(l-1) from p_l (Eq. 24).
+    fn shift(&self, [p0, p1, p2]: [S; 3], step: &Step<S>, upright: bool) -> [S; 3] {
+        let ([x0, x1, x2], [z0, z1, z2]) = (step.x, step.z);
+        let shift = |p: S, x, z| {
+            let sum = self.a.map_or(Sum::Word(p), |a| Sum::Word(p).plus(a, x));
+            self.d.map_or(sum, |d| sum.plus(d, z)).component().number()
+        };
+        [shift(p0, x0, z0), shift(p1, x1, z1), if upright { p2 } else { shift(p2, x2, z2) }]
+    }
+}
+
+impl<S: Scalar> Twist<S> {
+    /// The second and the third axis after the twist, from those before it.
+    fn turn_axes(self, v: Axis<S>, z: Axis<S>) -> [Axis<S>; 2] {
+        match self {
+            Self::Quarters(Quarters::None) => [v, z],
+            Self::Quarters(Quarters::Ahead) => [z, v.map(Component::negative)],
+            Self::Quarters(Quarters::Half) => [v.map(Component::negative), z.map(Component::negative)],
+            Self::Quarters(Quarters::Back) => [z.map(Component::negative), v],
+            Self::Other { sine, cosine } => [
+                combine(v, z, |v, z| Sum::Nothing.plus(cosine, v).plus(sine, z)),
+                combine(v, z, |v, z| Sum::Nothing.plus(cosine, z).minus(sine, v)),
+            ],
+        }
+    }
+}
+
+/// (z x p) . f (Eq. 8).
+fn triple_product<S: Scalar>([z0, z1, z2]: Axis<S>, [p0, p1, p2]: [S; 3], [f0, f1, f2]: [S; 3]) -> S {
+    let m0 = Sum::Nothing.plus(p2, z1).minus(p1, z2).component();
+    let m1 = Sum::Nothing.plus(p0, z2).minus(p2, z0).component();
+    let m2 = Sum::Nothing.plus(p1, z0).minus(p0, z1).component();
+    Sum::Nothing.plus(f0, m0).plus(f1, m1).plus(f2, m2).component().number()
+}
+
+/// One sum for each component of two axes.
+fn combine<S: Scalar>(
+    [a0, a1, a2]: Axis<S>,
+    [b0, b1, b2]: Axis<S>,
+    sum: impl Fn(Component<S>, Component<S>) -> Sum<S>,
+) -> Axis<S> {
+    [sum(a0, b0).component(), sum(a1, b1).component(), sum(a2, b2).component()]
+}
+
+impl<S: Scalar> Component<S> {
+    /// The base frame's own axes.
+    const BASE: [Axis<S>; 3] = [
+        [Self::One, Self::Zero, Self::Zero],
+        [Self::Zero, Self::One, Self::Zero],
+        [Self::Zero, Self::Zero, Self::One],
+    ];
+
+    fn negative(self) -> Self {
+        match self {
+            Self::Zero => Self::Zero,
+            Self::One => Self::MinusOne,
+            Self::MinusOne => Self::One,
+            Self::Varies(number) => Self::Varies(number.negative()),
+        }
+    }
+
+    fn number(self) -> S {
+        match self {
+            Self::Zero => S::ZERO,
+            Self::One => S::ONE,
+            Self::MinusOne => S::ONE.negative(),
+            Self::Varies(number) => number,
+        }
+    }
+}
+
+/// A sum of products that is as wide as it has to be.
+#[derive(Clone, Copy)]
+enum Sum<S: Scalar> {
+    Nothing,
+    Word(S),
+    Wide(S::Wide),
+}
+
+impl<S: Scalar> Sum<S> {
+    /// With the product of a number and a component.
+    fn plus(self, factor: S, component: Component<S>) -> Self {
+        match component {
+            Component::Zero => self,
+            Component::One => self.plus_word(factor),
+            Component::MinusOne => self.minus_word(factor),
+            Component::Varies(number) => Self::Wide(match self.wide() {
+                None => factor.times(number),
+                Some(sum) => S::plus(sum, factor.times(number)),
+            }),
+        }
+    }
+
+    /// Without the product of a number and a component.
+    fn minus(self, factor: S, component: Component<S>) -> Self {
+        match component {
+            Component::Zero => self,
+            Component::One => self.minus_word(factor),
+            Component::MinusOne => self.plus_word(factor),
+            Component::Varies(number) => Self::Wide(match self.wide() {
+                None => factor.negative().times(number),
+                Some(sum) => S::minus(sum, factor.times(number)),
+            }),
+        }
+    }
+
+    fn plus_word(self, word: S) -> Self {
+        self.wide().map_or(Self::Word(word), |sum| Self::Wide(S::plus(sum, word.widen())))
+    }
+
+    fn minus_word(self, word: S) -> Self {
+        self.wide().map_or_else(|| Self::Word(word.negative()), |sum| Self::Wide(S::minus(sum, word.widen())))
+    }
+
+    fn wide(self) -> Option<S::Wide> {
+        match self {
+            Self::Nothing => None,
+            Self::Word(word) => Some(word.widen()),
+            Self::Wide(sum) => Some(sum),
+        }
+    }
+
+    /// The sum, rounded once.
+    fn component(self) -> Component<S> {
+        match self {
+            Self::Nothing => Component::Zero,
+            Self::Word(word) => Component::Varies(word),
+            Self::Wide(sum) => Component::Varies(S::round(sum)),
+        }
+    }
+}
