@@ -1,0 +1,571 @@
+//! The frames of `golden/*.log`, which another program wrote from the document: `golden/make.py`.
+//!
+//! Each frame stands under a comment that says its meaning. The tests build the message from the
+//! comment alone and compare both ways, so that an error made in both `encode` and `decode` shows.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::str::FromStr;
+
+use protocol::can::{FD_FORMAT, Format, Frame};
+use protocol::candump::{self, Line};
+use protocol::fixed::{Acc, Q};
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::message::{
+    Answer, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, Refused, Request, SensorPage,
+    SkinSensors, State,
+};
+use protocol::packet::{Epoch, Half, Packet, PacketError, Paired, WORDS, crc16, data_id};
+use protocol::parameters::{Contact, Parameter, ParameterError, Parameters, Pose, Row};
+use protocol::time::Micros;
+
+const FD: &str = include_str!("golden/fd.log");
+const LENIENT: &str = include_str!("golden/lenient.log");
+const BAD: &str = include_str!("golden/bad.log");
+const CLASSIC: &str = include_str!("golden/classic.log");
+const SESSION: &str = include_str!("golden/session.log");
+const REFUSALS: &str = include_str!("golden/refusals.log");
+const DOCUMENT: &str = include_str!("golden/document.log");
+
+/// One frame of a log, with the comment above it.
+struct Golden<'a> {
+    comment: &'a str,
+    micros: u64,
+    text: &'a str,
+    frame: Frame,
+}
+
+fn lines(log: &str) -> Vec<Golden<'_>> {
+    let mut golden = Vec::new();
+    let mut comment = None;
+    for line in log.lines() {
+        match candump::parse(line).expect(line) {
+            Line::Frame(record) => golden.push(Golden {
+                comment: comment.take().expect("a comment above each frame"),
+                micros: record.time.nanos / 1_000,
+                text: line.rsplit_once(' ').unwrap().1,
+                frame: record.frame,
+            }),
+            Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.strip_prefix("# "),
+        }
+    }
+    assert!(golden.len() > 10, "the log is there");
+    golden
+}
+
+/// A comment: a word, and `key=value` fields that must all be used.
+struct Meaning<'a> {
+    text: &'a str,
+    what: &'a str,
+    fields: BTreeMap<&'a str, &'a str>,
+}
+
+impl<'a> Meaning<'a> {
+    fn new(text: &'a str) -> Self {
+        let mut words = text.split(' ');
+        let what = words.next().unwrap();
+        Self { text, what, fields: words.map(|field| field.split_once('=').expect(text)).collect() }
+    }
+
+    fn take(&mut self, key: &str) -> &'a str {
+        self.fields.remove(key).unwrap_or_else(|| panic!("{}: no {key}", self.text))
+    }
+
+    fn has(&self, key: &str) -> bool {
+        self.fields.contains_key(key)
+    }
+
+    fn number<T: FromStr>(&mut self, key: &str) -> T {
+        let text = self.take(key);
+        text.parse().unwrap_or_else(|_| panic!("{}: {key}={text}", self.text))
+    }
+
+    fn hex(&mut self, key: &str) -> u16 {
+        u16::from_str_radix(self.take(key), 16).expect(self.text)
+    }
+
+    /// A real number that must be a step of the format, exactly.
+    #[expect(clippy::float_cmp, reason = "the comments hold exact decimals")]
+    fn q<const F: u32>(&self, text: &str) -> Q<F> {
+        let value: f64 = text.parse().expect(self.text);
+        let q = Q::try_nearest(value).expect(self.text);
+        assert_eq!(q.to_f64(), value, "{}: {text} is no step", self.text);
+        q
+    }
+
+    fn one<const F: u32>(&mut self, key: &str) -> Q<F> {
+        let text = self.take(key);
+        self.q(text)
+    }
+
+    fn several<const F: u32, const N: usize>(&mut self, key: &str) -> [Q<F>; N] {
+        let text = self.take(key);
+        let all: Vec<_> = text.split(',').map(|text| self.q(text)).collect();
+        all.try_into().unwrap_or_else(|_| panic!("{}: {key} needs {N} numbers", self.text))
+    }
+
+    fn cell(&mut self, key: &str) -> CellId {
+        CellId::new(self.number(key)).expect(self.text)
+    }
+
+    fn node(&mut self, key: &str) -> Node {
+        match self.take(key) {
+            "gateway" => Node::Gateway,
+            "everyone" => Node::Everyone,
+            number => Node::Cell(CellId::new(number.parse().expect(self.text)).expect(self.text)),
+        }
+    }
+
+    fn epoch(&mut self) -> Epoch {
+        Epoch(self.number("epoch"))
+    }
+
+    fn sensors(&mut self) -> SensorPage {
+        if self.has("acceleration") {
+            return SensorPage::Acceleration(self.several("acceleration"));
+        }
+        SensorPage::Skin(SkinSensors {
+            contact: self.several("contact"),
+            proximity: self.one("proximity"),
+            temperature: self.several("temperature"),
+        })
+    }
+
+    fn state(&mut self) -> State {
+        let mut bits = self.number::<u16>("joint") << 8 | self.number::<u16>("version") << 12;
+        for name in self.take("state").split('+').filter(|&name| name != "none") {
+            bits |= State::NAMES.iter().find(|(_, known)| *known == name).expect(name).0.0;
+        }
+        State(bits)
+    }
+
+    /// The words of a parameter, through the struct that gives them their meaning.
+    fn words(&mut self, number: u8) -> [i16; WORDS] {
+        if self.has("words") {
+            let mut words = [0; WORDS];
+            for (word, text) in words.iter_mut().zip(self.take("words").split(',')) {
+                *word = text.parse().expect(self.text);
+            }
+            return words;
+        }
+        let parameter = Parameter::from_number(number).expect(self.text);
+        let mut all = Parameters::default();
+        match parameter {
+            Parameter::Mount => (all.joint, all.joints) = (self.number("joint"), self.number("joints")),
+            Parameter::Pose => {
+                all.pose = Pose { position: self.several("position"), normal: self.several("normal") };
+            }
+            Parameter::Contact => {
+                all.contact = Contact {
+                    alpha_c: self.one("alpha_c"),
+                    alpha_p: self.one("alpha_p"),
+                    contact_threshold: self.one("contact_threshold"),
+                    proximity_threshold: self.one("proximity_threshold"),
+                    force_threshold: self.one("force_threshold"),
+                };
+            }
+            Parameter::Timing => all.period_us = self.number("period_us"),
+            Parameter::Row(row) => {
+                *all.rows.get_mut(usize::from(row)).unwrap() = Row {
+                    a: self.one("a"),
+                    d: self.one("d"),
+                    alpha: self.one("alpha"),
+                    theta_offset: self.one("theta_offset"),
+                };
+            }
+            Parameter::Mode => return [self.number("on"), 0, 0, 0, 0, 0],
+            Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
+            Parameter::Identity => panic!("{}: identity is given in words", self.text),
+        }
+        all.words(parameter)
+    }
+
+    fn network(&mut self) -> NetworkPage {
+        match self.what {
+            "heartbeat" => NetworkPage::Heartbeat(Heartbeat {
+                serial: self.number("serial"),
+                configuration: self.hex("configuration"),
+                sent: self.number("sent"),
+                rejected: self.number("rejected"),
+                state: self.state(),
+            }),
+            "heard" => NetworkPage::Heard(Heard {
+                joints: self.number("joints"),
+                joints_late: self.number("joints_late"),
+                joints_repeated: self.number("joints_repeated"),
+                stimuli: self.number("stimuli"),
+                stimuli_late: self.number("stimuli_late"),
+                torques: self.number("torques"),
+            }),
+            _ => NetworkPage::Refused(Refused {
+                length: self.number("length"),
+                crc: self.number("crc"),
+                foreign: self.number("foreign"),
+                meaning: self.number("meaning"),
+                incomplete: self.number("incomplete"),
+                stimuli: self.number("stimuli"),
+            }),
+        }
+    }
+
+    fn configure(&mut self) -> Message {
+        let (to, tag, number) = (self.node("to"), self.number("tag"), self.number("parameter"));
+        let request = match self.what {
+            "read" => Request::Read { number },
+            _ => Request::Write { number, words: self.words(number) },
+        };
+        Message::Configure { to, tag, request }
+    }
+
+    fn configured(&mut self) -> Message {
+        let (from, tag, number) = (self.cell("from"), self.number("tag"), self.number("parameter"));
+        let answer = match self.what {
+            "refusal" => Answer::Refused { number, reason: self.number("reason") },
+            what => Answer::Value { number, written: what == "written", words: self.words(number) },
+        };
+        Message::Configured { from, tag, answer }
+    }
+
+    fn message(mut self) -> Message {
+        let message = match self.what {
+            "halt" => Message::Halt,
+            "sync" => Message::Sync,
+            "resume" => Message::Resume,
+            "report" => Message::Report,
+            "joints" => Message::Joints {
+                epoch: self.epoch(),
+                joints: Joints { positions: self.several("positions"), in_use: self.number("in_use") },
+            },
+            "sum" => Message::Sum {
+                from: self.cell("from"),
+                epoch: self.epoch(),
+                torque: self.several("torque"),
+                count: self.number("count"),
+            },
+            "torque" => Message::Torque {
+                from: self.cell("from"),
+                epoch: self.epoch(),
+                torque: self.several("torque"),
+            },
+            "sensors" => {
+                Message::Sensors { from: self.cell("from"), epoch: self.epoch(), page: self.sensors() }
+            }
+            "heartbeat" | "heard" | "refused" => {
+                Message::Network { from: self.node("from"), epoch: self.epoch(), page: self.network() }
+            }
+            "read" | "write" => self.configure(),
+            "value" | "written" | "refusal" => self.configured(),
+            "stimulus" => {
+                let from = match self.take("from") {
+                    "next" => From::Next,
+                    epoch => From::Epoch(Epoch(epoch.parse().expect(self.text))),
+                };
+                Message::Stimulus { to: self.node("to"), from, page: self.sensors() }
+            }
+            _ => panic!("{}: not understood", self.text),
+        };
+        assert!(self.fields.is_empty(), "{}: {:?} left over", self.text, self.fields);
+        message
+    }
+
+    /// The error that a comment `bad ...` names.
+    fn error(text: &'a str) -> Error {
+        let mut meaning = Self::new(text.strip_prefix("bad ").expect(text));
+        let kind = |meaning: &mut Self| {
+            let name = meaning.take("kind");
+            Kind::ALL.into_iter().find(|kind| kind.name() == name).expect(name)
+        };
+        let error = match meaning.what {
+            "foreign" => Error::Packet(PacketError::Foreign),
+            "length" => Error::Packet(PacketError::Length {
+                expected: meaning.number("expected"),
+                got: meaning.number("got"),
+            }),
+            "crc" => {
+                Error::Packet(PacketError::Crc { expected: meaning.hex("expected"), got: meaning.hex("got") })
+            }
+            "command" => Error::Message(MessageError::Command(meaning.number("node"))),
+            "sender" => Error::Message(MessageError::Sender {
+                kind: kind(&mut meaning),
+                node: meaning.number("node"),
+            }),
+            "page" => {
+                Error::Message(MessageError::Page { kind: kind(&mut meaning), page: meaning.number("page") })
+            }
+            "count" => Error::Message(MessageError::Count {
+                kind: kind(&mut meaning),
+                got: meaning.number("got"),
+                allowed: match meaning.take("allowed") {
+                    "1" => "1",
+                    "1-to-6" => "1 to 6",
+                    "1-to-255" => "1 to 255",
+                    other => panic!("{text}: {other}"),
+                },
+            }),
+            _ => panic!("{text}: not understood"),
+        };
+        assert!(meaning.fields.is_empty(), "{text}: {:?} left over", meaning.fields);
+        error
+    }
+}
+
+#[derive(Debug, PartialEq)]
+enum Error {
+    Packet(PacketError),
+    Message(MessageError),
+}
+
+fn read(frame: &Frame) -> Result<Message, Error> {
+    let packet = Packet::from_fd(frame).map_err(Error::Packet)?;
+    Message::decode(&packet).map_err(Error::Message)
+}
+
+fn only_frame(message: &Message) -> String {
+    let mut frames = message.encode().frames(Format::Fd);
+    let frame = frames.next().unwrap();
+    assert!(frames.next().is_none());
+    frame.to_string()
+}
+
+#[test]
+fn bytes_and_meaning_agree_both_ways() {
+    for log in [FD, SESSION, DOCUMENT, REFUSALS] {
+        for golden in lines(log) {
+            let message = Meaning::new(golden.comment).message();
+            assert_eq!(read(&golden.frame), Ok(message), "{}", golden.text);
+            assert_eq!(only_frame(&message), golden.text, "{}", golden.comment);
+        }
+    }
+}
+
+#[test]
+fn every_kind_command_and_page_has_its_golden_frame() {
+    let seen: Vec<_> = lines(FD).iter().map(|golden| Packet::from_fd(&golden.frame).unwrap()).collect();
+    for kind in Kind::ALL {
+        assert!(seen.iter().any(|packet| packet.id.kind == kind), "{kind:?}");
+    }
+    for command in 0..=4 {
+        assert!(
+            seen.iter().any(|packet| packet.id == Id { kind: Kind::Command, node: command }),
+            "{command}"
+        );
+    }
+    for (kind, counts) in
+        [(Kind::Sensors, &[0, 1][..]), (Kind::Network, &[0, 1, 2]), (Kind::Stimulus, &[0, 1, 0x80, 0x81])]
+    {
+        for &count in counts {
+            assert!(
+                seen.iter().any(|packet| packet.id.kind == kind && packet.count == count),
+                "{kind:?} {count}"
+            );
+        }
+    }
+    for number in (0..=u8::MAX).filter(|&number| Parameter::from_number(number).is_some()) {
+        let asked = |count| {
+            seen.iter().any(|packet| packet.id.kind == Kind::Configure && packet.count & 0x7F == count)
+        };
+        assert!(asked(number), "parameter {number}");
+    }
+}
+
+#[test]
+fn what_a_page_does_not_use_is_not_looked_at() {
+    for golden in lines(LENIENT) {
+        let message = Meaning::new(golden.comment).message();
+        assert_eq!(read(&golden.frame), Ok(message), "{}", golden.text);
+        assert_ne!(only_frame(&message), golden.text, "this belongs in fd.log");
+    }
+}
+
+#[test]
+fn bad_frames_are_refused_for_the_reason_given() {
+    for golden in lines(BAD) {
+        assert_eq!(read(&golden.frame), Err(Meaning::error(golden.comment)), "{}", golden.text);
+    }
+}
+
+#[test]
+fn classic_frames_pair_as_the_log_says() {
+    let mut halves = BTreeMap::<u16, Half>::new();
+    for golden in lines(CLASSIC) {
+        let outcome = data_id(&golden.frame).and_then(|id| {
+            let half = halves.entry(id.to_bits()).or_default();
+            half.push(Micros(golden.micros), id, golden.frame.data())
+        });
+        match (golden.comment.split_once(' '), outcome) {
+            (None, Ok(outcome)) => {
+                let wanted = match golden.comment {
+                    "waiting" => Paired::Waiting,
+                    _ => Paired::Incomplete,
+                };
+                assert_eq!(outcome, wanted, "{}", golden.text);
+            }
+            (Some(("whole", rest)), Ok(Paired::Whole(packet))) if rest.starts_with("bad ") => {
+                let decoded = Message::decode(&packet).map_err(Error::Message);
+                assert_eq!(decoded, Err(Meaning::error(rest)), "{}", golden.text);
+            }
+            (Some(("whole", meaning)), Ok(Paired::Whole(packet))) => {
+                let message = Meaning::new(meaning).message();
+                assert_eq!(Message::decode(&packet), Ok(message), "{}", golden.text);
+                let second = message.encode().frames(Format::Classic).nth(1).unwrap();
+                assert_eq!(second.to_string(), golden.text, "{meaning}");
+            }
+            (Some(("bad", _)), Err(error)) => {
+                assert_eq!(Error::Packet(error), Meaning::error(golden.comment), "{}", golden.text);
+            }
+            (_, outcome) => panic!("{} {}: {outcome:?}", golden.comment, golden.text),
+        }
+    }
+}
+
+#[test]
+fn the_first_classic_frames_are_written_as_the_log_has_them() {
+    let golden = lines(CLASSIC);
+    let mut pairs = 0;
+    for pair in golden.windows(2) {
+        let [first, second] = pair else { continue };
+        if let Some(meaning) = second.comment.strip_prefix("whole ")
+            && !meaning.starts_with("bad ")
+            && first.comment == "waiting"
+            && first.frame.id() == second.frame.id()
+        {
+            let frames: Vec<_> = Meaning::new(meaning).message().encode().frames(Format::Classic).collect();
+            let texts: Vec<_> = frames.iter().map(ToString::to_string).collect();
+            assert_eq!(texts, [first.text, second.text], "{meaning}");
+            pairs += 1;
+        }
+    }
+    assert!(pairs >= 10, "{pairs}");
+}
+
+/// What the writes of a session leave behind.
+fn staged(session: &str) -> (Parameters, Vec<(u16, bool)>) {
+    let mut parameters = Parameters::default();
+    let mut commits = Vec::new();
+    let messages: Vec<_> = lines(session).iter().map(|golden| read(&golden.frame).unwrap()).collect();
+    for pair in messages.windows(2) {
+        let [Message::Configure { request: Request::Write { number, words }, .. }, answer] = pair else {
+            continue;
+        };
+        match Parameter::from_number(*number) {
+            Some(Parameter::Commit) => {
+                let Message::Configured { answer, .. } = answer else { panic!("no answer to a commit") };
+                commits.push((words[0].cast_unsigned(), matches!(answer, Answer::Value { .. })));
+            }
+            Some(Parameter::Mode) => {}
+            Some(parameter) => parameters.set(parameter, *words).unwrap(),
+            None => panic!("parameter {number}"),
+        }
+    }
+    (parameters, commits)
+}
+
+#[test]
+fn the_hash_of_the_session_is_that_of_its_commit() {
+    let (parameters, commits) = staged(SESSION);
+    assert_eq!(parameters.check(), Ok(()));
+    assert_eq!(commits.len(), 2);
+    for (hash, accepted) in commits {
+        assert_eq!(hash == parameters.hash(), accepted, "{hash:04X}");
+    }
+}
+
+#[test]
+fn unsound_parameters_are_refused_with_the_code_of_the_log() {
+    let (sound, _) = staged(SESSION);
+    let messages: Vec<_> = lines(REFUSALS).iter().map(|golden| read(&golden.frame).unwrap()).collect();
+    let mut codes = BTreeSet::new();
+    for pair in messages.chunks(2) {
+        let [
+            Message::Configure { request: Request::Write { number, words }, .. },
+            Message::Configured { answer: Answer::Refused { number: refused, reason }, .. },
+        ] = pair
+        else {
+            panic!("{pair:?}");
+        };
+        let mut spoilt = sound;
+        let wanted = match Parameter::from_number(*number) {
+            None => (*number, Answer::UNKNOWN),
+            Some(parameter) => match spoilt.set(parameter, *words) {
+                Err(error) => (*number, error.code()),
+                Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
+            },
+        };
+        assert_eq!((*refused, *reason), wanted, "{pair:?}");
+        codes.insert(*reason);
+    }
+    assert!(codes.into_iter().eq([1, 2, 3, 4, 5, 6, 18]));
+}
+
+/// The document's arithmetic of Algorithm 1, on its own example: 3 N on a cell with
+/// J = (-1433, 4260, 0, 0, 0, 0) / 2^14.
+#[test]
+fn the_documents_torque_comes_out() {
+    let (parameters, _) = staged(SESSION);
+    let force: i64 = 3 * 1_024;
+    assert!(force >= i64::from(parameters.contact.contact_threshold.to_bits()));
+    let fused = Acc::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force).finer::<24>();
+    assert!(fused >= parameters.contact.force_threshold.widen().finer());
+    let rounded = (fused.steps() + (1 << 7)) >> 8;
+    let torque = [-1_433, 4_260, 0, 0, 0, 0].map(|j| Acc::<30>::from_steps(j * rounded).round::<12>());
+    let from = CellId::new(12).unwrap();
+    let wanted = only_frame(&Message::Torque { from, epoch: Epoch(7), torque });
+    assert!(lines(SESSION).iter().any(|golden| golden.text == wanted), "{wanted}");
+}
+
+const PROTOCOL_MD: &str = include_str!("../../docs/protocol.md");
+
+fn frames_of_the_document() -> Vec<Frame> {
+    let tokens = PROTOCOL_MD.split(|c: char| c.is_whitespace() || c == '`');
+    tokens
+        .filter(|token| token.len() > 30 && token.contains("##"))
+        .map(|token| candump::parse_frame(token).unwrap())
+        .collect()
+}
+
+#[test]
+fn the_document_spells_out_the_frames_of_its_log_and_no_others() {
+    let same = |a: &Frame, b: &Frame| {
+        (a.raw_id(), a.data(), a.flags() | FD_FORMAT) == (b.raw_id(), b.data(), b.flags() | FD_FORMAT)
+    };
+    let (written, golden) = (frames_of_the_document(), lines(DOCUMENT));
+    for golden in &golden {
+        assert!(written.iter().any(|frame| same(frame, &golden.frame)), "{} is missing", golden.text);
+    }
+    for frame in &written {
+        assert!(golden.iter().any(|golden| same(&golden.frame, frame)), "{frame} is not in document.log");
+    }
+}
+
+#[test]
+fn the_documents_crc_example_is_right() {
+    // Section "CRC": the identifier 20C, six words, epoch 7, count 1.
+    let bytes = [0x0C, 0x02, 0x00, 0x10, 0x00, 0xF8, 0x01, 0x00, 0, 0, 0, 0, 0, 0, 0x07, 0x01];
+    assert_eq!(crc16(&bytes), 0xD675);
+    assert!(PROTOCOL_MD.contains("0C 02 00 10 00 F8 01 00 00 00 00 00 00 00 07 01"));
+    assert!(PROTOCOL_MD.contains("D675") && PROTOCOL_MD.contains("29B1"));
+    let halves = lines(DOCUMENT)[0].frame;
+    let (head, tail) = halves.data().split_at(8);
+    for half in [head, tail] {
+        let half = Frame::classic(0x20C, half).unwrap().to_string();
+        assert!(PROTOCOL_MD.contains(&half), "{half}");
+    }
+}
+
+#[test]
+fn neither_zeros_nor_ones_are_a_packet_under_any_identifier() {
+    for bits in 0..0x800 {
+        for bytes in [[0; 16], [0xFF; 16]] {
+            assert!(Packet::decode(Id::from_bits(bits), &bytes).is_err(), "{bits:03X}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs python3"]
+fn the_logs_are_what_make_py_writes() {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/make.py");
+    let output = std::process::Command::new("python3").args(["-B", script, "--check"]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
+}

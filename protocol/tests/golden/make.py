@@ -1,0 +1,820 @@
+#!/usr/bin/env python3
+"""Writes the golden frames of this folder. Needs nothing but Python's standard library.
+
+This is a second implementation of docs/protocol.md, made from the document and not from the Rust
+code, and it shares nothing with it: when the two disagree, one of them, or the document, is wrong.
+Never "fix" a line of a log by copying what the Rust code prints.
+
+    python3 make.py           write the logs
+    python3 make.py --check   say whether the logs are what this script writes (exit code 1 if not)
+
+Every frame is preceded by a comment line with its meaning: a word, then key=value fields. Numbers are
+in the units of the document (quarter turns, Nm, N, g, degrees Celsius, m), as exact decimals.
+`protocol/tests/golden.rs` builds a message from the comment alone and compares both directions.
+
+    fd.log          every kind, page and parameter: bytes <-> meaning, both ways
+    lenient.log     frames that are read although nobody should write them so: bytes -> meaning
+    bad.log         frames that are refused, and why
+    classic.log     pairs of classic frames, with the times between them
+    session.log     a cell is configured, hears joints, is pressed and answers
+    refusals.log    writes that a commit refuses, and the refusal
+    document.log    the frames spelled out in docs/protocol.md
+"""
+
+import math
+import pathlib
+import random
+import struct
+import sys
+from fractions import Fraction
+
+HERE = pathlib.Path(__file__).parent
+
+# --- CRC, words, packets -------------------------------------------------------------------------
+
+
+def crc16(data):
+    """CRC-16/CCITT-FALSE, bit by bit: polynomial 0x1021, start 0xFFFF, most significant bit first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+    return crc
+
+
+assert crc16(b"123456789") == 0x29B1
+
+# Fraction bits.
+ANGLE = LENGTH = UNIT = 14  # Q1.14
+TORQUE = GAIN = ACCELERATION = 12  # Q3.12
+FORCE = 10  # Q5.10
+SUM = 8  # Q7.8
+TEMPERATURE = 6  # Q9.6
+
+
+def nearest(value, bits):
+    """The word of the nearest step, halves away from zero; must be in range."""
+    steps = Fraction(value) * 2**bits
+    word = math.floor(abs(steps) + Fraction(1, 2)) * (1 if steps >= 0 else -1)
+    assert -(2**15) <= word < 2**15, f"{value} does not fit"
+    return word
+
+
+def at_least(value, bits):
+    """The word of the least step that is not below the value: how thresholds are rounded."""
+    word = math.ceil(Fraction(value) * 2**bits)
+    assert -(2**15) <= word < 2**15, f"{value} does not fit"
+    return word
+
+
+def angle(radians):
+    """Quarter turns, wrapped into [-2, 2)."""
+    steps = radians / (2 * math.pi) * 65536
+    word = math.floor(abs(steps) + 0.5) * (1 if steps >= 0 else -1)
+    return signed(word & 0xFFFF)
+
+
+def signed(word):
+    assert 0 <= word < 2**16
+    return word - 2**16 if word & 0x8000 else word
+
+
+def number(word, bits):
+    """The word's value as an exact decimal (every dyadic fraction of 16 bits is one)."""
+    text = repr(word / 2**bits)
+    return text[:-2] if text.endswith(".0") else text
+
+
+def numbers(words, bits):
+    return ",".join(number(word, bits) for word in words)
+
+
+class Packet:
+    """Sixteen bytes under an identifier."""
+
+    def __init__(self, meaning, kind, node, words=(), epoch=0, count=0):
+        self.meaning, self.id = meaning, kind << 8 | node
+        self.words = (list(words) + [0] * 6)[:6]
+        self.epoch, self.count = epoch, count
+
+    def body(self):
+        return struct.pack("<6hBB", *self.words, self.epoch, self.count)
+
+    def crc(self):
+        return crc16(struct.pack("<H", self.id) + self.body())
+
+    def bytes(self):
+        return self.body() + struct.pack("<H", self.crc())
+
+    def fd(self, flags=5):
+        return f"{self.id:03X}##{flags:X}{self.bytes().hex().upper()}"
+
+    def halves(self):
+        data = self.bytes().hex().upper()
+        return f"{self.id:03X}#{data[:16]}", f"{self.id:03X}#{data[16:]}"
+
+
+# --- Messages ------------------------------------------------------------------------------------
+
+EVERYONE, GATEWAY = 255, 0
+NAME = {EVERYONE: "everyone", GATEWAY: "gateway"}
+
+
+def node(n):
+    return NAME.get(n, str(n))
+
+
+def command(name):
+    return Packet(name, 0, {"halt": 0, "sync": 2, "resume": 3, "report": 4}[name])
+
+
+def joints(epoch, words, in_use=6):
+    assert all(word == 0 for word in words[in_use:])
+    meaning = f"joints epoch={epoch} in_use={in_use} positions={numbers(words, ANGLE)}"
+    return Packet(meaning, 0, 1, words, epoch, in_use)
+
+
+def total(sender, epoch, words, count):
+    meaning = f"sum from={sender} epoch={epoch} count={count} torque={numbers(words, SUM)}"
+    return Packet(meaning, 1, sender, words, epoch, count)
+
+
+def torque(sender, epoch, words):
+    meaning = f"torque from={sender} epoch={epoch} torque={numbers(words, TORQUE)}"
+    return Packet(meaning, 2, sender, words, epoch, 1)
+
+
+def skin(contact, proximity=0, temperature=(0, 0)):
+    text = (
+        f"contact={numbers(contact, FORCE)} proximity={number(proximity, UNIT)}"
+        f" temperature={numbers(temperature, TEMPERATURE)}"
+    )
+    return text, 0, [*contact, proximity, *temperature]
+
+
+def acceleration(xyz):
+    return f"acceleration={numbers(xyz, ACCELERATION)}", 1, list(xyz)
+
+
+def sensors(sender, epoch, page):
+    text, number_of_page, words = page
+    return Packet(f"sensors from={sender} epoch={epoch} {text}", 3, sender, words, epoch, number_of_page)
+
+
+def stimulus(to, epoch, page):
+    """`epoch` is the first epoch, or None: from the next joints on."""
+    text, number_of_page, words = page
+    when = "from=next" if epoch is None else f"from={epoch}"
+    flag = 0x80 if epoch is None else 0
+    return Packet(f"stimulus to={node(to)} {when} {text}", 7, to, words, epoch or 0, number_of_page | flag)
+
+
+STATE = {
+    "configured": 0,
+    "active": 1,
+    "halted": 2,
+    "flash-damaged": 3,
+    "duplicate": 4,
+    "test-mode": 5,
+    "saturated": 6,
+    "claiming": 7,
+}
+
+
+def heartbeat(sender, epoch, serial, configuration, sent, rejected, state=(), joint=0, version=1):
+    bits = sum(1 << STATE[name] for name in state) | joint << 8 | version << 12
+    words = [serial & 0xFFFF, serial >> 16, configuration, sent, rejected, bits]
+    meaning = (
+        f"heartbeat from={node(sender)} epoch={epoch} serial={serial} configuration={configuration:04X}"
+        f" sent={sent} rejected={rejected} state={'+'.join(state) or 'none'} joint={joint} version={version}"
+    )
+    return Packet(meaning, 4, sender, map(signed, words), epoch, 0)
+
+
+HEARD = ("joints", "joints_late", "joints_repeated", "stimuli", "stimuli_late", "torques")
+REFUSED = ("length", "crc", "foreign", "meaning", "incomplete", "stimuli")
+
+
+def counters(sender, epoch, page, values):
+    name, keys = {1: ("heard", HEARD), 2: ("refused", REFUSED)}[page]
+    fields = " ".join(f"{key}={value}" for key, value in zip(keys, values, strict=True))
+    meaning = f"{name} from={node(sender)} epoch={epoch} {fields}"
+    return Packet(meaning, 4, sender, [signed(value) for value in values], epoch, page)
+
+
+# Parameters: (number, fields as text, words).
+
+
+def identity():
+    return 0, "", []
+
+
+def mount(joint, of):
+    return 1, f"joint={joint} joints={of}", [joint, of]
+
+
+def pose(position, normal):
+    words = [nearest(x, LENGTH) for x in position] + [nearest(x, UNIT) for x in normal]
+    return 2, f"position={numbers(words[:3], LENGTH)} normal={numbers(words[3:], UNIT)}", words
+
+
+def contact(alpha_c, alpha_p, contact_threshold, proximity_threshold, force_threshold):
+    words = [
+        nearest(alpha_c, GAIN),
+        nearest(alpha_p, FORCE),
+        at_least(contact_threshold, FORCE),
+        at_least(proximity_threshold, UNIT),
+        at_least(force_threshold, FORCE),
+    ]
+    text = (
+        f"alpha_c={number(words[0], GAIN)} alpha_p={number(words[1], FORCE)}"
+        f" contact_threshold={number(words[2], FORCE)} proximity_threshold={number(words[3], UNIT)}"
+        f" force_threshold={number(words[4], FORCE)}"
+    )
+    return 3, text, words
+
+
+def timing(period_us):
+    return 4, f"period_us={period_us}", [signed(period_us)]
+
+
+def mode(on):
+    return 5, f"on={on}", [on]
+
+
+def row(joint, a, d, alpha, theta_offset):
+    words = [nearest(a, LENGTH), nearest(d, LENGTH), angle(alpha), angle(theta_offset)]
+    text = (
+        f"a={number(words[0], LENGTH)} d={number(words[1], LENGTH)}"
+        f" alpha={number(words[2], ANGLE)} theta_offset={number(words[3], ANGLE)}"
+    )
+    return 15 + joint, text, words
+
+
+def commit(value):
+    return 127, f"hash={value:04X}", [signed(value)]
+
+
+def raw(number_of_parameter, words):
+    return number_of_parameter, f"words={','.join(map(str, words))}", words
+
+
+def read(to, tag, parameter):
+    return Packet(f"read to={node(to)} tag={tag} parameter={parameter}", 5, to, [], tag, parameter)
+
+
+def write(to, tag, parameter):
+    number_of_parameter, text, words = parameter
+    meaning = f"write to={node(to)} tag={tag} parameter={number_of_parameter} {text}"
+    return Packet(meaning, 5, to, words, tag, number_of_parameter | 0x80)
+
+
+def value(sender, tag, parameter, written):
+    number_of_parameter, text, words = parameter
+    name = "written" if written else "value"
+    meaning = f"{name} from={sender} tag={tag} parameter={number_of_parameter} {text}".rstrip()
+    return Packet(meaning, 6, sender, words, tag, number_of_parameter | (0x80 if written else 0))
+
+
+def refusal(sender, tag, parameter, reason):
+    meaning = f"refusal from={sender} tag={tag} parameter={parameter} reason={reason}"
+    return Packet(meaning, 6, sender, [parameter, reason], tag, 126)
+
+
+def configuration_hash(parameters):
+    """Over the words of parameters 1, 2, 3, 4, 16..21, six each."""
+    image = b""
+    for wanted in (1, 2, 3, 4, 16, 17, 18, 19, 20, 21):
+        words = next((words for found, _, words in parameters if found == wanted), [])
+        image += struct.pack("<6h", *words, *[0] * (6 - len(words)))
+    assert len(image) == 120
+    return crc16(image)
+
+
+# --- What a cell computes ------------------------------------------------------------------------
+
+
+def fused_force(parameters, contact_words, proximity):
+    """Algorithm 1 in integers: F_z in steps of 2^-24 N, and whether the cell is active."""
+    alpha_c, alpha_p, contact_th, proximity_th, force_th = parameters
+    f_c = sum(contact_words)
+    if f_c < contact_th:
+        f_c = 0
+    f_p = proximity
+    if f_p < proximity_th:
+        f_p = 0
+    f_z = (alpha_c * f_c << 2) + alpha_p * f_p
+    return f_z, f_z >= force_th << 14
+
+
+def torque_words(jacobian, f_z):
+    """J (Q1.14) times F_z (rounded to 16 fraction bits), rounded half up to Q3.12, saturated."""
+    f_z = (f_z + (1 << 7)) >> 8
+    words = []
+    for j in jacobian:
+        word = (j * f_z + (1 << 17)) >> 18
+        words.append(max(-(2**15), min(2**15 - 1, word)))
+    return words
+
+
+def cross(u, v):
+    return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+
+
+def exact_jacobian(chain, theta, position, normal):
+    """J_l = z_(l-1) . ((t - p_(l-1)) x f), f = -normal, in floating point, in the base frame."""
+    axes, origins = [], []
+    r = [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]
+    p = [0.0, 0.0, 0.0]
+    for (a, d, alpha, offset), q in zip(chain, theta, strict=True):
+        axes.append([r[i][2] for i in range(3)])
+        origins.append(list(p))
+        c, s = math.cos(q + offset), math.sin(q + offset)
+        ca, sa = math.cos(alpha), math.sin(alpha)
+        # Rz(theta) Tz(d) Tx(a) Rx(alpha)
+        t = [a * c, a * s, d]
+        m = [[c, -s * ca, s * sa], [s, c * ca, -c * sa], [0, sa, ca]]
+        p = [p[i] + sum(r[i][j] * t[j] for j in range(3)) for i in range(3)]
+        r = [[sum(r[i][k] * m[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    where = [p[i] + sum(r[i][j] * position[j] for j in range(3)) for i in range(3)]
+    force = [-sum(r[i][j] * normal[j] for j in range(3)) for i in range(3)]
+    result = []
+    for z, o in zip(axes, origins, strict=True):
+        moment = cross([where[i] - o[i] for i in range(3)], force)
+        result.append(sum(z[i] * moment[i] for i in range(3)))
+    return result + [0.0] * (6 - len(result))
+
+
+# --- The logs ------------------------------------------------------------------------------------
+
+MAX, MIN = 2**15 - 1, -(2**15)
+
+
+class Log:
+    """Lines of a candump log with their comments; time runs on by itself."""
+
+    def __init__(self, name, *head):
+        self.name, self.micros = name, 1_700_000_000_000_000
+        self.lines = [f"# {line}" for line in ("Written by make.py; see there.", *head)] + [""]
+
+    def title(self, text):
+        self.lines += ["", f"## {text}"] if self.lines[-1] else [f"## {text}"]
+
+    def add(self, meaning, frame, after_us=1_000):
+        self.micros += after_us
+        seconds, rest = divmod(self.micros, 1_000_000)
+        self.lines += [f"# {meaning}".rstrip(), f"({seconds}.{rest:06}) vcan0 {frame}"]
+
+    def put(self, *packets):
+        for packet in packets:
+            self.add(packet.meaning, packet.fd())
+
+    def text(self):
+        return "\n".join(self.lines) + "\n"
+
+
+PRESSED = skin([1024, 1024, 1024])
+
+
+def fd():
+    log = Log("fd.log", "Bytes and meaning, both ways.")
+    rng = random.Random(20260101)
+    words = lambda: [rng.randint(MIN, MAX) for _ in range(6)]
+    cell = lambda: rng.randint(1, 254)
+    epoch = lambda: rng.randint(0, 255)
+    u16 = lambda: rng.randint(0, 65535)
+
+    log.title("commands")
+    log.put(*(command(name) for name in ("halt", "sync", "resume", "report")))
+    log.put(
+        joints(0, [0] * 6),
+        joints(255, [MIN, MAX, -1, 1, 16384, -16384]),
+        joints(128, [angle(x) for x in (0.0, -1.2, 1.0, -1.4, -1.57, math.pi)]),
+        joints(1, [8192, 0, 0, 0, 0, 0], in_use=1),
+        joints(2, [8192, -8192, 100, 0, 0, 0], in_use=3),
+    )
+    log.put(*(joints(epoch(), words()) for _ in range(3)))
+
+    log.title("sums")
+    log.put(
+        total(1, 0, [256, -256, 1, -1, 0, 128], 1),
+        total(254, 255, [MAX, MIN, MAX - 1, MIN + 1, 0, 0], 255),
+        *(total(cell(), epoch(), words(), rng.randint(1, 255)) for _ in range(3)),
+    )
+
+    log.title("torques")
+    log.put(
+        torque(1, 0, [0] * 6),
+        torque(12, 7, [4096, -2048, 1, -1, 0, 0]),
+        torque(254, 255, [MAX, MIN, MAX - 1, MIN + 1, 0, -1]),
+        *(torque(cell(), epoch(), words()) for _ in range(3)),
+    )
+
+    log.title("sensors")
+    log.put(
+        sensors(1, 0, skin([0, 0, 0])),
+        sensors(12, 9, skin([1024, 1023, -1], 16384, [25 * 64, -40 * 64])),
+        sensors(254, 255, skin([MAX, MIN, 1], MAX, [MIN, MAX])),
+        sensors(7, 3, acceleration([0, 0, 4096])),
+        sensors(7, 4, acceleration([MAX, MIN, -1])),
+        *(sensors(cell(), epoch(), skin(words()[:3], words()[0], words()[:2])) for _ in range(2)),
+    )
+
+    log.title("network: heartbeats, one for every bit of the state, then the counters")
+    log.put(
+        heartbeat(12, 7, 100001, 0xBEEF, 4711, 3, ("configured", "active"), 2),
+        heartbeat(1, 0, 0, 0, 0, 0),
+        heartbeat(254, 255, 2**32 - 1, 0xFFFF, 65535, 65535, tuple(STATE), 15, 15),
+        heartbeat(GATEWAY, 200, 1, 0, 1, 0),
+        *(heartbeat(5, 6, 0x00010002, 0x8000, 0x0100, 0x8001, (name,), 1) for name in STATE),
+        counters(12, 7, 1, [1000, 2, 3, 40, 5, 600]),
+        counters(254, 255, 1, [65535, 65534, 32768, 32767, 1, 0]),
+        counters(12, 7, 2, [1, 20, 300, 4000, 50000, 6]),
+        counters(254, 255, 2, [65535, 65534, 32768, 32767, 1, 0]),
+        *(counters(cell(), epoch(), page, [u16() for _ in range(6)]) for page in (1, 2)),
+    )
+
+    log.title("configure: reading")
+    log.put(*(read(12, parameter, parameter) for parameter in (0, 1, 2, 3, 4, 5, 16, 21, 127)))
+    log.put(read(EVERYONE, 255, 0), read(254, 0, 99))
+
+    log.title("configure: writing")
+    log.put(
+        write(12, 1, mount(2, 6)),
+        write(12, 2, pose((Fraction("0.1"), 0, Fraction("0.06")), (0, 0, 1))),
+        write(12, 3, pose((-2, Fraction(32767, 16384), -1), (Fraction("0.6"), Fraction("-0.8"), 0))),
+        write(12, 4, contact(1, 0, Fraction("0.1"), Fraction("0.05"), Fraction("0.1"))),
+        write(12, 5, contact(Fraction(32767, 4096), Fraction(32767, 1024), 0, 1, Fraction(1, 1024))),
+        write(12, 6, timing(16000)),
+        write(12, 7, timing(65535)),
+        write(12, 8, mode(1)),
+        write(12, 9, mode(0)),
+        *(write(EVERYONE, 9 + joint, row(joint, *UR5[joint - 1])) for joint in range(1, 7)),
+        write(12, 16, row(1, -2, Fraction(32767, 16384), -math.pi, 3 * math.pi)),
+        write(12, 17, commit(0xBEEF)),
+        write(EVERYONE, 255, commit(0)),
+        write(254, 0, raw(99, [1, -1, MAX, MIN, 0, 256])),
+    )
+
+    log.title("configured: values, and every reason of a refusal")
+    log.put(
+        value(12, 0, raw(0, [signed(100001 & 0xFFFF), 100001 >> 16, 1, signed(0xBEEF), 0x1203, 0]), False),
+        value(12, 1, mount(2, 6), True),
+        value(12, 2, pose((0, 0, 0), (0, 0, 1)), False),
+        value(12, 3, mode(1), True),
+        value(254, 255, commit(0xBEEF), True),
+        *(refusal(12, 200, 1, reason) for reason in (1, 2, 3, 4, 5, 6, 16, 17, 18)),
+        refusal(254, 255, 127, 16),
+    )
+
+    log.title("stimuli")
+    log.put(
+        stimulus(12, 7, PRESSED),
+        stimulus(12, 0, PRESSED),
+        stimulus(12, 255, skin([0, 0, 0])),
+        stimulus(12, None, PRESSED),
+        stimulus(EVERYONE, None, skin([MAX, MIN, -1], -1, [MIN, MAX])),
+        stimulus(254, 128, acceleration([4096, -4096, 1])),
+        stimulus(EVERYONE, None, acceleration([0, 0, MIN])),
+    )
+    return log
+
+
+def lenient():
+    log = Log(
+        "lenient.log",
+        "What a receiver does not look at may be anything; a sender writes 0 there. Bytes to meaning only.",
+    )
+
+    def put(packet, flags=5, **changes):
+        for key, changed in changes.items():
+            assert getattr(packet, key) != changed
+            setattr(packet, key, changed)
+        log.add(packet.meaning, packet.fd(flags))
+
+    log.title("commands other than joints: words, epoch and count")
+    put(command("halt"), words=[1, 2, 3, 4, 5, 6], epoch=9, count=200)
+    put(command("sync"), epoch=7)
+    put(command("resume"), count=1)
+    put(command("report"), words=[-1] * 6)
+    log.title("words that a page does not use")
+    put(sensors(3, 1, acceleration([1, 2, 3])), words=[1, 2, 3, 4, 5, 6])
+    put(stimulus(3, 1, acceleration([1, 2, 3])), words=[1, 2, 3, -4, -5, -6])
+    log.title("the epoch of a stimulus that holds from the next joints on")
+    put(stimulus(3, None, PRESSED), epoch=77)
+    log.title("the words of a read")
+    put(read(3, 5, 2), words=[1, 2, 3, 4, 5, 6])
+    log.title("a refusal with the bit of a write, and with words after the reason")
+    put(refusal(3, 5, 2, 4), count=126 | 0x80)
+    put(refusal(3, 5, 2, 4), words=[2, 4, 9, 9, 9, 9])
+    log.title("FD flags: without FDF as kernels before 6.1 have it, without bit-rate switch, error passive")
+    put(torque(12, 7, [1, 2, 3, 4, 5, 6]), flags=1)
+    put(torque(12, 7, [1, 2, 3, 4, 5, 6]), flags=0)
+    put(torque(12, 7, [1, 2, 3, 4, 5, 6]), flags=4)
+    put(torque(12, 7, [1, 2, 3, 4, 5, 6]), flags=7)
+    return log
+
+
+def bad():
+    log = Log("bad.log", "Frames on an FD bus that are refused, and why.")
+    good = torque(12, 7, [4096, -2048, 1, -1, 0, 0])
+
+    log.title("CRC: one bit, other bytes, another cell's name, the CRC's bytes swapped, nothing but zeros")
+    data = good.bytes()
+
+    def wrong_crc(identifier, bytes16):
+        expected = crc16(struct.pack("<H", identifier) + bytes16[:14])
+        got = struct.unpack("<H", bytes16[14:])[0]
+        assert expected != got
+        frame = f"{identifier:03X}##5{bytes16.hex().upper()}"
+        log.add(f"bad crc expected={expected:04X} got={got:04X}", frame)
+
+    for bit in (0, 7, 8, 95, 96, 111, 112, 127):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        wrong_crc(good.id, bytes(flipped))
+    wrong_crc(0x20D, data)
+    wrong_crc(0x10C, data)
+    wrong_crc(good.id, data[:14] + data[15:] + data[14:15])
+    wrong_crc(0x000, bytes(16))
+    wrong_crc(good.id, b"\xff" * 16)
+    without_identifier = data[:14] + struct.pack("<H", crc16(data[:14]))
+    wrong_crc(good.id, without_identifier)
+
+    log.title("length")
+    for length in (0, 8, 12, 15, 20, 24, 64):
+        body = (data * 4)[:length].hex().upper()
+        log.add(f"bad length expected=16 got={length}", f"20C##5{body}")
+    first, second = good.halves()
+    log.add("bad length expected=16 got=8", first)
+    log.add("bad length expected=16 got=8", second)
+
+    log.title("29-bit identifiers")
+    log.add("bad foreign", f"0000020C##5{data.hex().upper()}")
+    log.add("bad foreign", f"1FFFFFFF##5{data.hex().upper()}")
+
+    def meaningless(error, kind, number_of_node, count, words=()):
+        packet = Packet("", kind, number_of_node, words, 7, count)
+        log.add(f"bad {error}", packet.fd())
+
+    log.title("commands that do not exist")
+    for number_of_command in (5, 6, 0x7F, 0xFF):
+        meaningless(f"command node={number_of_command}", 0, number_of_command, 0)
+    log.title("counts that cannot be")
+    for count in (0, 7, 255):
+        meaningless(f"count kind=command got={count} allowed=1-to-6", 0, 1, count)
+    meaningless("count kind=sum got=0 allowed=1-to-255", 1, 12, 0)
+    for count in (0, 2, 255):
+        meaningless(f"count kind=torque got={count} allowed=1", 2, 12, count)
+    log.title("senders and addressees that cannot be")
+    for kind, name, count in ((1, "sum", 1), (2, "torque", 1), (3, "sensors", 0), (6, "configured", 0)):
+        for number_of_node in (0, 255):
+            meaningless(f"sender kind={name} node={number_of_node}", kind, number_of_node, count)
+    meaningless("sender kind=network node=255", 4, 255, 0)
+    meaningless("sender kind=configure node=0", 5, 0, 0)
+    meaningless("sender kind=stimulus node=0", 7, 0, 0)
+    log.title("pages that do not exist")
+    for page in (2, 127, 128, 129, 255):
+        meaningless(f"page kind=sensors page={page}", 3, 12, page)
+    for page in (3, 128, 255):
+        meaningless(f"page kind=network page={page}", 4, 12, page)
+    for count, page in ((2, 2), (0x82, 2), (0xFF, 0x7F)):
+        meaningless(f"page kind=stimulus page={page}", 7, 12, count)
+    return log
+
+
+def classic():
+    log = Log(
+        "classic.log",
+        "Frames on a classic bus, one after the other, and what becomes of each. The times matter.",
+    )
+    first, second = "waiting", "whole"
+
+    def half(packet, index, outcome, after_us):
+        meaning = f"whole {packet.meaning}" if outcome == "whole" else outcome
+        log.add(meaning, packet.halves()[index], after_us)
+
+    a = [torque(12, epoch, [epoch * 100, -epoch, 3, 4, 5, 6]) for epoch in range(20)]
+    b = [torque(13, epoch, [-epoch * 100, epoch, 3, 4, 5, 6]) for epoch in range(20)]
+
+    log.title("pairs of every kind")
+    for packet in (
+        command("halt"),
+        joints(255, [MIN, MAX, -1, 1, 16384, -16384]),
+        total(1, 0, [MAX, MIN, 1, -1, 0, 0], 255),
+        torque(254, 255, [MAX, MIN, 1, -1, 0, 0]),
+        sensors(12, 9, skin([1024, 1023, -1], 16384, [1600, -2560])),
+        heartbeat(12, 7, 100001, 0xBEEF, 4711, 3, ("configured", "active"), 2),
+        read(12, 3, 0),
+        write(12, 1, mount(2, 6)),
+        refusal(12, 200, 1, 3),
+        stimulus(EVERYONE, None, PRESSED),
+    ):
+        half(packet, 0, first, 500)
+        half(packet, 1, second, 150)
+
+    log.title("two cells speak at once: halves pair by identifier")
+    half(a[1], 0, first, 1000)
+    half(b[1], 0, first, 120)
+    half(a[1], 1, second, 120)
+    half(b[1], 1, second, 120)
+
+    log.title("exactly 4 ms apart is a pair; 1 us more is not, and the newer half is then a first one")
+    half(a[2], 0, first, 1000)
+    half(a[2], 1, second, 4000)
+    half(a[3], 0, first, 1000)
+    half(a[3], 1, "incomplete", 4001)
+    half(a[4], 0, "incomplete", 4001)
+    half(a[4], 1, second, 150)
+
+    log.title("a lost second half costs its own packet only")
+    half(a[5], 0, first, 1000)
+    half(a[6], 0, "incomplete", 2000)
+    half(a[6], 1, second, 150)
+
+    log.title("a lost first half costs its own packet only")
+    half(a[7], 1, first, 1000)
+    half(a[8], 0, "incomplete", 2000)
+    half(a[8], 1, second, 150)
+
+    log.title("a half that came twice")
+    half(a[9], 0, first, 1000)
+    half(a[9], 0, "incomplete", 100)
+    half(a[9], 1, second, 100)
+
+    log.title("a frame of another length is refused and leaves the waiting half alone")
+    half(a[10], 0, first, 1000)
+    for length in (0, 7):
+        log.add(f"bad length expected=8 got={length}", f"20C#{'AA' * length}", 100)
+    half(a[10], 1, second, 100)
+
+    log.title("remote frames, error frames and 29-bit identifiers are foreign")
+    for frame in ("20C#R8", "20C#R", "20000004#0001000000000000", f"0000020C#{'00' * 8}"):
+        log.add("bad foreign", frame)
+
+    log.title("a wrong CRC drops the older half; the newer one waits and falls to the next first half")
+    half(a[11], 0, first, 1000)
+    spoilt = a[11].halves()[1]
+    log.add("incomplete", spoilt[:-1] + ("0" if spoilt[-1] != "0" else "1"), 150)
+    half(a[12], 0, "incomplete", 1000)
+    half(a[12], 1, second, 150)
+
+    log.title("a whole pair without a meaning")
+    odd = Packet("", 0, 9, [], 0, 0)
+    log.add("waiting", odd.halves()[0])
+    log.add("whole bad command node=9", odd.halves()[1], 150)
+    return log
+
+
+UR5 = [
+    (Fraction(0), Fraction("0.089159"), math.pi / 2, 0.0),
+    (Fraction("-0.425"), Fraction(0), 0.0, 0.0),
+    (Fraction("-0.39225"), Fraction(0), 0.0, 0.0),
+    (Fraction(0), Fraction("0.10915"), math.pi / 2, 0.0),
+    (Fraction(0), Fraction("0.09465"), -math.pi / 2, 0.0),
+    (Fraction(0), Fraction("0.0823"), 0.0, 0.0),
+]
+
+# The cell of the document: on the UR5's second link.
+CELL, JOINT, SERIAL = 12, 2, 100001
+PARAMETERS = [
+    mount(JOINT, 6),
+    pose((Fraction("0.1"), Fraction("0.05"), Fraction("0.06")), (0, Fraction("0.8"), Fraction("0.6"))),
+    contact(1, 0, Fraction("0.1"), Fraction("0.05"), Fraction("0.1")),
+    timing(16000),
+    *(row(joint, *UR5[joint - 1]) for joint in range(1, 7)),
+]
+ANGLES = (0.0, -1.2, 1.0, -1.4, -1.57, 0.0)
+
+
+def answer(contact_words):
+    """The cell's torque for ANGLES: its Jacobian from the words it has, in exact arithmetic."""
+    by_number = {number_of_parameter: words for number_of_parameter, _, words in PARAMETERS}
+    real = lambda words: [word / 2**14 for word in words]
+    quarter = math.pi / 2
+    chain = []
+    for joint in range(1, JOINT + 1):
+        a, d, alpha, offset = real(by_number[15 + joint])
+        chain.append((a, d, alpha * quarter, offset * quarter))
+    theta = [angle(q) / 2**14 * quarter for q in ANGLES[:JOINT]]
+    placed = real(by_number[2])
+    jacobian = [nearest(j, 14) for j in exact_jacobian(chain, theta, placed[:3], placed[3:])]
+    f_z, active = fused_force(by_number[3], contact_words, 0)
+    return jacobian, f_z, active, torque_words(jacobian, f_z)
+
+
+def session():
+    log = Log(
+        "session.log",
+        "A cell is configured, hears joints, is pressed and answers.",
+        "Its Jacobian is computed in floating point from the words and rounded to nearest: another",
+        "cell's may differ by a step or two of 2^-14, and its torque accordingly.",
+    )
+    value_of = configuration_hash(PARAMETERS)
+    log.title("the cell claims its number, and is there 250 ms later")
+    log.put(heartbeat(CELL, 0, SERIAL, 0, 0, 0, ("claiming",)), heartbeat(CELL, 0, SERIAL, 0, 1, 0))
+    log.title("the gateway writes every parameter")
+    for tag, parameter in enumerate(PARAMETERS, 1):
+        log.put(write(CELL, tag, parameter), value(CELL, tag, parameter, True))
+    log.title("a commit with a wrong hash, and one with the right hash")
+    log.put(write(CELL, 11, commit(value_of ^ 1)), refusal(CELL, 11, 127, 16))
+    log.put(write(CELL, 12, commit(value_of)), value(CELL, 12, commit(value_of), True))
+    log.title("test mode")
+    log.put(write(CELL, 13, mode(1)), value(CELL, 13, mode(1), True))
+    log.title("pressed with 3 N from epoch 7 on, and let go from the next joints on")
+    words = [angle(q) for q in ANGLES]
+    log.put(
+        stimulus(CELL, 7, PRESSED),
+        joints(6, words),
+        joints(7, words),
+        torque(CELL, 7, answer([1024] * 3)[3]),
+        stimulus(CELL, None, skin([0, 0, 0])),
+        joints(8, words),
+        torque(CELL, 8, [0] * 6),
+        joints(9, words),
+        command("sync"),
+        heartbeat(CELL, 9, SERIAL, value_of, 17, 0, ("configured", "test-mode"), JOINT),
+        command("report"),
+        counters(CELL, 9, 1, [4, 0, 0, 2, 0, 2]),
+        counters(CELL, 9, 2, [0] * 6),
+        sensors(CELL, 9, skin([0, 0, 0])),
+        sensors(CELL, 9, acceleration([0, 0, 0])),
+    )
+    return log
+
+
+def refusals():
+    log = Log(
+        "refusals.log",
+        "Each write, on top of the sound configuration of session.log, and the refusal that it earns: of the",
+        "write itself, or (parameter 127) of a commit after it, whatever its hash.",
+    )
+    by_number = {parameter[0] for parameter in PARAMETERS}
+    steep = lambda n: pose((0, 0, 0), n)
+    at_once = [(raw(1, [1, -1]), 2), (raw(1, [1, 256]), 2), (raw(1, [-1, 6]), 3), (raw(1, [256, 6]), 3)]
+    at_commit = [
+        (mount(1, 0), 2),
+        (mount(1, 7), 2),
+        (mount(0, 6), 3),
+        (mount(4, 3), 3),
+        (steep((0, 0, 0)), 4),
+        (steep((0, 0, Fraction("1.01"))), 4),
+        (steep((0, 0, Fraction("0.99"))), 4),
+        *((raw(3, [-1 if i == word else 1 for i in range(5)]), 5) for word in range(5)),
+        (timing(0), 6),
+    ]
+    tag = 0
+
+    def case(parameter, refused, reason):
+        nonlocal tag
+        tag += 1
+        log.put(write(CELL, tag, parameter), refusal(CELL, tag, refused, reason))
+
+    log.title("numbers that are not written like this, or not at all")
+    case(raw(0, [1] * 6), 0, 1)
+    for unknown in (6, 15, 22, 126):
+        case(raw(unknown, [1] * 6), unknown, 18)
+    log.title("words that cannot even be staged")
+    for parameter, reason in at_once:
+        assert parameter[0] in by_number
+        case(parameter, parameter[0], reason)
+    log.title("what only the commit finds")
+    for parameter, reason in at_commit:
+        assert parameter[0] in by_number
+        case(parameter, 127, reason)
+    return log
+
+
+def document():
+    log = Log("document.log", "The frames that docs/protocol.md spells out; it must hold each of them.")
+    value_of = configuration_hash(PARAMETERS)
+    log.title("the worked example of the CRC, as one frame")
+    log.put(torque(12, 7, [4096, -2048, 1, 0, 0, 0]))
+    log.title("halt, sync, joints")
+    log.put(command("halt"), command("sync"), command("resume"), joints(7, [angle(q) for q in ANGLES]))
+    log.title("a configuration")
+    for tag, parameter in enumerate(PARAMETERS, 1):
+        log.put(write(CELL, tag, parameter))
+    log.put(write(CELL, 11, commit(value_of)))
+    log.title("pressing a cell from a shell")
+    log.put(write(CELL, 12, mode(1)), stimulus(CELL, None, PRESSED), stimulus(CELL, None, skin([0, 0, 0])))
+    log.put(torque(CELL, 7, answer([1024] * 3)[3]), torque(CELL, 8, [0] * 6))
+    return log
+
+
+def main():
+    stale = 0
+    for log in (fd(), lenient(), bad(), classic(), session(), refusals(), document()):
+        path = HERE / log.name
+        if "--check" in sys.argv[1:]:
+            if not path.exists() or path.read_text() != log.text():
+                print(f"{path} is not what make.py writes")
+                stale = 1
+        else:
+            path.write_text(log.text())
+    return stale
+
+
+if __name__ == "__main__":
+    sys.exit(main())
