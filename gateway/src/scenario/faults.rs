@@ -1,0 +1,146 @@
+//! From what a scenario's file says of faults to what it means.
+
+use protocol::document::Fault as Wrong;
+use protocol::document::Step::{Index, Key};
+use protocol::time::Span;
+
+use super::check::{Checked, EndS, Names, length, quoted};
+use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
+
+const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of sensors \"stuck\", \
+     \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
+
+/// The faults, in the order of time.
+pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
+    let mut faults = Vec::with_capacity(raw.len());
+    for (index, raw) in raw.iter().enumerate() {
+        faults.push(Entry { index, raw, names }.fault(end)?);
+    }
+    faults.sort_by_key(|fault| fault.at);
+    Ok(faults)
+}
+
+/// One `[[fault]]`.
+struct Entry<'a> {
+    index: usize,
+    raw: &'a raw::Fault,
+    names: &'a Names<'a>,
+}
+
+impl Entry<'_> {
+    fn wrong(&self, key: &'static str, got: impl core::fmt::Display, why: impl core::fmt::Display) -> Wrong {
+        Wrong::new(&[Key("fault"), Index(self.index), Key(key)], got, why)
+    }
+
+    fn fault(&self, end: EndS) -> Checked<Fault> {
+        let raw = self.raw;
+        let at = end.moment(&[Key("fault"), Index(self.index), Key("at_s")], raw.at_s)?;
+        let kind = match raw.kind.as_str() {
+            "kill" => self.process(ProcessAction::Kill)?,
+            "stop" => self.process(ProcessAction::Stop)?,
+            "continue" => self.process(ProcessAction::Continue)?,
+            "restart" => self.process(ProcessAction::Restart)?,
+            "stuck" => self.sensor(SensorFault::Stuck, &["for_s"])?,
+            "drift" => {
+                let n_per_s = self.given("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
+                self.sensor(SensorFault::Drift { n_per_s }, &["for_s", "n_per_s"])?
+            }
+            "drop" => self.hits(|probability| BusFault::Drop { probability })?,
+            "duplicate" => self.hits(|probability| BusFault::Duplicate { probability })?,
+            "corrupt" => self.hits(|probability| BusFault::Corrupt { probability })?,
+            "reorder" => self.hits(|probability| BusFault::Reorder { probability })?,
+            "delay" => {
+                let probability = self.given("probability", raw.probability, 0.0, 1.0)?;
+                let delay = self.delay()?;
+                let keys = &["for_s", "probability", "delay_us"];
+                self.bus(BusFault::Delay { probability, delay }, keys)?
+            }
+            "babble" => {
+                let frames_per_s = self.given("frames_per_s", raw.frames_per_s, 1.0, 100_000.0)?;
+                let got = raw.id.unwrap_or(0);
+                let id = u16::try_from(got).ok().filter(|&id| id < 0x800);
+                let id = id.ok_or_else(|| self.wrong("id", got, "an identifier is 0 to 0x7FF"))?;
+                self.bus(BusFault::Babble { frames_per_s, id }, &["for_s", "frames_per_s", "id"])?
+            }
+            got => {
+                return Err(self.wrong("kind", quoted(got), KINDS));
+            }
+        };
+        Ok(Fault { at, kind })
+    }
+
+    fn process(&self, action: ProcessAction) -> Checked<FaultKind> {
+        self.only(&[])?;
+        Ok(FaultKind::Process { action, cells: self.cells()? })
+    }
+
+    fn sensor(&self, fault: SensorFault, keys: &[&str]) -> Checked<FaultKind> {
+        self.only(keys)?;
+        Ok(FaultKind::Sensor { fault, length: self.length()?, cells: self.cells()? })
+    }
+
+    fn hits(&self, make: impl FnOnce(f64) -> BusFault) -> Checked<FaultKind> {
+        let probability = self.given("probability", self.raw.probability, 0.0, 1.0)?;
+        self.bus(make(probability), &["for_s", "probability"])
+    }
+
+    fn bus(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
+        self.only(keys)?;
+        let at = [Key("fault"), Index(self.index)];
+        let bus = self.names.bus(&at, self.raw.bus.as_deref())?;
+        let cells = if self.raw.cells.is_some() { self.cells()? } else { Vec::new() };
+        Ok(FaultKind::Bus { fault, length: self.length()?, bus, cells })
+    }
+
+    fn cells(&self) -> Checked<Vec<usize>> {
+        let at = [Key("fault"), Index(self.index)];
+        self.names.cells(&at, self.raw.bus.as_deref(), self.raw.cells.as_deref(), self.raw.all)
+    }
+
+    /// How long it lasts; without `for_s` it stays.
+    fn length(&self) -> Checked<Span> {
+        let path = [Key("fault"), Index(self.index), Key("for_s")];
+        self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| length(&path, seconds))
+    }
+
+    fn delay(&self) -> Checked<Span> {
+        let why = "1 to 1000000 us are needed with kind = \"delay\"";
+        match self.raw.delay_us.map(u64::try_from) {
+            Some(Ok(delay @ 1..=1_000_000)) => Ok(Span(delay)),
+            Some(_) => Err(self.wrong("delay_us", self.raw.delay_us.unwrap_or_default(), why)),
+            None => Err(self.wrong("delay_us", "", why)),
+        }
+    }
+
+    /// A number that this kind of fault needs.
+    fn given(&self, key: &'static str, value: Option<f64>, least: f64, greatest: f64) -> Checked<f64> {
+        let why = || match (least, greatest) {
+            (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
+            _ => format!("{least} to {greatest} are needed with kind = {:?}", self.raw.kind),
+        };
+        match value {
+            Some(value) if value.is_finite() && (least..=greatest).contains(&value) => Ok(value),
+            Some(value) => Err(self.wrong(key, value, why())),
+            None => Err(self.wrong(key, "", why())),
+        }
+    }
+
+    /// Refuses the keys that mean nothing for this kind of fault.
+    fn only(&self, keys: &[&str]) -> Checked<()> {
+        let raw = self.raw;
+        let given = [
+            ("for_s", raw.for_s.is_some()),
+            ("probability", raw.probability.is_some()),
+            ("delay_us", raw.delay_us.is_some()),
+            ("n_per_s", raw.n_per_s.is_some()),
+            ("frames_per_s", raw.frames_per_s.is_some()),
+            ("id", raw.id.is_some()),
+        ];
+        match given.into_iter().find(|(key, given)| *given && !keys.contains(key)) {
+            Some((key, _)) => {
+                Err(self.wrong(key, "", format_args!("means nothing with kind = {:?}", raw.kind)))
+            }
+            None => Ok(()),
+        }
+    }
+}

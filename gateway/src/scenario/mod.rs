@@ -1,0 +1,250 @@
+//! The description of a run: where the robot goes, who touches it, and what breaks.
+//!
+//! A [`Scenario`] exists only when everything in its file has been checked against the skin. Every
+//! error names the line, the key, the value and what is allowed, in one line. Cells are named by their
+//! index in [`Skin::cells`], buses by theirs in [`Skin::buses`].
+
+mod check;
+mod faults;
+mod raw;
+mod touches;
+
+use std::path::Path;
+
+use protocol::document::{self, DocumentError};
+use protocol::fixed::{Q1_14, Q9_6};
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+
+pub use touches::{Stimulus, Touches, contact_words};
+
+/// A checked description.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scenario {
+    /// How long it takes.
+    pub duration: Span,
+    /// What random faults are drawn from.
+    pub seed: u64,
+    /// Where the robot goes.
+    pub motion: Motion,
+    /// What the gateway computes, in the order of time; before the first it compares.
+    pub modes: Vec<ModeChange>,
+    /// Who touches the skin, in the file's order.
+    pub touches: Vec<Touch>,
+    /// What breaks, in the order of time.
+    pub faults: Vec<Fault>,
+}
+
+/// Where the robot goes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Where it begins, in rad.
+    pub start_rad: [f64; MAX_JOINTS],
+    /// And then.
+    pub kind: MotionKind,
+}
+
+/// How the robot moves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum MotionKind {
+    /// `hold`: it stays where it is.
+    Hold,
+    /// `sine`: every joint swings about its start.
+    Sine {
+        /// How far, in rad.
+        amplitude_rad: [f64; MAX_JOINTS],
+        /// How slowly, in s.
+        period_s: f64,
+    },
+    /// `kinesthetic`: the skin's controller moves it, whichever that is.
+    Kinesthetic,
+}
+
+/// From when on the gateway computes what.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct ModeChange {
+    /// From when on.
+    pub at: Micros,
+    /// What.
+    pub mode: Mode,
+}
+
+/// What the gateway computes.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Mode {
+    /// `compare`: it takes the cells' torques, and computes all of them centrally as well.
+    #[default]
+    Compare,
+    /// `distributed`: it takes the cells' torques.
+    Distributed,
+}
+
+/// Something touches some cells.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Touch {
+    /// When it begins.
+    pub at: Micros,
+    /// How long it lasts.
+    pub length: Span,
+    /// What it touches, in the skin's order.
+    pub cells: Vec<usize>,
+    /// The greatest force on each of the cells, in N.
+    pub force_n: f64,
+    /// How the force comes and goes.
+    pub profile: Profile,
+    /// How near it is, 0 to 1, all the time.
+    pub proximity: Q1_14,
+    /// How warm it makes the cells, in degrees Celsius.
+    pub temperature: Option<[Q9_6; 2]>,
+}
+
+/// How a touch's force comes and goes.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Profile {
+    /// `half-sine`: it grows and falls like half a swing.
+    HalfSine,
+    /// `step`: all of it, all the time.
+    Step,
+    /// `ramp`: it grows evenly to all of it, and then is gone.
+    Ramp,
+}
+
+/// Something breaks, or is mended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fault {
+    /// When.
+    pub at: Micros,
+    /// What.
+    pub kind: FaultKind,
+}
+
+/// What breaks.
+#[derive(Clone, Debug, PartialEq)]
+pub enum FaultKind {
+    /// Something is done to the processes of cells.
+    Process {
+        /// What.
+        action: ProcessAction,
+        /// To whom.
+        cells: Vec<usize>,
+    },
+    /// Cells measure wrongly; [`Touches`] does it.
+    Sensor {
+        /// How.
+        fault: SensorFault,
+        /// For how long.
+        length: Span,
+        /// Which.
+        cells: Vec<usize>,
+    },
+    /// A bus carries frames wrongly.
+    Bus {
+        /// How.
+        fault: BusFault,
+        /// For how long.
+        length: Span,
+        /// Which bus.
+        bus: usize,
+        /// Only frames of these cells; empty means all frames.
+        cells: Vec<usize>,
+    },
+}
+
+/// What is done to a process.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum ProcessAction {
+    /// `kill`: it ends at once.
+    Kill,
+    /// `stop`: it hangs, as if its firmware did.
+    Stop,
+    /// `continue`: it goes on after a stop.
+    Continue,
+    /// `restart`: it is started anew, ended before if need be.
+    Restart,
+}
+
+/// How a cell measures wrongly.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum SensorFault {
+    /// `stuck`: it goes on to say what it felt when the fault began.
+    Stuck,
+    /// `drift`: its contact force moves away from the true one.
+    Drift {
+        /// How quickly, in N/s; may be negative.
+        n_per_s: f64,
+    },
+}
+
+/// How a bus carries frames wrongly; a probability is that of a frame to be hit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BusFault {
+    /// `drop`: the frame is lost.
+    Drop {
+        /// 0 to 1.
+        probability: f64,
+    },
+    /// `delay`: the frame comes later.
+    Delay {
+        /// 0 to 1.
+        probability: f64,
+        /// By how much.
+        delay: Span,
+    },
+    /// `duplicate`: the frame comes twice.
+    Duplicate {
+        /// 0 to 1.
+        probability: f64,
+    },
+    /// `corrupt`: bits of the frame are turned.
+    Corrupt {
+        /// 0 to 1.
+        probability: f64,
+    },
+    /// `reorder`: the frame comes after the next one.
+    Reorder {
+        /// 0 to 1.
+        probability: f64,
+    },
+    /// `babble`: somebody sends frames that nobody asked for.
+    Babble {
+        /// How many.
+        frames_per_s: f64,
+        /// Under this identifier.
+        id: u16,
+    },
+}
+
+impl Scenario {
+    /// Reads and checks a file.
+    ///
+    /// # Errors
+    /// When it cannot be read, or the first thing that is wrong with it.
+    pub fn read(path: &Path, skin: &Skin) -> Result<Self, DocumentError> {
+        Self::parse(&path.display().to_string(), &document::text(path)?, skin)
+    }
+
+    /// Checks a text; `path` is what errors call it.
+    ///
+    /// # Errors
+    /// The first thing that is wrong with it.
+    pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
+        document::parse(path, text, |raw| check::scenario(raw, skin))
+    }
+
+    /// Nobody touches the skin, nothing breaks, and the skin's controller moves the robot from zero.
+    #[must_use]
+    pub const fn idle(duration: Span) -> Self {
+        let motion = Motion { start_rad: [0.0; MAX_JOINTS], kind: MotionKind::Kinesthetic };
+        Self { duration, seed: 1, motion, modes: Vec::new(), touches: Vec::new(), faults: Vec::new() }
+    }
+
+    /// What the gateway computes at a time.
+    #[must_use]
+    pub fn mode_at(&self, time: Micros) -> Mode {
+        self.modes.iter().rev().find(|change| change.at <= time).map_or_else(Mode::default, |it| it.mode)
+    }
+}
+
+#[cfg(test)]
+mod tests;

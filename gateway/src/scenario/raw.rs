@@ -1,0 +1,79 @@
+//! What a scenario's file says, before anybody asked whether it can be.
+
+use serde::Deserialize;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Scenario {
+    pub(super) version: i64,
+    pub(super) duration_s: f64,
+    #[serde(default = "one")]
+    pub(super) seed: i64,
+    #[serde(default)]
+    pub(super) motion: Motion,
+    #[serde(default)]
+    pub(super) mode: Vec<Mode>,
+    #[serde(default)]
+    pub(super) touch: Vec<Touch>,
+    #[serde(default)]
+    pub(super) fault: Vec<Fault>,
+}
+
+const fn one() -> i64 {
+    1
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Motion {
+    pub(super) kind: String,
+    pub(super) start_rad: Option<Vec<f64>>,
+    pub(super) amplitude_rad: Option<Vec<f64>>,
+    pub(super) period_s: Option<f64>,
+}
+
+impl Default for Motion {
+    fn default() -> Self {
+        Self { kind: "kinesthetic".to_owned(), start_rad: None, amplitude_rad: None, period_s: None }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Mode {
+    pub(super) at_s: f64,
+    pub(super) kind: String,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Touch {
+    pub(super) at_s: f64,
+    pub(super) for_s: f64,
+    pub(super) bus: Option<String>,
+    pub(super) cells: Option<Vec<i64>>,
+    #[serde(default)]
+    pub(super) all: bool,
+    pub(super) force_n: f64,
+    pub(super) profile: String,
+    #[serde(default)]
+    pub(super) proximity: f64,
+    pub(super) temperature_c: Option<[f64; 2]>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Fault {
+    pub(super) at_s: f64,
+    pub(super) kind: String,
+    pub(super) for_s: Option<f64>,
+    pub(super) bus: Option<String>,
+    pub(super) cells: Option<Vec<i64>>,
+    #[serde(default)]
+    pub(super) all: bool,
+    pub(super) probability: Option<f64>,
+    pub(super) delay_us: Option<i64>,
+    pub(super) n_per_s: Option<f64>,
+    pub(super) frames_per_s: Option<f64>,
+    pub(super) id: Option<i64>,
+}

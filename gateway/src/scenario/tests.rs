@@ -1,0 +1,316 @@
+use proptest::prelude::*;
+
+use super::*;
+use crate::testing::{SKIN, skin};
+
+const GOOD: &str = r#"version = 1
+duration_s = 12.0
+seed = 7
+
+[motion]
+kind = "sine"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+amplitude_rad = [0.5, 0.1, 0.0, 0.0, 0.0, 0.0]
+period_s = 4.0
+
+[[mode]]
+at_s = 0.0
+kind = "compare"
+[[mode]]
+at_s = 5.7
+kind = "distributed"
+
+[[touch]]
+at_s = 2.0
+for_s = 1.6
+bus = "vcan0"
+cells = [1, 3]
+force_n = 3.0
+profile = "half-sine"
+
+[[touch]]
+at_s = 3.0
+for_s = 0.5
+cells = [2]
+force_n = 1.0
+profile = "step"
+proximity = 0.5
+temperature_c = [30.0, 31.5]
+
+[[fault]]
+at_s = 9.0
+kind = "delay"
+for_s = 1.0
+bus = "vcan0"
+probability = 0.25
+delay_us = 3000
+
+[[fault]]
+at_s = 8.0
+kind = "kill"
+cells = [1]
+"#;
+
+/// Three cells on one bus.
+fn three() -> Skin {
+    let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
+    let text = [2, 3].map(|node| cell.replace("node = 1", &format!("node = {node}")));
+    Skin::parse("skin.toml", &format!("{SKIN}\n{}", text.concat())).unwrap()
+}
+
+fn good() -> Scenario {
+    Scenario::parse("scenario.toml", GOOD, &three()).unwrap()
+}
+
+fn says(from: &str, to: &str) -> String {
+    assert!(GOOD.contains(from), "{from}");
+    Scenario::parse("s.toml", &GOOD.replacen(from, to, 1), &three()).unwrap_err().to_string()
+}
+
+#[test]
+fn a_good_scenario_is_read() {
+    let scenario = good();
+    assert_eq!((scenario.duration, scenario.seed), (Span(12_000_000), 7));
+    assert!(matches!(scenario.motion.kind, MotionKind::Sine { .. }));
+    assert_eq!(scenario.mode_at(Micros(5_699_999)), Mode::Compare);
+    assert_eq!(scenario.mode_at(Micros(5_700_000)), Mode::Distributed);
+    assert_eq!(scenario.touches[0].cells, [0, 2]);
+    assert_eq!(scenario.touches[1].temperature.unwrap()[1].to_f64(), 31.5);
+    let [kill, delay] = scenario.faults.as_slice() else { panic!("{:?}", scenario.faults) };
+    let action = ProcessAction::Kill;
+    assert_eq!(kill.kind, FaultKind::Process { action, cells: vec![0] }, "in the order of time");
+    let fault = BusFault::Delay { probability: 0.25, delay: Span(3_000) };
+    let length = Span(1_000_000);
+    assert_eq!(delay.kind, FaultKind::Bus { fault, length, bus: 0, cells: vec![] });
+}
+
+#[test]
+fn little_needs_to_be_said() {
+    let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &skin()).unwrap();
+    assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
+    assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
+}
+
+#[test]
+fn every_error_names_line_key_value_and_what_is_allowed() {
+    assert_eq!(says("version = 1", "version = 2"), "s.toml:1: version = 2: this program reads version 1");
+    assert_eq!(says("12.0", "0.0"), "s.toml:2: duration_s = 0: must be above 0, and at most 3.2e7");
+    assert_eq!(says("seed = 7", "seed = -7"), "s.toml:3: seed = -7: must not be negative");
+    assert_eq!(
+        says("\"sine\"", "\"dance\""),
+        "s.toml:6: motion.kind = \"dance\": \"hold\", \"sine\" or \"kinesthetic\""
+    );
+    assert_eq!(says("\"sine\"", "\"hold\""), "s.toml:8: motion.amplitude_rad: only with kind = \"sine\"");
+    assert_eq!(says("period_s = 4.0\n", ""), "s.toml:5: motion.period_s: needed with kind = \"sine\"");
+    assert_eq!(
+        says("-1.57, 0.0]", "-1.57]"),
+        "s.toml:7: motion.start_rad = 5 values: one for each of the robot's 6 joints is needed"
+    );
+    assert_eq!(
+        says("start_rad = [0.0", "start_rad = [6.0"),
+        "s.toml:7: motion.start_rad[0] = 6: joint 1 may go from -6.283185307179586 to \
+         6.283185307179586, and comes as far as 0.5 from its start"
+    );
+    assert_eq!(
+        says("[0.5, 0.1", "[1.5, 0.1"),
+        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, and joint 1 may make 2"
+    );
+    assert_eq!(
+        says("at_s = 5.7", "at_s = 0.0"),
+        "s.toml:15: mode[1].at_s = 0: modes come in the order of time"
+    );
+    assert_eq!(
+        says("\"distributed\"", "\"central\""),
+        "s.toml:16: mode[1].kind = \"central\": \"compare\" or \"distributed\""
+    );
+    assert_eq!(
+        says("at_s = 2.0", "at_s = 12.0"),
+        "s.toml:19: touch[0].at_s = 12: the scenario goes from 0 to duration_s = 12"
+    );
+    assert_eq!(
+        says("\"vcan0\"", "\"vcan7\""),
+        "s.toml:21: touch[0].bus = \"vcan7\": no such bus; there is \"vcan0\""
+    );
+    assert_eq!(
+        says("[1, 3]", "[1, 4]"),
+        "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has this node"
+    );
+    assert_eq!(says("[1, 3]", "[1, 1]"), "s.toml:22: touch[0].cells[1] = 1: cells[0] names it already");
+    assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
+    assert_eq!(
+        says("cells = [1, 3]\n", ""),
+        "s.toml:18: touch[0].cells: which cells? give their nodes, or all = true"
+    );
+    assert_eq!(
+        says("force_n = 3.0", "force_n = 96.0"),
+        "s.toml:23: touch[0].force_n = 96: 0 to 95.997 N are possible, what three contact words can say"
+    );
+    assert_eq!(
+        says("\"step\"", "\"poke\""),
+        "s.toml:31: touch[1].profile = \"poke\": \"half-sine\", \"step\" or \"ramp\""
+    );
+    assert_eq!(
+        says("31.5]", "600.0]"),
+        "s.toml:33: touch[1].temperature_c = 600: its word holds [-512, 512)"
+    );
+    assert_eq!(
+        says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
+        "s.toml:30: touch[1].force_n = 94: with the touches before it that makes 97 N on cell 1 of \
+         \"vcan0\", more than the 95.997 N that three contact words can say"
+    );
+    assert_eq!(
+        says("probability = 0.25", "probability = 25"),
+        "s.toml:40: fault[0].probability = 25: 0 to 1 are needed with kind = \"delay\""
+    );
+    assert_eq!(
+        says("delay_us = 3000\n", ""),
+        "s.toml:35: fault[0].delay_us: 1 to 1000000 us are needed with kind = \"delay\""
+    );
+    assert_eq!(
+        says("kind = \"kill\"", "kind = \"kill\"\nprobability = 0.5"),
+        "s.toml:46: fault[1].probability: means nothing with kind = \"kill\""
+    );
+    assert!(
+        says("\"kill\"", "\"kil\"").starts_with("s.toml:45: fault[1].kind = \"kil\": of processes \"kill\"")
+    );
+    assert_eq!(
+        says("for_s = 1.6", "for = 1.6"),
+        "s.toml:20: unknown field `for`, expected one of `at_s`, `for_s`, `bus`, `cells`, `all`, \
+         `force_n`, `profile`, `proximity`, `temperature_c`"
+    );
+}
+
+#[test]
+fn with_several_buses_the_bus_must_be_named() {
+    let more = SKIN.replacen(
+        "[controller]",
+        "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]",
+        1,
+    );
+    let skin = Skin::parse("skin.toml", &more).unwrap();
+    let text = "version = 1\nduration_s = 1.0\n[[fault]]\nat_s = 0.5\nkind = \"kill\"\ncells = [1]\n";
+    assert_eq!(
+        Scenario::parse("s.toml", text, &skin).unwrap_err().to_string(),
+        "s.toml:3: fault[0].bus: which bus? there is \"vcan0\", \"vcan1\""
+    );
+    let text = format!("{text}bus = \"vcan1\"\n");
+    assert_eq!(
+        Scenario::parse("s.toml", &text, &skin).unwrap_err().to_string(),
+        "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has this node"
+    );
+}
+
+/// The force in N that the words of a cell say in an epoch.
+fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
+    touches.sensors(cell, epoch).contact.iter().map(|word| word.to_f64()).sum()
+}
+
+#[test]
+fn touches_come_and_go_by_their_profile() {
+    let touches = Touches::new(&good(), &three());
+    // 62.5 epochs a second: the half-sine goes from epoch 125 to 225, the step from 187.5 to 218.75.
+    assert_eq!(force(&touches, 0, 125), 0.0);
+    assert_eq!(force(&touches, 0, 175), 3.0, "the middle");
+    assert!((force(&touches, 0, 150) - 3.0 * 0.5_f64.sqrt()).abs() < 1e-3);
+    assert_eq!(force(&touches, 0, 225), 0.0);
+    assert_eq!((force(&touches, 1, 187), force(&touches, 1, 188)), (0.0, 1.0));
+    assert_eq!((force(&touches, 1, 218), force(&touches, 1, 219)), (1.0, 0.0));
+    assert_eq!(touches.sensors(1, 200).proximity.to_f64(), 0.5);
+    assert_eq!(touches.sensors(1, 219), Default::default());
+    assert_eq!(touches.sensors(77, 200), Default::default(), "no such cell");
+    let text = GOOD.replacen("\"half-sine\"", "\"ramp\"", 1);
+    let scenario = Scenario::parse("s.toml", &text, &three()).unwrap();
+    assert_eq!(force(&Touches::new(&scenario, &three()), 0, 150), 0.75);
+}
+
+#[test]
+fn forces_of_overlapping_touches_add_up() {
+    let text = GOOD.replacen("cells = [2]", "cells = [1]", 1);
+    let touches = Touches::new(&Scenario::parse("s.toml", &text, &three()).unwrap(), &three());
+    let alone = Touches::new(&good(), &three());
+    assert_eq!(force(&touches, 0, 200), force(&alone, 0, 200) + 1.0);
+}
+
+#[test]
+fn only_touches_at_the_same_time_press_together() {
+    let touch = |at, length, force| {
+        format!(
+            "[[touch]]\nat_s = {at}\nfor_s = {length}\nall = true\nforce_n = {force}\nprofile = \"step\"\n"
+        )
+    };
+    let parse = |touches: [String; 3]| {
+        let text = format!("version = 1\nduration_s = 9.0\n{}", touches.concat());
+        Scenario::parse("s.toml", &text, &three())
+    };
+    assert!(parse([touch(1.0, 1.0, 50.0), touch(2.0, 1.0, 50.0), touch(0.5, 4.0, 40.0)]).is_ok());
+    assert!(parse([touch(1.0, 1.5, 50.0), touch(2.0, 1.0, 30.0), touch(0.5, 4.0, 40.0)]).is_err());
+    assert!(parse([touch(0.5, 4.0, 40.0), touch(2.0, 1.0, 30.0), touch(1.0, 1.5, 50.0)]).is_err());
+}
+
+#[test]
+fn only_changes_make_stimuli() {
+    let mut touches = Touches::new(&good(), &three());
+    let mut stimuli =
+        |epoch| touches.stimuli_for(epoch).map(|it| (it.cell, it.node.get())).collect::<Vec<_>>();
+    assert_eq!(stimuli(0), []);
+    assert_eq!(stimuli(125), [], "the half-sine begins with nothing");
+    assert_eq!(stimuli(126), [(0, 1), (2, 3)]);
+    assert_eq!(stimuli(188), [(0, 1), (1, 2), (2, 3)]);
+    assert_eq!(stimuli(190), [(0, 1), (2, 3)], "the step holds");
+    assert_eq!(stimuli(219), [(0, 1), (1, 2), (2, 3)], "and ends");
+    assert_eq!(stimuli(226), []);
+}
+
+#[test]
+fn sensors_get_stuck_and_drift() {
+    let faults = "[[fault]]\nat_s = 3.2\nkind = \"stuck\"\nfor_s = 4.8\ncells = [2]\n\
+                  [[fault]]\nat_s = 0.0\nkind = \"drift\"\ncells = [3]\nn_per_s = 0.5\n";
+    let scenario = Scenario::parse("s.toml", &format!("{GOOD}{faults}"), &three()).unwrap();
+    let touches = Touches::new(&scenario, &three());
+    assert_eq!((force(&touches, 1, 199), force(&touches, 1, 499), force(&touches, 1, 500)), (1.0, 1.0, 0.0));
+    assert_eq!((force(&touches, 2, 0), force(&touches, 2, 125)), (0.0, 1.0), "half a newton a second");
+    assert!((force(&touches, 2, 175) - 4.4).abs() < 1e-3, "on top of the touch");
+}
+
+proptest! {
+    #[test]
+    fn three_words_add_up_exactly_to_the_rounded_force(force_n in -96.0_f64..96.0) {
+        let words = contact_words(force_n).map(|word| i64::from(word.to_bits()));
+        let wanted = (force_n * 1_024.0).round() as i64;
+        prop_assert_eq!(words.iter().sum::<i64>(), wanted.clamp(3 * -32_768, 3 * 32_767));
+        prop_assert!(words.iter().max().unwrap() - words.iter().min().unwrap() <= 1);
+    }
+
+    #[test]
+    fn no_force_panics(force_n: f64) {
+        let _ = contact_words(force_n);
+    }
+
+    /// Whoever takes every change knows what every cell feels, also when epochs were skipped.
+    #[test]
+    fn changes_add_up_to_what_every_cell_feels(steps in proptest::collection::vec(1_u64..40, 1..60)) {
+        let faults = "[[fault]]\nat_s = 2.5\nkind = \"stuck\"\nfor_s = 0.3\ncells = [1]\n\
+                      [[fault]]\nat_s = 2.0\nkind = \"drift\"\nfor_s = 2.0\ncells = [3]\nn_per_s = -0.5\n";
+        let scenario = Scenario::parse("s.toml", &format!("{GOOD}{faults}"), &three()).unwrap();
+        let mut touches = Touches::new(&scenario, &three());
+        let mut known = [protocol::message::SkinSensors::default(); 3];
+        let (mut before, mut epoch) = (None, 0);
+        for step in steps {
+            for stimulus in touches.changes(before, epoch) {
+                prop_assert_ne!(known[stimulus.cell], stimulus.sensors);
+                known[stimulus.cell] = stimulus.sensors;
+            }
+            for (cell, known) in known.iter().enumerate() {
+                prop_assert_eq!(*known, touches.sensors(cell, epoch));
+            }
+            (before, epoch) = (Some(epoch), epoch + step);
+        }
+    }
+}
+
+#[test]
+fn words_saturate_beyond_what_they_can_say() {
+    assert_eq!(contact_words(200.0).map(|word| word.to_bits()), [i16::MAX; 3]);
+    assert_eq!(contact_words(-200.0).map(|word| word.to_bits()), [i16::MIN; 3]);
+    assert_eq!(contact_words(1.0).map(|word| word.to_bits()), [342, 341, 341]);
+}

@@ -1,0 +1,229 @@
+//! What every cell feels in every epoch: the touches' forces and the sensors' faults, as words.
+//!
+//! A pure function of the scenario and the epoch: epoch 0 is the scenario's beginning, epoch k comes k
+//! broadcast periods later. What holds at that moment is what the cell feels when it hears those joints.
+
+use core::f64::consts::PI;
+
+use protocol::fixed::Q5_10;
+use protocol::id::CellId;
+use protocol::message::SkinSensors;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+
+use super::{FaultKind, Profile, Scenario, SensorFault, Touch};
+
+/// What a cell shall feel from an epoch on.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Stimulus {
+    /// The cell, as an index into [`Skin::cells`].
+    pub cell: usize,
+    /// Its bus, as an index into [`Skin::buses`].
+    pub bus: usize,
+    /// Its number there.
+    pub node: CellId,
+    /// What it feels.
+    pub sensors: SkinSensors,
+}
+
+/// The touches of a scenario, cell by cell. A cell that nothing touches feels
+/// [`SkinSensors::default`], which is also what every cell feels before the first epoch.
+#[derive(Clone, Debug)]
+pub struct Touches {
+    /// From one epoch to the next, in µs.
+    period_us: f64,
+    touches: Vec<Touch>,
+    /// The touches' forces in N before and now: scratch of [`Touches::changes`].
+    levels: Vec<[Option<f64>; 2]>,
+    cells: Vec<Felt>,
+}
+
+/// Something that happens to a cell at some time.
+#[derive(Clone, Debug)]
+struct Felt {
+    cell: usize,
+    bus: usize,
+    node: CellId,
+    /// Indices into the touches.
+    touches: Vec<usize>,
+    faults: Vec<Wrong>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Wrong {
+    at: Micros,
+    length: Span,
+    fault: SensorFault,
+}
+
+impl Touches {
+    /// What happens to which cell.
+    #[must_use]
+    pub fn new(scenario: &Scenario, skin: &Skin) -> Self {
+        let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| Felt {
+            cell: index,
+            bus: cell.bus,
+            node: cell.node,
+            touches: Vec::new(),
+            faults: Vec::new(),
+        };
+        let mut cells: Vec<Felt> = skin.cells.iter().enumerate().map(of_cell).collect();
+        for (index, touch) in scenario.touches.iter().enumerate() {
+            for &cell in &touch.cells {
+                if let Some(felt) = cells.get_mut(cell) {
+                    felt.touches.push(index);
+                }
+            }
+        }
+        for fault in &scenario.faults {
+            let FaultKind::Sensor { fault: wrong, length, cells: hit } = &fault.kind else { continue };
+            for &cell in hit {
+                if let Some(felt) = cells.get_mut(cell) {
+                    felt.faults.push(Wrong { at: fault.at, length: *length, fault: *wrong });
+                }
+            }
+        }
+        cells.retain(|felt| !felt.touches.is_empty() || !felt.faults.is_empty());
+        Self {
+            period_us: 1e6 / skin.timing.broadcast_hz(),
+            levels: vec![[None; 2]; scenario.touches.len()],
+            touches: scenario.touches.clone(),
+            cells,
+        }
+    }
+
+    /// The cells whose words differ from those of the epoch before.
+    pub fn stimuli_for(&mut self, epoch: u64) -> impl Iterator<Item = Stimulus> {
+        self.changes(epoch.checked_sub(1), epoch)
+    }
+
+    /// The cells whose words in `epoch` differ from those in `before`, `None` being the time before the
+    /// first epoch: for a loop that has skipped some. Each cell at most once, in the skin's order.
+    ///
+    /// Work grows with the cells that something ever touches; no allocation.
+    pub fn changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
+        let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
+        for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
+            *levels = times.map(|time| time.and_then(|time| touch.level(time)));
+        }
+        let this = &*self;
+        this.cells.iter().filter_map(move |felt| {
+            let [before, now] = if felt.faults.is_empty() {
+                this.words_of_levels(felt)?
+            } else {
+                times.map(|time| time.map_or_else(SkinSensors::default, |time| this.words_at(felt, time)))
+            };
+            let stimulus = Stimulus { cell: felt.cell, bus: felt.bus, node: felt.node, sensors: now };
+            (before != now).then_some(stimulus)
+        })
+    }
+
+    /// What a cell feels in an epoch: for one that was started anew.
+    #[must_use]
+    pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
+        match self.cells.binary_search_by_key(&cell, |felt| felt.cell) {
+            Ok(at) => self
+                .cells
+                .get(at)
+                .map_or_else(SkinSensors::default, |felt| self.words_at(felt, self.time_of(epoch))),
+            Err(_) => SkinSensors::default(),
+        }
+    }
+
+    /// When an epoch is.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_precision_loss,
+        clippy::cast_sign_loss,
+        reason = "not negative; exact for the first 2^53 us, 285 years"
+    )]
+    pub fn time_of(&self, epoch: u64) -> Micros {
+        Micros((epoch as f64 * self.period_us).round() as u64)
+    }
+
+    /// Before and now, from the scratch; `None` when no touch of this cell changed.
+    fn words_of_levels(&self, felt: &Felt) -> Option<[SkinSensors; 2]> {
+        let levels = || felt.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
+        if levels().all(|(_, [before, now])| before == now) {
+            return None;
+        }
+        let before = self.words(levels().map(|(index, [before, _])| (index, *before)), 0.0);
+        let now = self.words(levels().map(|(index, [_, now])| (index, *now)), 0.0);
+        Some([before, now])
+    }
+
+    /// What a cell says at a time, with its faults.
+    fn words_at(&self, felt: &Felt, time: Micros) -> SkinSensors {
+        let faults = || felt.faults.iter().filter(|wrong| wrong.holds_at(time));
+        // A stuck sensor says what it felt when it got stuck.
+        let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
+        let time = stuck.unwrap_or(time);
+        let drift = felt.faults.iter().map(|wrong| match wrong.fault {
+            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.since(wrong.at)),
+            SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
+        });
+        let levels =
+            felt.touches.iter().filter_map(|&index| Some((index, self.touches.get(index)?.level(time))));
+        self.words(levels, drift.sum())
+    }
+
+    /// Forces add up; the nearest thing is felt; the last touch in the file tells the temperature.
+    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SkinSensors {
+        let mut sensors = SkinSensors::default();
+        for (index, level) in levels {
+            let (Some(touch), Some(level)) = (self.touches.get(index), level) else { continue };
+            force_n += level;
+            sensors.proximity = sensors.proximity.max(touch.proximity);
+            sensors.temperature = touch.temperature.unwrap_or(sensors.temperature);
+        }
+        SkinSensors { contact: contact_words(force_n), ..sensors }
+    }
+}
+
+impl Wrong {
+    fn holds_at(&self, time: Micros) -> bool {
+        self.at <= time && time.since(self.at) < self.length
+    }
+}
+
+impl Touch {
+    /// Whether it touches at a time.
+    pub(super) fn holds_at(&self, time: Micros) -> bool {
+        self.at <= time && time.since(self.at) < self.length
+    }
+
+    /// The force in N at a time; `None` when it does not touch then.
+    fn level(&self, time: Micros) -> Option<f64> {
+        if !self.holds_at(time) {
+            return None;
+        }
+        let part = seconds(time.since(self.at)) / seconds(self.length);
+        Some(match self.profile {
+            Profile::Step => self.force_n,
+            Profile::Ramp => self.force_n * part,
+            Profile::HalfSine => self.force_n * (PI * part).sin(),
+        })
+    }
+}
+
+/// The greatest force that three contact words can say together, in N.
+pub(super) const GREATEST_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
+
+/// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
+/// rounded to a word's step. Beyond what three words can say they saturate.
+#[must_use]
+#[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
+pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
+    let steps = (force_n * 1_024.0).round() as i64;
+    [2, 1, 0].map(|share| {
+        // Three numbers a third apart, rounded down, add up to the whole.
+        let steps = steps.saturating_add(share).div_euclid(3);
+        Q5_10::from_bits(i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX }))
+    })
+}
+
+#[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+fn seconds(span: Span) -> f64 {
+    span.0 as f64 * 1e-6
+}
