@@ -98,6 +98,7 @@ impl Torque {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "words are exact in f64")]
 mod tests {
     use super::*;
     use proptest::prelude::*;

@@ -80,11 +80,20 @@ fn fold(angle: Q1_14) -> i32 {
 /// An odd polynomial of the folded angle whose coefficients sum up to one.
 fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
     let z = fold(angle);
-    let square = (z * z) >> 13; // 15 fraction bits, at most 2^15
-    let factor = coefficients.into_iter().rev().reduce(|sum, c| c + ((square * sum) >> 15)).unwrap_or(0);
-    let product = z * factor; // 30 fraction bits, at most 2^30
-    let rounded = (product + (1 << 15) + (product >> 31)) >> 16; // halves away from zero, which is odd
-    Q1_14::from_bits(i16::try_from(rounded).expect("a sine is within 1"))
+    let square = product(z, z) >> 13; // 15 fraction bits, at most 2^15
+    let horner = |sum: i32, coefficient: i32| coefficient + (product(square, sum) >> 15);
+    let factor = coefficients.into_iter().rev().reduce(horner).unwrap_or(0);
+    let sine = product(z, factor); // 30 fraction bits, at most 2^30
+    let rounded = (sine + (1 << 15) + (sine >> 31)) >> 16; // halves away from zero, which is odd
+    let [low, high, ..] = rounded.to_le_bytes(); // a sine is within 1
+    Q1_14::from_bits(i16::from_le_bytes([low, high]))
+}
+
+/// A product that fits 32 bits, for every angle there is; unchecked in a release build, where checking
+/// it would cost a small processor more than the product.
+fn product(lhs: i32, rhs: i32) -> i32 {
+    debug_assert!(lhs.checked_mul(rhs).is_some(), "{lhs} x {rhs} is wider than 32 bits");
+    lhs.wrapping_mul(rhs)
 }
 
 /// Fraction bits of [`fine_sine_cosine`].

@@ -1,12 +1,7 @@
 //! The kernels against torques that were computed elsewhere, against Eq. 8 in real numbers, and against
 //! each other.
 
-#![allow(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::print_stdout,
-    reason = "a test may stop, and speak"
-)]
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::witness::{Counted, Operations};
@@ -17,35 +12,13 @@ use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
 
 mod witness;
 
-use witness::{Case, equation_8};
-
-/// Mean and greatest error in Nm of the torques of loaded joints, over the cases.
-fn errors(jacobian: impl Fn(&Parameters, &[Q1_14; 6]) -> [Q1_14; 6]) -> (f64, f64) {
-    let (mut sum, mut count, mut greatest) = (0.0, 0.0, 0.0_f64);
-    for case in Case::all() {
-        if case.torques.iter().any(|torque| torque.abs() >= Q3_12::MAX.to_f64()) {
-            continue;
-        }
-        let force = Force::from_steps((case.force * 65_536.0) as i64);
-        let torque = Torque::new(&jacobian(&case.parameters(), &case.words()), force);
-        let words = torque.words();
-        let (loaded, beyond) = words.split_at(usize::from(case.joint));
-        for (word, wanted) in loaded.iter().zip(case.torques) {
-            let error = (word.to_f64() - wanted).abs();
-            sum += error;
-            count += 1.0;
-            greatest = greatest.max(error);
-        }
-        assert!(beyond.iter().all(|&word| word == Q3_12::ZERO), "joints beyond the cell's bear no load");
-    }
-    (sum / count, greatest)
-}
+use witness::{Case, Errors, equation_8};
 
 #[test]
 fn the_wrench_kernel_errs_less_than_its_bars_on_a_ur5() {
-    let (mean, greatest) = errors(|parameters, joints| Wrench::<Q1_14>::new(parameters).jacobian(joints));
-    println!("wrench: mean {mean:.3e} Nm, greatest {greatest:.3e} Nm");
-    assert!(mean <= 1.2e-4 && greatest <= 1.5e-3);
+    let errors = Errors::of_words(|parameters, joints| Wrench::new(parameters).jacobian(joints));
+    assert!(errors.mean <= 1.2e-4 && errors.greatest <= 1.5e-3, "{errors:?}");
+    assert_eq!((errors.torques, errors.left_out), (1_048, 0));
 }
 
 #[test]
@@ -57,23 +30,54 @@ fn a_pressed_cell_lets_the_joint_give_way() {
     for position in [0.0, 0.3, -1.7].map(Q1_14::nearest) {
         let joints = [position; MAX_JOINTS];
         let jacobian = Wrench::<Q1_14>::new(&parameters).jacobian(&joints);
-        assert_eq!(jacobian.map(Q1_14::to_f64), [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(jacobian, [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0].map(Q1_14::nearest));
         let torque = Torque::new(&jacobian, Force::from_steps(2 << 16));
-        assert_eq!(torque.words()[0].to_f64(), -1.0, "tau = -r F");
+        assert_eq!(torque.words()[0], Q3_12::nearest(-1.0), "tau = -r F");
     }
 }
 
 #[test]
 fn the_projection_kernel_errs_less_than_the_papers_0_0054_nm_on_a_ur5() {
-    let (mean, greatest) = errors(|parameters, joints| Projection::<Q1_14>::new(parameters).jacobian(joints));
-    println!("projection: mean {mean:.3e} Nm, greatest {greatest:.3e} Nm");
-    assert!(mean <= 1.4e-4 && greatest <= 1.5e-3);
+    let errors = Errors::of_words(|parameters, joints| Projection::new(parameters).jacobian(joints));
+    assert!(errors.mean <= 1.4e-4 && errors.greatest <= 1.5e-3, "{errors:?}");
 
-    let (mean, greatest) = errors(|parameters, joints| {
+    let with_the_papers_sine = Errors::of_words(|parameters, joints| {
         Projection::<PaperWord>::new(parameters).jacobian(joints).map(|PaperWord(row)| row)
     });
-    println!("projection with the paper's sine: mean {mean:.3e} Nm, greatest {greatest:.3e} Nm");
-    assert!(mean <= 5.4e-3);
+    assert!(with_the_papers_sine.mean <= 1e-3, "{with_the_papers_sine:?}");
+}
+
+#[test]
+fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
+    // Two links of 1.5 m, stretched out, and a cell at the end that looks up or down.
+    let link = Row { a: Q1_14::nearest(1.5), ..Row::default() };
+    let zero = Q1_14::ZERO;
+    for (up, wanted) in [(-1.0, Q1_14::MAX), (1.0, Q1_14::MIN)] {
+        let pose = Pose { position: [zero; 3], normal: [zero, Q1_14::nearest(up), zero] };
+        let parameters =
+            Parameters { joint: 2, joints: 2, pose, rows: [link; MAX_JOINTS], ..Parameters::default() };
+        let wrench = Wrench::<Q1_14>::new(&parameters).jacobian(&[zero; 6]);
+        let projection = Projection::<Q1_14>::new(&parameters).jacobian(&[zero; 6]);
+        assert_eq!(wrench[..2], [wanted, Q1_14::nearest(-1.5 * up)]);
+        // Here the position saturates before it meets the force; the last step may differ.
+        assert!(projection[0].to_bits().unsigned_abs() >= 0x7FFF);
+        assert_eq!(projection[0].to_bits() < 0, wanted == Q1_14::MIN);
+        assert_eq!(projection[1..], wrench[1..]);
+    }
+}
+
+#[test]
+fn an_offset_is_added_to_the_position_and_wraps() {
+    let mut case = Case::all().into_iter().find(|case| case.joint == 6).unwrap().parameters();
+    let joints = [-0x7000, 0x7000, 0x1234, -0x4321, 0x6543, -1].map(Q1_14::from_bits);
+    let wanted = in_words::<Wrench>(&case, &joints);
+    let shift = Q1_14::from_bits(0x5A5A);
+    for row in &mut case.rows {
+        row.theta_offset = shift;
+    }
+    let shifted = joints.map(|position| Q1_14::from_bits(position.to_bits().wrapping_sub(shift.to_bits())));
+    assert!(apart(in_words::<Wrench>(&case, &shifted), wanted) == 0.0);
+    assert!(apart(in_words::<Projection>(&case, &shifted), wanted) < 2e-4);
 }
 
 /// What a kernel does for the UR5 and a cell on its last link.
@@ -86,10 +90,8 @@ fn operations<K: Kernel<Counted>>() -> Operations {
 #[test]
 fn the_operations_on_a_ur5_are_what_the_docs_say() {
     let wrench = operations::<Wrench<Counted>>();
-    println!("{wrench:?}");
     assert_eq!((wrench.multiplications, wrench.additions, wrench.sines, wrench.cosines), (40, 24, 5, 5));
     let projection = operations::<Projection<Counted>>();
-    println!("{projection:?}");
     assert_eq!(
         (projection.multiplications, projection.additions, projection.sines, projection.cosines),
         (103, 56, 6, 6)
@@ -148,7 +150,7 @@ fn in_words<K: Kernel>(parameters: &Parameters, joints: &[Q1_14; 6]) -> [f64; 6]
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(4_096))]
+    #![proptest_config(ProptestConfig { cases: 1_024, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn both_kernels_are_equation_8_in_real_numbers(parameters in any_arm(), joints: [i16; 6]) {
@@ -161,13 +163,13 @@ proptest! {
     }
 
     #[test]
-    fn words_err_by_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; 6]) {
+    fn words_err_by_half_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; 6]) {
         let joints = joints.map(Q1_14::from_bits);
         let wanted = equation_8(&parameters, &joints);
         let wrench = in_words::<Wrench>(&parameters, &joints);
         let projection = in_words::<Projection>(&parameters, &joints);
-        prop_assert!(apart(wrench, wanted) <= 1e-3, "{wrench:?} is not {wanted:?}");
-        prop_assert!(apart(projection, wanted) <= 1e-3, "{projection:?} is not {wanted:?}");
+        prop_assert!(apart(wrench, wanted) <= 5e-4, "{wrench:?} is not {wanted:?}");
+        prop_assert!(apart(projection, wanted) <= 5e-4, "{projection:?} is not {wanted:?}");
     }
 
     #[test]

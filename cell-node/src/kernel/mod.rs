@@ -16,6 +16,17 @@
 //! - [`Projection`] carries the frames from the base up to the cell, as the paper does (Eq. 20 to 25).
 //!   It is the witness in tests and the other side of the comparison.
 //!
+//! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | greatest |
+//! |---|---|---|---|---|---|---|
+//! | [`Wrench`] | 40 | 24 | 5 | 5 | 1.2e-4 Nm | 1.5e-3 Nm |
+//! | [`Projection`] | 103 | 56 | 6 | 6 | 1.4e-4 Nm | 1.5e-3 Nm |
+//! | the paper (Eq. 27) | 103 | 57 | 6 | 6 | 5.4e-3 Nm | |
+//!
+//! The operations are counted by running the code on numbers that count (`witness::Counted`); the errors, of Q3.12
+//! words against Eq. 8 in double precision, are bounds over 300 poses with up to 6 N. For any arm
+//! within reach of 1.6 m, J errs by less than 5e-4 m. `cargo run -p cell-node --example kernels` prints
+//! all of this as measured.
+//!
 //! Any arm of 1 to 6 revolute joints in standard Denavit-Hartenberg form will do. Angles are words that
 //! wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
 //! twists four; lengths that are zero cost nothing. Parameters that
@@ -41,7 +52,7 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     /// Never panics, whatever the words are.
     fn new(parameters: &Parameters) -> Self;
 
-    /// J_l in m for joints l = 1..=6 (zero for l > k), from joint positions in quarter turns.
+    /// J_l in m, [-2, 2), for joints l = 1..=6 (zero for l > k), from joint positions in quarter turns.
     ///
     /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];

@@ -1,6 +1,6 @@
 //! The number that a kernel computes with: fixed point on the cell; other types for tests and counts.
 
-use core::ops::{Add, Mul, Sub};
+use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Acc, Q1_14};
 
@@ -14,7 +14,11 @@ pub trait Scalar: Copy {
     type Wide: Copy;
     /// What constants are computed with, once, when a kernel is built. An integer here counts steps
     /// whose size the program follows; see [`Scalar::settle`].
-    type Fine: Copy + Add<Output = Self::Fine> + Sub<Output = Self::Fine> + Mul<Output = Self::Fine>;
+    type Fine: Copy
+        + Add<Output = Self::Fine>
+        + Sub<Output = Self::Fine>
+        + Mul<Output = Self::Fine>
+        + Neg<Output = Self::Fine>;
 
     /// Nothing.
     const ZERO: Self;

@@ -15,7 +15,7 @@
 //! needed. Twist and shift of joint k are constant too and are folded into the six stored words. What
 //! nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
 
-use core::ops::{Add, Mul, Sub};
+use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
@@ -227,16 +227,15 @@ fn fold<S: Scalar>(pose: &Pose, row: &Row) -> Wrenched<S> {
 }
 
 /// The same before rounding. Words of 16 bits give no number above 2^61.
-fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N>>(
+fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
     [nx, ny, nz]: [N; 3],
     [tx, ty, tz]: [N; 3],
     [sine, cosine, one]: [N; 3],
     (a, d): (N, N),
 ) -> ([N; 3], [N; 3]) {
     let twist = |[x, y, z]: [N; 3]| [one * x, cosine * y - sine * z, sine * y + cosine * z];
-    let zero = one - one;
     // The force pushes against the normal.
-    let [fx, fy, fz] = twist([zero - nx, zero - ny, zero - nz]);
+    let [fx, fy, fz] = twist([-nx, -ny, -nz]);
     // t x f = n x t.
     let [mx, my, mz] = twist([ny * tz - nz * ty, nz * tx - nx * tz, nx * ty - ny * tx]);
     ([fx, fy, fz], [mx - d * fy, my + d * fx - a * fz, mz + a * fy])

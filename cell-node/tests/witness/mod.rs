@@ -1,8 +1,16 @@
 //! What the kernels are held against: the UR5, torques computed elsewhere, and Eq. 8 in real numbers.
 
-#![allow(dead_code, clippy::unwrap_used, clippy::indexing_slicing, reason = "shared; a test may stop")]
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    clippy::float_cmp,
+    reason = "shared by programs that use a part each; a test may stop; zeros are exact"
+)]
 
-use protocol::fixed::Q1_14;
+use cell_node::contact::{Force, Torque};
+use protocol::fixed::{Q1_14, Q3_12};
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
 
 /// One line of `vectors/ur5_torque.csv`: computed from Eq. 8 in double precision, and in agreement with
@@ -53,6 +61,52 @@ impl Case {
     /// The joint positions as words.
     pub(crate) fn words(&self) -> [Q1_14; 6] {
         self.positions.map(|angle| Q1_14::from_radians(angle).unwrap())
+    }
+}
+
+/// How far torques are from those of the cases, in Nm.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Errors {
+    /// The mean of the absolute errors.
+    pub(crate) mean: f64,
+    /// The greatest absolute error.
+    pub(crate) greatest: f64,
+    /// How many torques were compared: those of loaded joints.
+    pub(crate) torques: usize,
+    /// How many cases were left out, because a torque lies beyond Q3.12.
+    pub(crate) left_out: usize,
+}
+
+impl Errors {
+    /// Compares what `torques` says of each case.
+    pub(crate) fn of(torques: impl Fn(&Case) -> [f64; 6]) -> Self {
+        let cases = Case::all();
+        let fits = |case: &&Case| case.torques.iter().all(|torque| torque.abs() < Q3_12::MAX.to_f64());
+        let errors: Vec<f64> = cases
+            .iter()
+            .filter(fits)
+            .flat_map(|case| {
+                let got = torques(case);
+                let loaded = usize::from(case.joint);
+                assert!(got[loaded..].iter().all(|&torque| torque == 0.0), "joints beyond k bear no load");
+                (0..loaded).map(move |joint| (got[joint] - case.torques[joint]).abs())
+            })
+            .collect();
+        Self {
+            mean: errors.iter().sum::<f64>() / errors.len() as f64,
+            greatest: errors.iter().copied().fold(0.0, f64::max),
+            torques: errors.len(),
+            left_out: cases.len() - cases.iter().filter(fits).count(),
+        }
+    }
+
+    /// Compares the words that a cell would send.
+    pub(crate) fn of_words(jacobian: impl Fn(&Parameters, &[Q1_14; 6]) -> [Q1_14; 6]) -> Self {
+        Self::of(|case| {
+            let force = Force::from_steps((case.force * 65_536.0) as i64);
+            let torque = Torque::new(&jacobian(&case.parameters(), &case.words()), force);
+            torque.words().map(Q3_12::to_f64)
+        })
     }
 }
 

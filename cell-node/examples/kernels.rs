@@ -1,0 +1,97 @@
+//! Prints what the kernels cost and how well they do on a UR5, as tables.
+//!
+//! ```text
+//! cargo run -p cell-node --example kernels
+//! ```
+
+#![expect(clippy::print_stdout, clippy::unwrap_used, reason = "it prints, and stops where it cannot")]
+
+use cell_node::kernel::witness::{Counted, Operations};
+use cell_node::kernel::{Kernel, PaperWord, Projection, Wrench};
+use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
+use protocol::fixed::{Q1_14, Q3_12};
+
+#[path = "../tests/witness/mod.rs"]
+mod witness;
+
+use witness::{Case, Errors};
+
+fn main() {
+    println!("Sine over all 65 536 angles (Q1.14; rounding alone: mean 1.52e-5)\n");
+    println!("| function | mean error | greatest error |\n|---|---|---|");
+    angles("sine, seventh order", sine, f64::sin);
+    angles("cosine, seventh order", cosine, f64::cos);
+    angles("sine, fifth order (paper)", paper_sine, f64::sin);
+    angles("cosine, fifth order (paper)", paper_cosine, f64::cos);
+
+    println!("\nOne Jacobian on a UR5\n");
+    println!("| kernel | k | mul | add | sin | cos | negations | angle additions | roundings |");
+    println!("|---|---|---|---|---|---|---|---|---|");
+    for joint in (1..=6).rev() {
+        operations::<Wrench<Counted>>("wrench", joint);
+    }
+    for joint in (1..=6).rev() {
+        operations::<Projection<Counted>>("projection", joint);
+    }
+    println!("| paper, Eq. 27 | 6 | 103 | 57 | 6 | 6 | | | |");
+
+    println!("\nTorques of loaded joints on a UR5, Nm\n");
+    println!("| kernel and numbers | mean error | greatest error |\n|---|---|---|");
+    let wrench = Errors::of_words(|parameters, joints| Wrench::new(parameters).jacobian(joints));
+    torques("wrench, words", wrench);
+    torques(
+        "projection, words",
+        Errors::of_words(|parameters, joints| Projection::new(parameters).jacobian(joints)),
+    );
+    torques(
+        "wrench, words, paper's sine",
+        Errors::of_words(|parameters, joints| {
+            Wrench::<PaperWord>::new(parameters).jacobian(joints).map(|row| row.0)
+        }),
+    );
+    torques(
+        "projection, words, paper's sine",
+        Errors::of_words(|parameters, joints| {
+            Projection::<PaperWord>::new(parameters).jacobian(joints).map(|row| row.0)
+        }),
+    );
+    let real = |case: &Case| {
+        Wrench::<f64>::new(&case.parameters()).jacobian(&case.words()).map(|row| row * case.force)
+    };
+    torques("either, real numbers, from the same words", Errors::of(real));
+    torques(
+        "the same, rounded to Q3.12",
+        Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64())),
+    );
+    println!(
+        "\n{} torques in {} poses; {} poses left out, beyond Q3.12",
+        wrench.torques,
+        Case::all().len(),
+        wrench.left_out
+    );
+}
+
+fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, witness: impl Fn(f64) -> f64) {
+    let errors = (i16::MIN..=i16::MAX).map(|bits| {
+        let angle = Q1_14::from_bits(bits);
+        (function(angle).to_f64() - witness(angle.to_radians())).abs()
+    });
+    let (sum, greatest) = errors.fold((0.0, 0.0_f64), |(sum, most), error| (sum + error, most.max(error)));
+    println!("| {name} | {:.2e} | {greatest:.2e} |", sum / 65_536.0);
+}
+
+fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
+    let case = Case::all().into_iter().find(|case| case.joint == joint).unwrap();
+    let kernel = K::new(&case.parameters());
+    let (_, done) = Operations::count(|| kernel.jacobian(&case.words()));
+    let Operations { multiplications, additions, sines, cosines, negations, angle_additions, roundings } =
+        done;
+    println!(
+        "| {name} | {joint} | {multiplications} | {additions} | {sines} | {cosines} | {negations} | \
+         {angle_additions} | {roundings} |"
+    );
+}
+
+fn torques(name: &str, Errors { mean, greatest, .. }: Errors) {
+    println!("| {name} | {mean:.2e} | {greatest:.2e} |");
+}
