@@ -98,6 +98,16 @@ fn the_operations_on_a_ur5_are_what_the_docs_say() {
     );
 }
 
+#[test]
+fn what_nobody_reads_is_not_computed_behind_an_odd_twist_either() {
+    // J_1 = sin(alpha) m_y + cos(alpha) m_z, and m_y takes two products after the turn of joint 2.
+    let mut parameters = Case::all().into_iter().find(|case| case.joint == 2).unwrap().parameters();
+    parameters.rows[0] = Row { alpha: Q1_14::nearest(0.3), ..Row::default() };
+    let kernel = Wrench::<Counted>::new(&parameters);
+    let (_, done) = Operations::count(|| kernel.jacobian(&[Q1_14::nearest(0.7); 6]));
+    assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
+}
+
 /// The words of an arm: any at all.
 fn any_arm() -> impl Strategy<Value = Parameters> {
     arm(any::<i16>())
