@@ -1,0 +1,20 @@
+//! The embedded bus: `CAN_RAW`'s rules over a Unix socket, for machines whose kernel has no SocketCAN.
+//!
+//! ```text
+//!   client --datagram--> [ Parcel::accept ] -> [ Router ] -> [ Queue ] per client --datagram--> client
+//!                          16 or 72 bytes       filters       bounded, counts drops
+//! ```
+//!
+//! Routing and queues are pure; [`Server`] is the shell around them: one thread, one `epoll`. Frames are
+//! passed on in the order in which they are read, so all clients see the same order. It is private to the
+//! user and it is not `AF_CAN`: `candump` cannot attach to it.
+
+pub mod cases;
+pub mod parcel;
+pub mod place;
+pub mod queue;
+pub mod routing;
+pub mod server;
+
+pub use place::PlaceError;
+pub use server::{ServeError, Served, Server, Totals};

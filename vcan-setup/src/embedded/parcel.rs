@@ -1,0 +1,112 @@
+//! A frame's datagram on its way through the bus.
+
+use protocol::bus::embedded::OWN_BYTE;
+use protocol::can::{CLASSIC_BYTES, FD_BYTES, FD_FORMAT, Format, Frame};
+
+/// Which byte holds the FD flags.
+const FLAGS_BYTE: usize = 5;
+
+/// `struct can_frame` or `struct canfd_frame`, as the bus passes it on.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Parcel {
+    bytes: [u8; FD_BYTES],
+    id: u32,
+    format: Format,
+}
+
+impl Parcel {
+    /// Takes a client's datagram; `None` when it is no frame that `CAN_RAW` would send.
+    ///
+    /// The size must be that of one of the structs, the length at most what it carries, and CAN FD must be
+    /// what the client opened (`fd`). As kernels do from 6.1 on, an FD frame gets its flag FDF. The bytes are
+    /// passed on as they came otherwise, except the one that marks own frames. Never panics.
+    #[must_use]
+    pub fn accept(datagram: &[u8], fd: bool) -> Option<Self> {
+        let frame = Frame::from_bytes(datagram).ok()?;
+        if frame.format() == Format::Fd && !fd {
+            return None;
+        }
+        let mut bytes = [0; FD_BYTES];
+        bytes.get_mut(..datagram.len())?.copy_from_slice(datagram);
+        if frame.format() == Format::Fd {
+            *bytes.get_mut(FLAGS_BYTE)? |= FD_FORMAT;
+        }
+        *bytes.get_mut(OWN_BYTE)? = 0;
+        Some(Self { bytes, id: frame.raw_id(), format: frame.format() })
+    }
+
+    /// The same frame, marked as the receiver's own or not.
+    #[must_use]
+    pub fn marked(mut self, own: bool) -> Self {
+        if let Some(byte) = self.bytes.get_mut(OWN_BYTE) {
+            *byte = own.into();
+        }
+        self
+    }
+
+    /// Identifier and flags.
+    #[must_use]
+    pub const fn raw_id(&self) -> u32 {
+        self.id
+    }
+
+    /// Classic or FD.
+    #[must_use]
+    pub const fn format(&self) -> Format {
+        self.format
+    }
+
+    /// The datagram is the first [`Parcel::byte_len`] of these.
+    #[must_use]
+    pub const fn bytes(&self) -> &[u8; FD_BYTES] {
+        &self.bytes
+    }
+
+    /// 16 or 72.
+    #[must_use]
+    pub const fn byte_len(&self) -> usize {
+        match self.format {
+            Format::Classic => CLASSIC_BYTES,
+            Format::Fd => FD_BYTES,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::embedded::cases;
+    use proptest::prelude::*;
+
+    #[test]
+    fn what_can_raw_refuses_to_send_is_refused() {
+        for case in cases::refused() {
+            assert_eq!(Parcel::accept(&case.datagram, case.fd), None, "{}", case.what);
+        }
+    }
+
+    #[test]
+    fn the_fdf_flag_is_set_and_the_own_mark_cannot_be_forged() {
+        let mut bytes = Frame::with_data(0x201, Format::Fd, 1, &[7]).unwrap().to_bytes();
+        bytes[OWN_BYTE] = 1;
+        let parcel = Parcel::accept(&bytes, true).unwrap();
+        assert_eq!(parcel.bytes()[4..9], [1, 1 | FD_FORMAT, 0, 0, 7]);
+        assert_eq!(parcel.marked(true).bytes()[OWN_BYTE], 1);
+        assert_eq!(parcel.marked(true).marked(false), parcel);
+    }
+
+    proptest! {
+        #[test]
+        fn a_frame_passes_unchanged(id: u32, fd: bool, data in proptest::collection::vec(any::<u8>(), 0..=8)) {
+            let frame = if fd { Frame::fd(id, 1, &data) } else { Frame::classic(id, &data) }.unwrap();
+            let parcel = Parcel::accept(&frame.to_bytes()[..frame.byte_len()], true).unwrap();
+            prop_assert_eq!(&parcel.bytes()[..parcel.byte_len()], &frame.to_bytes()[..frame.byte_len()]);
+            prop_assert_eq!((parcel.raw_id(), parcel.format()), (frame.raw_id(), frame.format()));
+        }
+
+        #[test]
+        fn no_datagram_panics(bytes in proptest::collection::vec(any::<u8>(), 0..80), fd: bool) {
+            let _ = Parcel::accept(&bytes, fd);
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! Where a bus's socket lies, and who may put it there.
+//!
+//! Whoever makes or removes a socket or the directory holds a lock on the directory meanwhile, so a socket
+//! that a killed server left behind is told apart from one that is served, and only one wins.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+
+use protocol::bus::BusError;
+use protocol::bus::embedded::{DirectoryError, address, make_directory, open_directory, socket_name};
+use rustix::fs::{AtFlags, FileType, FlockOperation};
+use rustix::io::Errno;
+use rustix::net::{AddressFamily, SocketFlags, SocketType};
+use thiserror::Error;
+
+/// Why a bus cannot be served under a name.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum PlaceError {
+    /// No bus can have this name.
+    #[error(transparent)]
+    Name(BusError),
+    /// The directory cannot be used.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
+    /// Another server is there.
+    #[error("the embedded bus {name} is already served at {}: use it, or stop its server first", path.display())]
+    Served {
+        /// The bus.
+        name: String,
+        /// Its socket.
+        path: PathBuf,
+    },
+    /// A file that is no socket.
+    #[error("{} is in the way and is no socket: move it away", path.display())]
+    InTheWay {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Anything else that the system says.
+    #[error("cannot {doing} {}: {source}", path.display())]
+    Io {
+        /// The socket or the directory.
+        path: PathBuf,
+        /// What was tried.
+        doing: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// A listening socket in its directory; dropping it removes both, the directory only when it is empty.
+#[derive(Debug)]
+pub(super) struct Place {
+    pub(super) listener: OwnedFd,
+    pub(super) path: PathBuf,
+    directory: PathBuf,
+    file: String,
+    /// Device and inode of the socket's file, to remove no one else's.
+    inode: (u64, u64),
+}
+
+/// How many clients may be waiting to be let in; the kernel's own limit is often lower.
+const BACKLOG: i32 = 4096;
+
+impl Place {
+    pub(super) fn take(directory: &Path, name: &str) -> Result<Self, PlaceError> {
+        protocol::bus::check_name(name).map_err(PlaceError::Name)?;
+        let file = socket_name(name);
+        let path = directory.join(&file);
+        let address = address(directory, name)?;
+        let failed = |doing| {
+            let path = path.clone();
+            move |errno: Errno| PlaceError::Io { path, doing, source: errno.into() }
+        };
+        let lock = lock(directory)?;
+        match rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW) {
+            Ok(stat) if FileType::from_raw_mode(stat.st_mode) != FileType::Socket => {
+                return Err(PlaceError::InTheWay { path });
+            }
+            Ok(_) => {
+                let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+                let probe = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
+                    .map_err(failed("ask for"))?;
+                // Only a socket that nobody listens on refuses; a full list of waiting clients does not.
+                if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
+                    return Err(PlaceError::Served { name: name.to_owned(), path });
+                }
+                rustix::fs::unlinkat(&lock, &file, AtFlags::empty()).map_err(failed("remove"))?;
+            }
+            Err(Errno::NOENT) => {}
+            Err(errno) => return Err(failed("look at")(errno)),
+        }
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let listener = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
+            .map_err(failed("make"))?;
+        rustix::net::bind(&listener, &address).map_err(failed("make"))?;
+        rustix::net::listen(&listener, BACKLOG).map_err(failed("listen on"))?;
+        let stat = rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW).map_err(failed("look at"))?;
+        let inode = (stat.st_dev, stat.st_ino);
+        Ok(Self { listener, path, directory: directory.to_owned(), file, inode })
+    }
+
+    fn remove(&self) -> Result<(), Errno> {
+        let Ok(directory) = open_directory(&self.directory) else { return Ok(()) };
+        rustix::fs::flock(&directory, FlockOperation::LockExclusive)?;
+        let stat = rustix::fs::statat(&directory, &self.file, AtFlags::SYMLINK_NOFOLLOW)?;
+        if (stat.st_dev, stat.st_ino) == self.inode {
+            rustix::fs::unlinkat(&directory, &self.file, AtFlags::empty())?;
+            rustix::fs::rmdir(&self.directory)?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        // Nothing more can be done: somebody else removed it, or the directory has other buses.
+        let _ = self.remove();
+    }
+}
+
+/// Makes the directory unless it is there, and locks it.
+fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
+    let failed = |errno: Errno| PlaceError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
+    loop {
+        let directory = match make_directory(path) {
+            Ok(directory) => directory,
+            // A server that ended removed it between the two looks; but a missing parent stays missing.
+            Err(DirectoryError::Io { source, .. })
+                if source.kind() == io::ErrorKind::NotFound && path.parent().is_some_and(Path::exists) =>
+            {
+                continue;
+            }
+            Err(error) => return Err(error.into()),
+        };
+        rustix::io::retry_on_intr(|| rustix::fs::flock(&directory, FlockOperation::LockExclusive))
+            .map_err(failed)?;
+        let locked = rustix::fs::fstat(&directory).map_err(failed)?;
+        // Whoever held the lock before may have removed the directory: then this lock is on nothing.
+        if let Ok(present) = rustix::fs::lstat(path)
+            && (present.st_dev, present.st_ino) == (locked.st_dev, locked.st_ino)
+        {
+            return Ok(directory);
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! What waits for one client, and what was dropped because it did not read.
+
+use std::collections::VecDeque;
+
+use super::parcel::Parcel;
+
+/// The next thing to tell a client.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Entry {
+    /// A frame.
+    Frame(Parcel),
+    /// How many frames were dropped so far.
+    Dropped(u32),
+}
+
+/// A bounded queue. When it is full the newest frame is dropped, as a socket's receive buffer does it, and
+/// the client is told the total before the next frame that it gets.
+#[derive(Debug)]
+pub struct Queue {
+    entries: VecDeque<Entry>,
+    frames: usize,
+    limit: usize,
+    dropped: u32,
+    told: u32,
+}
+
+impl Queue {
+    /// An empty queue for at most `limit` frames.
+    #[must_use]
+    pub const fn new(limit: usize) -> Self {
+        Self { entries: VecDeque::new(), frames: 0, limit, dropped: 0, told: 0 }
+    }
+
+    /// Appends a frame; `false` when there was no room and it was dropped and counted.
+    pub fn push(&mut self, parcel: Parcel) -> bool {
+        if self.frames >= self.limit {
+            self.dropped = self.dropped.wrapping_add(1);
+            return false;
+        }
+        self.tell();
+        self.entries.push_back(Entry::Frame(parcel));
+        self.frames += 1;
+        true
+    }
+
+    /// Appends the total of dropped frames, unless the client knows it. To be called also when the queue has
+    /// run empty: then nothing that was not dropped stands between.
+    pub fn tell(&mut self) {
+        if self.told != self.dropped {
+            self.entries.push_back(Entry::Dropped(self.dropped));
+            self.told = self.dropped;
+        }
+    }
+
+    /// What comes next, oldest first.
+    pub fn iter(&self) -> impl Iterator<Item = &Entry> {
+        self.entries.iter()
+    }
+
+    /// Forgets the oldest `count` entries, which were sent; how many of them were frames.
+    pub fn sent(&mut self, count: usize) -> usize {
+        let before = self.frames;
+        for entry in self.entries.drain(..count.min(self.entries.len())) {
+            match entry {
+                Entry::Frame(_) => self.frames -= 1,
+                Entry::Dropped(_) => {}
+            }
+        }
+        before - self.frames
+    }
+
+    /// How many frames wait.
+    #[must_use]
+    pub const fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// Whether nothing waits, not even a notice.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    /// How many frames were dropped so far; wraps.
+    #[must_use]
+    pub const fn dropped(&self) -> u32 {
+        self.dropped
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::can::Frame;
+
+    fn parcel(id: u32) -> Parcel {
+        Parcel::accept(&Frame::classic(id, &[]).unwrap().to_bytes()[..16], true).unwrap()
+    }
+
+    #[test]
+    fn what_does_not_fit_is_dropped_and_told_before_the_next_frame() {
+        let mut queue = Queue::new(2);
+        let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id))).collect();
+        assert_eq!(kept, [true, true, false, false, false]);
+        assert_eq!(queue.sent(2), 2);
+        assert!(queue.push(parcel(5)));
+        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [Entry::Dropped(3), Entry::Frame(parcel(5))]);
+    }
+
+    #[test]
+    fn a_total_is_told_once() {
+        let mut queue = Queue::new(0);
+        queue.tell();
+        assert!(queue.is_empty());
+        queue.push(parcel(0));
+        queue.tell();
+        queue.tell();
+        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [Entry::Dropped(1)]);
+        assert_eq!(queue.sent(1), 0);
+    }
+
+    proptest! {
+        /// `true` pushes the next frame, `false` sends the oldest entry.
+        #[test]
+        fn a_reader_knows_at_every_frame_how_many_are_missing(limit in 0_usize..6, steps in proptest::collection::vec(any::<bool>(), 0..60)) {
+            let mut queue = Queue::new(limit);
+            let (mut pushed, mut heard, mut missing) = (0_u32, 0_u32, 0_u32);
+            let mut hear = |queue: &mut Queue| {
+                match queue.iter().next().copied() {
+                    Some(Entry::Dropped(total)) => missing = total,
+                    Some(Entry::Frame(parcel)) => {
+                        assert_eq!(parcel.raw_id(), heard + missing);
+                        heard += 1;
+                    }
+                    None => {}
+                }
+                queue.sent(1);
+                (heard, missing)
+            };
+            for push in steps {
+                if push {
+                    queue.push(parcel(pushed));
+                    pushed += 1;
+                } else {
+                    hear(&mut queue);
+                }
+                prop_assert!(queue.frames() <= limit);
+            }
+            queue.tell();
+            while !queue.is_empty() {
+                hear(&mut queue);
+            }
+            let (heard, missing) = hear(&mut queue);
+            prop_assert_eq!(heard + missing, pushed);
+            prop_assert_eq!(missing, queue.dropped());
+        }
+    }
+}

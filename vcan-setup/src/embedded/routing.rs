@@ -1,0 +1,298 @@
+//! Which clients get a frame: the rules of the kernel's `CAN_RAW`.
+//!
+//! As the kernel does (`net/can/af_can.c`), filters are sorted once into classes, so that a frame looks only
+//! where it can match: an exact identifier is found in a table, whatever the number of clients.
+
+use std::collections::HashMap;
+
+use protocol::bus::Filter;
+use protocol::bus::embedded::Hello;
+use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, REMOTE, STANDARD_MASK};
+
+/// A client's place in the server's table.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct ClientId(pub usize);
+
+/// Where a filter is looked up.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Class {
+    /// Error frames of the classes in this mask.
+    Errors(u32),
+    /// Everything but error frames.
+    All,
+    /// Frames that match.
+    Masked(Filter),
+    /// Frames that do not match.
+    Inverted(Filter),
+    /// Data frames with this 11-bit identifier.
+    Standard(u16),
+    /// Data frames with this 29-bit identifier; the word has the flag set.
+    Extended(u32),
+}
+
+impl Class {
+    /// The kernel's `can_rcv_list_find`.
+    fn of(filter: Filter) -> Self {
+        let Filter { id, mut mask } = filter;
+        if mask & ERROR != 0 {
+            return Self::Errors(mask & EXTENDED_MASK);
+        }
+        if mask & EXTENDED != 0 && id & EXTENDED == 0 {
+            mask &= Filter::EXACT_MASK;
+        }
+        let matched = Filter { id: id & mask, mask };
+        if id & Filter::INVERTED != 0 {
+            return Self::Inverted(matched);
+        }
+        if mask == 0 {
+            return Self::All;
+        }
+        if matched.id & REMOTE == 0 {
+            if matched.id & EXTENDED != 0 && mask == EXTENDED_MASK | EXTENDED | REMOTE {
+                return Self::Extended(matched.id);
+            }
+            if matched.id & EXTENDED == 0 && mask == Filter::EXACT_MASK {
+                return u16::try_from(matched.id).map_or(Self::Masked(matched), Self::Standard);
+            }
+        }
+        Self::Masked(matched)
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Wants {
+    own_frames: bool,
+    fd: bool,
+    /// The last frame that was delivered, so that a second match does not deliver it again.
+    last: u64,
+}
+
+/// Who wants what.
+#[derive(Debug)]
+pub struct Router {
+    clients: Vec<Option<Wants>>,
+    errors: Vec<(u32, ClientId)>,
+    all: Vec<ClientId>,
+    masked: Vec<(Filter, ClientId)>,
+    inverted: Vec<(Filter, ClientId)>,
+    standard: Vec<Vec<ClientId>>,
+    extended: HashMap<u32, Vec<ClientId>>,
+    frames: u64,
+}
+
+impl Router {
+    /// Nobody wants anything.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            clients: Vec::new(),
+            errors: Vec::new(),
+            all: Vec::new(),
+            masked: Vec::new(),
+            inverted: Vec::new(),
+            standard: vec![Vec::new(); 1 + STANDARD_MASK as usize],
+            extended: HashMap::new(),
+            frames: 0,
+        }
+    }
+
+    /// Puts a client's wishes in force, in place of those that it had.
+    pub fn insert(&mut self, client: ClientId, hello: &Hello) {
+        self.remove(client);
+        if self.clients.len() <= client.0 {
+            self.clients.resize(client.0 + 1, None);
+        }
+        let wants = Wants { own_frames: hello.own_frames, fd: hello.fd, last: 0 };
+        if let Some(slot) = self.clients.get_mut(client.0) {
+            *slot = Some(wants);
+        }
+        let errors = (hello.error_mask != 0).then_some(Class::Errors(hello.error_mask & EXTENDED_MASK));
+        for class in hello.filters.iter().copied().map(Class::of).chain(errors) {
+            match class {
+                Class::Errors(mask) => self.errors.push((mask, client)),
+                Class::All => self.all.push(client),
+                Class::Masked(filter) => self.masked.push((filter, client)),
+                Class::Inverted(filter) => self.inverted.push((filter, client)),
+                Class::Standard(id) => {
+                    if let Some(list) = self.standard.get_mut(usize::from(id)) {
+                        list.push(client);
+                    }
+                }
+                Class::Extended(id) => self.extended.entry(id).or_default().push(client),
+            }
+        }
+    }
+
+    /// Forgets a client; nothing happens if there is none.
+    pub fn remove(&mut self, client: ClientId) {
+        if self.clients.get_mut(client.0).and_then(Option::take).is_none() {
+            return;
+        }
+        self.errors.retain(|&(_, other)| other != client);
+        self.all.retain(|&other| other != client);
+        self.masked.retain(|&(_, other)| other != client);
+        self.inverted.retain(|&(_, other)| other != client);
+        for list in &mut self.standard {
+            list.retain(|&other| other != client);
+        }
+        self.extended.retain(|_, list| {
+            list.retain(|&other| other != client);
+            !list.is_empty()
+        });
+    }
+
+    /// Names each client that gets a frame, once, and whether the frame is its own.
+    pub fn route(
+        &mut self,
+        from: ClientId,
+        id: u32,
+        format: Format,
+        mut deliver: impl FnMut(ClientId, bool),
+    ) {
+        self.frames += 1;
+        let Self { clients, frames, .. } = self;
+        let mut offer = |client: ClientId| {
+            let Some(wants) = clients.get_mut(client.0).and_then(Option::as_mut) else { return };
+            let own = client == from;
+            if wants.last != *frames && (wants.own_frames || !own) && (wants.fd || format == Format::Classic)
+            {
+                wants.last = *frames;
+                deliver(client, own);
+            }
+        };
+        if id & ERROR != 0 {
+            self.errors.iter().filter(|(mask, _)| id & mask != 0).for_each(|&(_, client)| offer(client));
+            return;
+        }
+        let matches = |filter: &Filter| id & filter.mask == filter.id;
+        self.all.iter().for_each(|&client| offer(client));
+        self.masked.iter().filter(|(filter, _)| matches(filter)).for_each(|&(_, client)| offer(client));
+        self.inverted.iter().filter(|(filter, _)| !matches(filter)).for_each(|&(_, client)| offer(client));
+        if id & REMOTE != 0 {
+            return;
+        }
+        let exact = if id & EXTENDED == 0 {
+            self.standard.get((id & STANDARD_MASK) as usize)
+        } else {
+            self.extended.get(&id)
+        };
+        exact.into_iter().flatten().for_each(|&client| offer(client));
+    }
+}
+
+impl Default for Router {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::embedded::cases;
+    use proptest::prelude::*;
+
+    fn hello(filters: &[Filter]) -> Hello {
+        Hello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
+    }
+
+    /// Who gets it, in order of their numbers.
+    fn receivers(router: &mut Router, from: usize, id: u32, format: Format) -> Vec<(usize, bool)> {
+        let mut receivers = Vec::new();
+        router.route(ClientId(from), id, format, |client, own| receivers.push((client.0, own)));
+        receivers.sort_unstable();
+        receivers
+    }
+
+    #[test]
+    fn every_case_comes_out_as_can_raw_has_it() {
+        for case in cases::cases() {
+            let mut router = Router::new();
+            let hello = Hello {
+                filters: case.filters.clone(),
+                own_frames: case.own_frames,
+                fd: case.fd,
+                error_mask: case.error_mask,
+                buffer: 0,
+            };
+            router.insert(ClientId(1), &hello);
+            let from = usize::from(case.from_self);
+            let got = receivers(&mut router, from, case.frame.raw_id(), case.frame.format()).len();
+            assert_eq!(got, usize::from(case.received), "{}", case.what);
+        }
+    }
+
+    #[test]
+    fn a_client_that_left_gets_nothing_and_its_number_can_be_used_again() {
+        let mut router = Router::new();
+        let exact = Filter { id: 0x123, mask: Filter::EXACT_MASK };
+        router.insert(ClientId(1), &hello(&[exact, Filter::ALL, exact.inverted()]));
+        router.remove(ClientId(1));
+        assert_eq!(receivers(&mut router, 0, 0x123, Format::Classic), []);
+        router.insert(ClientId(1), &hello(&[exact]));
+        assert_eq!(receivers(&mut router, 0, 0x123, Format::Classic), [(1, false)]);
+        assert_eq!(receivers(&mut router, 0, 0x124, Format::Classic), []);
+    }
+
+    #[test]
+    fn exact_filters_never_reach_a_list_that_every_frame_walks() {
+        let mut router = Router::new();
+        for client in 0..254 {
+            let filters = [0x001, 0x400 + client, 0x8000_0000 + client].map(|id| Filter {
+                id,
+                mask: if id > STANDARD_MASK { EXTENDED_MASK | EXTENDED | REMOTE } else { Filter::EXACT_MASK },
+            });
+            router.insert(ClientId(client as usize), &hello(&filters));
+        }
+        assert!(router.all.is_empty() && router.masked.is_empty() && router.inverted.is_empty());
+        assert_eq!(receivers(&mut router, 300, 0x001, Format::Fd).len(), 254);
+        assert_eq!(receivers(&mut router, 300, 0x407, Format::Fd), [(7, false)]);
+        assert_eq!(receivers(&mut router, 300, 0x8000_0007, Format::Fd), [(7, false)]);
+    }
+
+    /// The rule as the kernel's documentation states it, without any classes.
+    fn passes(filters: &[Filter], error_mask: u32, id: u32) -> bool {
+        let errors = |filter: &&Filter| filter.mask & ERROR != 0;
+        if id & ERROR != 0 {
+            let masks = filters.iter().filter(errors).map(|filter| filter.mask).chain([error_mask]);
+            return masks.into_iter().any(|mask| id & mask & EXTENDED_MASK != 0);
+        }
+        filters.iter().filter(|filter| !errors(filter)).any(|&Filter { id: wanted, mut mask }| {
+            if mask & EXTENDED != 0 && wanted & EXTENDED == 0 {
+                mask &= STANDARD_MASK | EXTENDED | REMOTE;
+            }
+            (id & mask == wanted & mask) != (wanted & Filter::INVERTED != 0)
+        })
+    }
+
+    fn word() -> impl Strategy<Value = u32> {
+        let flags =
+            prop::sample::select(vec![0, EXTENDED, REMOTE, EXTENDED | REMOTE, ERROR, EXTENDED | ERROR]);
+        (prop_oneof![0_u32..4, 0x7FC..0x800_u32, Just(0x1FFF_FFFF)], flags).prop_map(|(id, flags)| id | flags)
+    }
+
+    fn filter() -> impl Strategy<Value = Filter> {
+        let exact = Just(Filter::EXACT_MASK);
+        let extended = Just(EXTENDED_MASK | EXTENDED | REMOTE);
+        let mask = prop_oneof![exact, extended, Just(0), word(), 0x7FC..0x800_u32];
+        (word(), mask).prop_map(|(id, mask)| Filter { id, mask })
+    }
+
+    /// A frame's identifier as drivers make it: 11 bits unless the flag says 29.
+    fn sound(id: u32) -> u32 {
+        if id & (EXTENDED | ERROR) == 0 { id & (STANDARD_MASK | REMOTE) } else { id }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(2000))]
+        #[test]
+        fn classes_change_nothing(filters in proptest::collection::vec(filter(), 0..5), error_mask in prop_oneof![Just(0_u32), 0..8_u32], id in word()) {
+            let id = sound(id);
+            let mut router = Router::new();
+            router.insert(ClientId(1), &Hello { error_mask, ..hello(&filters) });
+            let got = receivers(&mut router, 0, id, Format::Classic);
+            let expected = if passes(&filters, error_mask, id) { vec![(1, false)] } else { vec![] };
+            prop_assert_eq!(got, expected);
+        }
+    }
+}
