@@ -1,0 +1,336 @@
+//! One tick of the control loop, pure: what the buses know goes in, what has to be sent and recorded
+//! comes out.
+//!
+//! ```text
+//!   Tick, Snapshots ─> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
+//!                                   ├─> Outcome::halt ───> a halt frame
+//!                                   └─> Record ──────────> what this tick was like
+//! ```
+//!
+//! A tick allocates nothing, takes no lock, writes no log, and its work does not grow with the cells,
+//! unless it computes centrally beside them ([`Cycle::central`]).
+
+use protocol::fixed::Q1_14;
+use protocol::message::Joints;
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use crate::central::{Central, Felt};
+use crate::controller::{BadCycle, Controller, Input, Step};
+use crate::robot::{Moved, Robot};
+use crate::table::Snapshot;
+
+/// When a tick is.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Tick {
+    /// Its number since the start; skipped ticks are counted in.
+    pub number: u64,
+    /// When it should begin, since the start.
+    pub time: Micros,
+}
+
+/// Why the robot does not move.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum Halt {
+    /// So many bad cycles in a row.
+    BadCycles(BadCycle),
+    /// Somebody sent a halt frame.
+    Frame,
+}
+
+/// What a tick was like.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Record {
+    /// When it was.
+    pub tick: Tick,
+    /// Ticks skipped just before it, because the one before took too long or the machine was away.
+    pub skipped: u64,
+    /// Joint positions in rad.
+    pub q: [f64; WORDS],
+    /// Joint velocities in rad/s.
+    pub qdot: [f64; WORDS],
+    /// The cells' torque in Nm.
+    pub torque: [f64; WORDS],
+    /// Cells in it.
+    pub contributing: u32,
+    /// Epochs that the oldest of them has missed.
+    pub age: u32,
+    /// Cells in contact that missed the last epoch.
+    pub stale: u32,
+    /// Cells that have fallen silent.
+    pub dead: u32,
+    /// Why the cycle was bad, if it was.
+    pub bad: Option<BadCycle>,
+    /// Why the robot is halted, if it is.
+    pub halted: Option<Halt>,
+    /// Joints at their limits, and what the robot refused.
+    pub moved: Moved,
+}
+
+/// What a tick leads to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outcome {
+    /// Joints to send on every bus, when they are due.
+    pub joints: Option<(Epoch, Joints)>,
+    /// Broadcasts that should have been before this one and were skipped with their ticks.
+    pub broadcasts_skipped: u64,
+    /// Whether a halt frame has to be sent.
+    pub halt: bool,
+    /// For whoever records.
+    pub record: Record,
+}
+
+/// The control loop's state.
+pub struct Cycle {
+    controller: Box<dyn Controller>,
+    robot: Box<dyn Robot + Send>,
+    central: Vec<Central>,
+    joints: Joints,
+    tick_seconds: f64,
+    ticks_per_broadcast: u64,
+    bad_limit: u32,
+    epoch: Epoch,
+    broadcasts: u64,
+    /// The last broadcast's place in the schedule.
+    slot: Option<u64>,
+    bad_in_a_row: u32,
+    halted: Option<Halt>,
+    halts: u32,
+    resumes: u32,
+}
+
+impl core::fmt::Debug for Cycle {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Cycle").field("epoch", &self.epoch).field("halted", &self.halted).finish_non_exhaustive()
+    }
+}
+
+impl Cycle {
+    /// A loop that has not begun; the first epoch will be 0.
+    #[must_use]
+    pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
+        let part = |bus| Skin { cells: skin.cells_of(bus).cloned().collect(), ..skin.clone() };
+        let in_use = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
+        Self {
+            controller,
+            robot,
+            central: (0..skin.buses.len()).map(|bus| Central::new(&part(bus))).collect(),
+            joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use },
+            tick_seconds: 1.0 / skin.timing.control_hz,
+            ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
+            bad_limit: skin.safety.bad_cycles,
+            epoch: Epoch(255),
+            broadcasts: 0,
+            slot: None,
+            bad_in_a_row: 0,
+            halted: None,
+            halts: 0,
+            resumes: 0,
+        }
+    }
+
+    /// Joint positions in rad.
+    #[must_use]
+    pub fn positions(&self) -> [f64; WORDS] {
+        self.robot.positions()
+    }
+
+    /// Broadcasts so far.
+    #[must_use]
+    pub const fn broadcasts(&self) -> u64 {
+        self.broadcasts
+    }
+
+    /// One tick; `skipped` ticks before it did not happen, and `valid` says whether the buses work.
+    pub fn tick<'a>(
+        &mut self,
+        tick: Tick,
+        skipped: u64,
+        buses: impl IntoIterator<Item = &'a Snapshot>,
+        valid: bool,
+    ) -> Outcome {
+        let mut input = Input {
+            tick: tick.number,
+            time: tick.time,
+            q: self.robot.positions(),
+            qdot: self.robot.velocities(),
+            valid,
+            ..Input::default()
+        };
+        let (mut stale, mut dead, mut halts, mut resumes) = (0, 0, 0, 0);
+        for bus in buses {
+            for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
+                *sum += torque;
+            }
+            input.contributing += bus.contributing;
+            input.age = input.age.max(bus.age);
+            (stale, dead) = (stale + bus.stale, dead + bus.dead);
+            (halts, resumes) = (halts + bus.halts, resumes + bus.resumes);
+        }
+        self.obey(halts, resumes);
+        input.halted = self.halted.is_some();
+
+        let step = self.controller.step(&input);
+        let bad = match step {
+            Step::Move(_) => None,
+            Step::Bad(why) => Some(why),
+        };
+        let halt = self.judge(bad);
+        let velocity = match step {
+            Step::Move(velocity) if self.halted.is_none() => velocity,
+            // Without an answer the robot goes on as it was for a while; halted, it stands.
+            Step::Bad(_) if self.halted.is_none() => input.qdot,
+            Step::Move(_) | Step::Bad(_) => [0.0; WORDS],
+        };
+        let moved = self.robot.step(&velocity, self.tick_seconds);
+        let (joints, broadcasts_skipped) = self.broadcast(tick);
+        let Input { q, qdot, torque, contributing, age, .. } = input;
+        let record = Record {
+            tick,
+            skipped,
+            q,
+            qdot,
+            torque,
+            contributing,
+            age,
+            stale,
+            dead,
+            bad,
+            halted: self.halted,
+            moved,
+        };
+        Outcome { joints, broadcasts_skipped, halt, record }
+    }
+
+    /// What the central computation makes of the last broadcast's words and what the cells then felt:
+    /// the work that distributed computation takes out of the tick. It grows with the cells.
+    #[must_use]
+    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Felt {
+        let mut felt = Felt::default();
+        for (central, bus) in self.central.iter().zip(buses) {
+            let part = central.feel(&central.frames(&self.joints.positions), &bus.felt);
+            for (sum, torque) in felt.torque.iter_mut().zip(part.torque) {
+                *sum += torque;
+            }
+            felt.active += part.active;
+        }
+        felt
+    }
+
+    /// Halts and resumes that others sent.
+    fn obey(&mut self, halts: u32, resumes: u32) {
+        if resumes != self.resumes {
+            self.resumes = resumes;
+            self.halted = None;
+            self.bad_in_a_row = 0;
+        }
+        if halts != self.halts {
+            self.halts = halts;
+            self.halted = Some(Halt::Frame);
+        }
+    }
+
+    /// Counts bad cycles; returns whether this one was one too many.
+    fn judge(&mut self, bad: Option<BadCycle>) -> bool {
+        let Some(why) = bad else {
+            self.bad_in_a_row = 0;
+            return false;
+        };
+        self.bad_in_a_row = self.bad_in_a_row.saturating_add(1);
+        let halt = self.bad_in_a_row >= self.bad_limit && self.halted.is_none();
+        if halt {
+            self.halted = Some(Halt::BadCycles(why));
+        }
+        halt
+    }
+
+    /// The joints, when their time has come: every so many ticks, also when ticks were skipped.
+    fn broadcast(&mut self, tick: Tick) -> (Option<(Epoch, Joints)>, u64) {
+        let slot = tick.number / self.ticks_per_broadcast;
+        if self.slot == Some(slot) {
+            return (None, 0);
+        }
+        let skipped = self.slot.map_or(slot, |last| slot.saturating_sub(last + 1));
+        self.slot = Some(slot);
+        let in_use = usize::from(self.joints.in_use);
+        for (word, q) in self.joints.positions.iter_mut().zip(self.robot.positions()).take(in_use) {
+            // A position that is no number keeps its last word; a robot refuses such velocities anyway.
+            *word = Q1_14::from_radians(q).unwrap_or(*word);
+        }
+        self.epoch = self.epoch.next();
+        self.broadcasts += 1;
+        (Some((self.epoch, self.joints)), skipped)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::controller::Kinesthetic;
+    use crate::robot::SimulatedArm;
+    use crate::table::Table;
+    use crate::testing;
+
+    struct Dead;
+
+    impl Controller for Dead {
+        fn step(&mut self, _: &Input) -> Step {
+            Step::Bad(BadCycle::NoAnswer)
+        }
+    }
+
+    fn tick(number: u64) -> Tick {
+        Tick { number, time: Micros(number * 2_000) }
+    }
+
+    fn cycle(controller: Box<dyn Controller>) -> (Cycle, Snapshot) {
+        let skin = testing::skin();
+        let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+        (Cycle::new(&skin, controller, Box::new(robot)), Table::new(&skin, 0).snapshot().clone())
+    }
+
+    #[test]
+    fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
+        let (mut cycle, bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+        let mut sent = vec![];
+        for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
+            let outcome = cycle.tick(tick(number), 0, [&bus], true);
+            if let Some((epoch, _)) = outcome.joints {
+                sent.push((number, epoch.0, outcome.broadcasts_skipped));
+            }
+        }
+        assert_eq!(sent, [(0, 0, 0), (8, 1, 0), (17, 2, 0), (40, 3, 2)]);
+    }
+
+    #[test]
+    fn bad_cycles_in_a_row_halt_once_and_a_resume_lets_go() {
+        let (mut cycle, mut bus) = cycle(Box::new(Dead));
+        let limit = u64::from(testing::skin().safety.bad_cycles);
+        let halts: Vec<u64> =
+            (0..limit + 10).filter(|&number| cycle.tick(tick(number), 0, [&bus], true).halt).collect();
+        assert_eq!(halts, [limit - 1]);
+        bus.resumes = 1;
+        let after = cycle.tick(tick(99), 0, [&bus], true);
+        assert_eq!((after.record.halted, after.record.bad), (None, Some(BadCycle::NoAnswer)));
+        bus.halts = 1;
+        let halted = cycle.tick(tick(100), 0, [&bus], true);
+        assert_eq!((halted.record.halted, halted.halt), (Some(Halt::Frame), false));
+    }
+
+    #[test]
+    fn a_halted_robot_stands_whatever_is_asked() {
+        let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+        bus.torque = [5.0; WORDS];
+        for number in 0..50 {
+            cycle.tick(tick(number), 0, [&bus], true);
+        }
+        let moved = cycle.positions();
+        assert!(moved[0] > 0.0);
+        bus.halts = 1;
+        for number in 50..99 {
+            cycle.tick(tick(number), 0, [&bus], true);
+        }
+        assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
+    }
+}

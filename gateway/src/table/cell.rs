@@ -1,0 +1,281 @@
+//! One cell, as the gateway sees it.
+
+use protocol::id::CellId;
+use protocol::message::{Heard, Heartbeat, Refused, SkinSensors, State};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Parameters;
+use protocol::skin::{self, Safety};
+use protocol::time::Micros;
+
+use super::felt::Felt;
+use super::ledger::{Replies, Uplink};
+use super::DEAD_AFTER;
+
+/// A torque may answer the newest epoch, or one of so many before it.
+pub(super) const LATEST: i8 = 3;
+
+/// How a cell is.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum Status {
+    /// Never heard.
+    Unknown,
+    /// Alive and not in contact.
+    Quiet,
+    /// In contact, and answered the last epoch that had time for it.
+    Active,
+    /// In contact, and missed an epoch.
+    Stale,
+    /// Silent for too long.
+    Dead,
+}
+
+impl Status {
+    /// The name that tables and summaries use.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "never heard",
+            Self::Quiet => "quiet",
+            Self::Active => "active",
+            Self::Stale => "stale",
+            Self::Dead => "dead",
+        }
+    }
+}
+
+/// What changed in the running sum.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(super) struct Change {
+    pub(super) torque: [i32; WORDS],
+    pub(super) contributing: i32,
+}
+
+/// The central torques of one epoch, in Nm.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Expected {
+    number: u64,
+    pub(super) quantised: [f64; WORDS],
+    pub(super) unquantised: [f64; WORDS],
+}
+
+/// One cell.
+#[derive(Debug)]
+pub struct Cell {
+    /// Its number.
+    pub node: CellId,
+    /// The joint that moves it, from 1.
+    pub(super) joint: usize,
+    /// The hash that its configuration must have.
+    pub configuration: u16,
+    /// Its last heartbeat.
+    pub heartbeat: Option<Heartbeat>,
+    /// The last page of what it heard, and the first one since it started or we did.
+    pub heard: Option<(Heard, Heard)>,
+    /// The last page of what it refused.
+    pub refused: Option<Refused>,
+    /// Packets sent and arrived.
+    pub uplink: Uplink,
+    /// Replies due and come.
+    pub replies: Replies,
+    pub(super) felt: Felt,
+    last_word: Option<Micros>,
+    dead: bool,
+    /// The number of the last broadcast that it answered.
+    pub(super) answered: Option<u64>,
+    /// The last torque, in steps of Q3.12, while it is held.
+    held: Option<[i32; WORDS]>,
+    /// What of it is in the running sum.
+    contribution: [i32; WORDS],
+    /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
+    due: u8,
+    expected: [Option<Expected>; LATEST as usize + 1],
+}
+
+impl Cell {
+    pub(super) fn new(described: &skin::Cell, parameters: &Parameters) -> Self {
+        Self {
+            node: described.node,
+            joint: described.joint.into(),
+            configuration: parameters.hash(),
+            heartbeat: None,
+            heard: None,
+            refused: None,
+            uplink: Uplink::default(),
+            replies: Replies::default(),
+            felt: Felt::default(),
+            last_word: None,
+            dead: false,
+            answered: None,
+            held: None,
+            contribution: [0; WORDS],
+            due: 0,
+            expected: [None; LATEST as usize + 1],
+        }
+    }
+
+    /// Any valid frame is a sign of life. Returns whether the cell was thought dead.
+    pub(super) const fn hear(&mut self, at: Micros) -> bool {
+        self.last_word = Some(at);
+        let revived = self.dead;
+        self.dead = false;
+        revived
+    }
+
+    /// Whether it has just been silent for too long.
+    pub(super) fn falls_silent(&mut self, now: Micros) -> bool {
+        let silent = self.last_word.is_some_and(|last| now.since(last) > DEAD_AFTER);
+        let falls = silent && !self.dead;
+        self.dead |= silent;
+        falls
+    }
+
+    pub(super) fn take_heartbeat(&mut self, heartbeat: &Heartbeat) -> Change {
+        let restarted = heartbeat.sent == 0 && heartbeat.state.has(State::CLAIMING);
+        self.uplink.settle(heartbeat.sent, restarted);
+        if restarted {
+            self.felt.restart();
+            self.doubt();
+            self.heard = None;
+        }
+        self.heartbeat = Some(*heartbeat);
+        if heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
+    }
+
+    /// Counters that the cell reports; the first ones since a start are what later ones are compared to.
+    pub(super) fn report(&mut self, heard: Heard) {
+        let first = self.heard.map_or(heard, |(first, _)| first);
+        self.heard = Some((first, heard));
+    }
+
+    /// Whether it can be expected to answer: configured, awake, and not halted.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        !self.dead && self.heartbeat.is_some_and(|heartbeat| {
+            let state = heartbeat.state;
+            state.has(State::CONFIGURED) && !state.has(State::CLAIMING) && !state.has(State::HALTED)
+        })
+    }
+
+    pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
+        self.felt.latch(epoch)
+    }
+
+    /// A new broadcast: what was not answered in three epochs is missing, and what is held grows old.
+    /// Returns the change of the sum and how many epochs the held torque has missed.
+    pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
+        let oldest = 1 << LATEST;
+        if self.due & oldest != 0 {
+            self.miss(1);
+        }
+        let due = in_contact && self.is_ready();
+        self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
+        self.replies.due += u64::from(due);
+        let Some(held) = self.held else { return (Change::default(), 0) };
+        let answered = self.answered.unwrap_or(number);
+        let missed = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
+        let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(missed);
+        if left == 0 && missed > 0 {
+            return (self.let_go(), missed);
+        }
+        let decay = safety.decay_epochs.max(1);
+        let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
+        let whole = i32::try_from(decay).unwrap_or(i32::MAX);
+        (self.contribute(held.map(|word| word * keep / whole)), missed)
+    }
+
+    pub(super) const fn is_due(&self) -> bool {
+        self.due & 1 != 0
+    }
+
+    /// A torque answers the broadcast `number`, `lag` before the newest. Returns whether it was due.
+    pub(super) fn answer(&mut self, number: u64, lag: i8) -> bool {
+        self.answered = Some(number);
+        let bit = 1 << lag;
+        let was_due = self.due & bit != 0;
+        self.due &= !bit;
+        match (was_due, lag) {
+            (true, 0) => self.replies.in_time += 1,
+            (true, _) => self.replies.late += 1,
+            (false, _) => self.replies.unasked += 1,
+        }
+        was_due
+    }
+
+    /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
+    pub(super) fn hold(&mut self, words: [i32; WORDS]) -> Change {
+        self.held = (words != [0; WORDS]).then_some(words);
+        self.contribute(words)
+    }
+
+    /// Lets go of a held torque.
+    pub(super) fn let_go(&mut self) -> Change {
+        self.held = None;
+        self.contribute([0; WORDS])
+    }
+
+    fn contribute(&mut self, words: [i32; WORDS]) -> Change {
+        let counts = |words: &[i32; WORDS]| i32::from(*words != [0; WORDS]);
+        let before = core::mem::replace(&mut self.contribution, words);
+        let mut torque = words;
+        for (torque, before) in torque.iter_mut().zip(before) {
+            *torque -= before;
+        }
+        Change { torque, contributing: counts(&words) - counts(&before) }
+    }
+
+    pub(super) fn expect(&mut self, number: u64, quantised: [f64; WORDS], unquantised: [f64; WORDS]) {
+        self.expected.rotate_right(1);
+        if let Some(newest) = self.expected.first_mut() {
+            *newest = Some(Expected { number, quantised, unquantised });
+        }
+    }
+
+    pub(super) fn expected_at(&self, number: u64) -> Option<&Expected> {
+        self.expected.iter().flatten().find(|expected| expected.number == number)
+    }
+
+    /// Nothing more will come: what is still due is missing.
+    pub(super) fn settle(&mut self) {
+        self.miss(self.due.count_ones());
+        self.due = 0;
+    }
+
+    /// It started anew: what it still owed, it will never send.
+    fn doubt(&mut self) {
+        let owed = u64::from(self.due.count_ones());
+        self.due = 0;
+        self.replies.missing += owed;
+        self.replies.in_doubt += owed;
+        self.answered = None;
+    }
+
+    fn miss(&mut self, count: u32) {
+        self.replies.missing += u64::from(count);
+        if self.dead {
+            self.replies.in_doubt += u64::from(count);
+        }
+    }
+
+    pub(super) fn status(&self, now: Micros, newest: Option<u64>) -> Status {
+        let Some(last) = self.last_word else { return Status::Unknown };
+        if self.dead || now.since(last) > DEAD_AFTER {
+            return Status::Dead;
+        }
+        match (self.held, self.answered, newest) {
+            (None, _, _) => Status::Quiet,
+            (Some(_), Some(answered), Some(newest)) if answered + 1 < newest => Status::Stale,
+            (Some(_), _, _) => Status::Active,
+        }
+    }
+}
+
+/// A sum of words of Q3.12 in Nm.
+#[expect(clippy::cast_precision_loss, reason = "sums of 254 words of 16 bits are exact")]
+pub(super) fn to_nm(steps: i64) -> f64 {
+    steps as f64 / 4_096.0
+}
+
+/// A word of Q3.12 in Nm.
+pub(super) fn word_to_nm(word: i32) -> f64 {
+    f64::from(word) / 4_096.0
+}

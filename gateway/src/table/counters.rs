@@ -1,0 +1,123 @@
+//! Frames by kind, and what became of those that could not be used.
+
+use protocol::id::Kind;
+
+/// What can be odd about a frame; each has a counter and a reason that people read.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+#[repr(usize)]
+pub enum Event {
+    /// Wrong length or format.
+    Length,
+    /// Wrong CRC.
+    Crc,
+    /// A kind, page, command or count that does not exist.
+    Meaning,
+    /// A classic first half without its second.
+    Incomplete,
+    /// A remote frame or a 29-bit identifier.
+    Foreign,
+    /// The driver's report of an error on the bus.
+    ErrorFrame,
+    /// From a node that the skin does not have, or of a kind that this bus does not use.
+    Stranger,
+    /// A torque of an epoch that has passed.
+    StaleTorque,
+    /// A second torque of one cell for one epoch.
+    RepeatedTorque,
+    /// A torque with a saturated word; it is used.
+    Saturated,
+    /// A cell heard another one under its number.
+    Duplicate,
+    /// Another gateway.
+    Rival,
+}
+
+impl Event {
+    /// All events, in the order of their counters.
+    pub const ALL: [Self; 12] = [
+        Self::Length,
+        Self::Crc,
+        Self::Meaning,
+        Self::Incomplete,
+        Self::Foreign,
+        Self::ErrorFrame,
+        Self::Stranger,
+        Self::StaleTorque,
+        Self::RepeatedTorque,
+        Self::Saturated,
+        Self::Duplicate,
+        Self::Rival,
+    ];
+
+    /// The name that tables and summaries use.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Length => "wrong length",
+            Self::Crc => "wrong CRC",
+            Self::Meaning => "no meaning",
+            Self::Incomplete => "incomplete pair",
+            Self::Foreign => "foreign",
+            Self::ErrorFrame => "error frame",
+            Self::Stranger => "unknown node",
+            Self::StaleTorque => "stale torque",
+            Self::RepeatedTorque => "repeated torque",
+            Self::Saturated => "saturated",
+            Self::Duplicate => "duplicate number",
+            Self::Rival => "second gateway",
+        }
+    }
+}
+
+/// Everything that is counted on a bus.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Counters {
+    received: [u64; Kind::ALL.len()],
+    sent: [u64; Kind::ALL.len()],
+    events: [u64; Event::ALL.len()],
+    /// Epochs that were closed.
+    pub epochs: u64,
+    /// Of these, epochs that somebody had to answer.
+    pub epochs_due: u64,
+    /// Of these, epochs that everybody answered in time.
+    pub epochs_complete: u64,
+}
+
+impl Counters {
+    pub(super) fn frame(&mut self, kind: Kind, own: bool) {
+        let counters = if own { &mut self.sent } else { &mut self.received };
+        if let Some(counter) = counters.get_mut(kind as usize) {
+            *counter += 1;
+        }
+    }
+
+    pub(super) fn count(&mut self, event: Event) {
+        if let Some(counter) = self.events.get_mut(event as usize) {
+            *counter += 1;
+        }
+    }
+
+    pub(super) const fn epoch(&mut self, due: bool, complete: bool) {
+        self.epochs += 1;
+        self.epochs_due += due as u64;
+        self.epochs_complete += (due && complete) as u64;
+    }
+
+    /// Packets of a kind that others sent.
+    #[must_use]
+    pub fn received(&self, kind: Kind) -> u64 {
+        self.received.get(kind as usize).copied().unwrap_or(0)
+    }
+
+    /// Packets of a kind that this gateway sent, as read back from the bus.
+    #[must_use]
+    pub fn sent(&self, kind: Kind) -> u64 {
+        self.sent.get(kind as usize).copied().unwrap_or(0)
+    }
+
+    /// How often something happened.
+    #[must_use]
+    pub fn events(&self, event: Event) -> u64 {
+        self.events.get(event as usize).copied().unwrap_or(0)
+    }
+}

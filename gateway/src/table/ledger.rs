@@ -1,0 +1,145 @@
+//! Accounts that must add up: what cells sent against what arrived, and replies due against replies
+//! that came.
+
+/// Packets of one cell: sent by its own count = delivered + rejected + lost, as of its last heartbeat.
+///
+/// A heartbeat says how many packets the cell sent before it. A bus keeps each sender's order, so what
+/// has not arrived by then never will.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Uplink {
+    /// Sent, by the cell's own count.
+    pub sent: u64,
+    /// Arrived and understood.
+    pub delivered: u64,
+    /// Arrived and refused.
+    pub rejected: u64,
+    /// Sent and never arrived.
+    pub lost: u64,
+    /// Arrived more often than sent: repeated on the way, or sent by somebody else under this name.
+    pub surplus: u64,
+    /// Times that the cell started anew; what it had sent since its last heartbeat is in doubt.
+    pub restarts: u32,
+    said: Option<u16>,
+    arrived_since: u64,
+    rejected_since: u64,
+}
+
+impl Uplink {
+    /// A packet arrived.
+    pub(super) const fn arrive(&mut self) {
+        self.arrived_since += 1;
+    }
+
+    /// A frame with this cell's identifier arrived that cannot be used.
+    pub(super) const fn reject(&mut self) {
+        self.rejected_since += 1;
+    }
+
+    /// A heartbeat says that the cell had sent `said` packets, modulo 2^16. Call it before the heartbeat
+    /// itself arrives.
+    pub(super) fn settle(&mut self, said: u16, restarted: bool) {
+        let before = self.said.replace(said);
+        if restarted && before.is_some() {
+            self.restarts += 1;
+        }
+        let (arrived, rejected) = (self.arrived_since, self.rejected_since);
+        (self.arrived_since, self.rejected_since) = (0, 0);
+        // What came before the first heartbeat, or since a restart, has nothing to be compared with.
+        let Some(before) = before.filter(|_| !restarted) else { return };
+        let sent = u64::from(said.wrapping_sub(before));
+        self.sent += sent;
+        self.delivered += arrived;
+        self.rejected += rejected;
+        self.lost += sent.saturating_sub(arrived + rejected);
+        self.surplus += (arrived + rejected).saturating_sub(sent);
+    }
+
+    /// Packets that arrived since the last heartbeat: of a dead cell, all that is known of its end.
+    #[must_use]
+    pub const fn unsettled(&self) -> u64 {
+        self.arrived_since + self.rejected_since
+    }
+
+    /// The account of several cells together.
+    #[must_use]
+    pub fn total(all: impl Iterator<Item = Self>) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            sent: sum.sent + one.sent,
+            delivered: sum.delivered + one.delivered,
+            rejected: sum.rejected + one.rejected,
+            lost: sum.lost + one.lost,
+            surplus: sum.surplus + one.surplus,
+            restarts: sum.restarts + one.restarts,
+            said: None,
+            arrived_since: sum.arrived_since + one.arrived_since,
+            rejected_since: sum.rejected_since + one.rejected_since,
+        })
+    }
+}
+
+/// Replies of one cell: due = in time + late + missing.
+///
+/// A reply is due when the cell is configured, awake, and feels a force by Algorithm 1.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Replies {
+    /// Epochs that the cell had to answer.
+    pub due: u64,
+    /// Answered before the next broadcast.
+    pub in_time: u64,
+    /// Answered after it.
+    pub late: u64,
+    /// Not answered.
+    pub missing: u64,
+    /// Of the missing ones, those of a cell that was dead or started anew.
+    pub in_doubt: u64,
+    /// Torques that nobody was waiting for: ends of contacts, and cells whose sensors are unknown.
+    pub unasked: u64,
+}
+
+impl Replies {
+    /// The account of several cells together.
+    #[must_use]
+    pub fn total(all: impl Iterator<Item = Self>) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            due: sum.due + one.due,
+            in_time: sum.in_time + one.in_time,
+            late: sum.late + one.late,
+            missing: sum.missing + one.missing,
+            in_doubt: sum.in_doubt + one.in_doubt,
+            unasked: sum.unasked + one.unasked,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn what_did_not_arrive_by_the_next_heartbeat_is_lost() {
+        let mut uplink = Uplink::default();
+        uplink.settle(65_534, false);
+        uplink.arrive(); // the heartbeat itself
+        uplink.arrive();
+        uplink.reject();
+        uplink.settle(3, false); // five were sent
+        assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (5, 2, 1, 2));
+        uplink.arrive();
+        uplink.settle(0, true);
+        assert_eq!((uplink.sent, uplink.restarts, uplink.unsettled()), (5, 1, 0));
+    }
+
+    proptest! {
+        #[test]
+        fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, any::<bool>()), 0..20)) {
+            let mut uplink = Uplink::default();
+            for (said, arrived, rejected, restarted) in said {
+                for _ in 0..arrived { uplink.arrive(); }
+                for _ in 0..rejected { uplink.reject(); }
+                uplink.settle(said, restarted);
+            }
+            prop_assert_eq!(uplink.sent + uplink.surplus, uplink.delivered + uplink.rejected + uplink.lost);
+        }
+    }
+}

@@ -1,0 +1,463 @@
+//! What a gateway knows of one bus: the latest of every cell, and the running sum of their torques.
+//!
+//! ```text
+//!   frame, time, own ─> handle_frame ─┐           ┌─> Snapshot (what a tick needs, whatever the cells' number)
+//!               time ─> handle_time ──┴─ [Table] ─┴─> counters, ledgers, accuracy (what the end's table needs)
+//! ```
+//!
+//! Own frames are read back from the bus: the joints that open an epoch do so where they stand among the
+//! others' frames, with the kernel's time stamp. Every frame costs bounded work; a new epoch and the
+//! passing of time cost work for each cell, but in the thread that receives, not in the tick.
+
+mod accuracy;
+mod cell;
+mod counters;
+mod felt;
+mod ledger;
+
+use core::time::Duration;
+
+use hdrhistogram::Histogram;
+use protocol::can::{Format, Frame};
+use protocol::fixed::Q1_14;
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
+use protocol::skin::{Safety, Skin};
+use protocol::time::{Micros, Span};
+
+use crate::central::Central;
+
+pub use accuracy::{Accuracy, Errors};
+pub use cell::{Cell, Status};
+pub use counters::{Counters, Event};
+pub use ledger::{Replies, Uplink};
+
+/// A cell that has said nothing for so long is dead.
+pub const DEAD_AFTER: Span = Span::from_millis(500);
+
+/// What a tick needs to know of a bus.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    /// The sum of all held torques in Nm.
+    pub torque: [f64; WORDS],
+    /// Cells in it.
+    pub contributing: u32,
+    /// Epochs that the oldest of them has missed.
+    pub age: u32,
+    /// Cells in contact that missed the last epoch.
+    pub stale: u32,
+    /// Cells that have fallen silent.
+    pub dead: u32,
+    /// Halts heard that this gateway did not send.
+    pub halts: u32,
+    /// Resumes heard that this gateway did not send.
+    pub resumes: u32,
+    /// Frames of another gateway.
+    pub rivals: u32,
+    /// What each cell feels, in the order of the bus' cells; only kept up to date while comparing.
+    pub felt: Vec<SkinSensors>,
+}
+
+/// The broadcast that cells are answering.
+#[derive(Clone, Copy, Debug)]
+struct Broadcast {
+    epoch: Epoch,
+    /// Broadcasts before this one.
+    number: u64,
+    at: Micros,
+    due: u32,
+    in_time: u32,
+    last_reply: Option<Micros>,
+    error: [f64; WORDS],
+}
+
+/// All that is known of one bus.
+#[derive(Debug)]
+pub struct Table {
+    format: Format,
+    safety: Safety,
+    central: Central,
+    unquantised: Central,
+    comparing: bool,
+    cells: Vec<Cell>,
+    /// Where a node stands in `cells`.
+    places: [Option<usize>; CellId::COUNT],
+    halves: Vec<Half>,
+    broadcast: Option<Broadcast>,
+    /// Twice, four times ... a torque is a whole number of these, so that the sum never drifts.
+    sum: [i64; WORDS],
+    snapshot: Snapshot,
+    counters: Counters,
+    accuracy: Accuracy,
+    last_reply: Histogram<u64>,
+}
+
+impl Table {
+    /// Nothing heard yet on one of a skin's buses.
+    #[must_use]
+    pub fn new(skin: &Skin, bus: usize) -> Self {
+        let part = Skin { cells: skin.cells_of(bus).cloned().collect(), ..skin.clone() };
+        let mut places = [None; CellId::COUNT];
+        let mut cells = Vec::with_capacity(part.cells.len());
+        for described in &part.cells {
+            if let Some(place) = places.get_mut(described.node.index()) {
+                *place = Some(cells.len());
+            }
+            cells.push(Cell::new(described, &part.parameters(described)));
+        }
+        let snapshot = Snapshot {
+            torque: [0.0; WORDS],
+            contributing: 0,
+            age: 0,
+            stale: 0,
+            dead: 0,
+            halts: 0,
+            resumes: 0,
+            rivals: 0,
+            felt: vec![SkinSensors::default(); cells.len()],
+        };
+        Self {
+            format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
+            safety: skin.safety,
+            central: Central::new(&part),
+            unquantised: Central::unquantised(&part),
+            comparing: false,
+            cells,
+            places,
+            halves: vec![Half::NONE; 1 << 11],
+            broadcast: None,
+            sum: [0; WORDS],
+            snapshot,
+            counters: Counters::default(),
+            accuracy: Accuracy::default(),
+            last_reply: Histogram::new(3).expect("three digits are a valid precision"),
+        }
+    }
+
+    /// Whether distributed torques are compared with central ones from the next epoch on.
+    pub const fn set_comparing(&mut self, comparing: bool) {
+        self.comparing = comparing;
+    }
+
+    /// What a tick needs.
+    #[must_use]
+    pub const fn snapshot(&self) -> &Snapshot {
+        &self.snapshot
+    }
+
+    /// The bus' cells, in the skin's order.
+    #[must_use]
+    pub fn cells(&self) -> &[Cell] {
+        &self.cells
+    }
+
+    /// Frames by kind and what became of them.
+    #[must_use]
+    pub const fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    /// Distributed against central torques.
+    #[must_use]
+    pub const fn accuracy(&self) -> &Accuracy {
+        &self.accuracy
+    }
+
+    /// From a broadcast to its last reply in time, in µs, for each epoch with a reply.
+    #[must_use]
+    pub const fn last_reply(&self) -> &Histogram<u64> {
+        &self.last_reply
+    }
+
+    /// Takes a frame that stood on the bus at `at`; `own` if this gateway sent it. For joints of its own
+    /// `q` are the positions in rad that were rounded to words, if known. Returns whether the snapshot
+    /// may have changed.
+    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, q: Option<[f64; WORDS]>) -> bool {
+        let Ok(id) = packet::data_id(frame) else {
+            self.counters.count(if frame.is_error() { Event::ErrorFrame } else { Event::Foreign });
+            return false;
+        };
+        let packet = match self.packet(at, id, frame) {
+            Ok(Some(packet)) => packet,
+            Ok(None) => return false,
+            Err(event) => {
+                self.counters.frame(id.kind, own);
+                self.reject(id, own, event);
+                return false;
+            }
+        };
+        self.counters.frame(id.kind, own);
+        let Ok(message) = Message::decode(&packet) else {
+            self.reject(id, own, Event::Meaning);
+            return false;
+        };
+        if own {
+            self.hear_own(at, &message, q);
+        } else {
+            self.hear(at, id, &message);
+        }
+        true
+    }
+
+    /// The packet that a frame is or completes; `None` for half of one.
+    fn packet(&mut self, at: Micros, id: Id, frame: &Frame) -> Result<Option<Packet>, Event> {
+        let event = |error| match error {
+            PacketError::Length { .. } => Event::Length,
+            PacketError::Crc { .. } => Event::Crc,
+            _ => Event::Foreign,
+        };
+        if self.format == Format::Fd {
+            return Packet::from_fd(frame).map(Some).map_err(event);
+        }
+        if frame.format() != Format::Classic {
+            return Err(Event::Length);
+        }
+        let half = self.halves.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
+        match half.push(at, id, frame.data()).map_err(event)? {
+            Paired::Waiting => Ok(None),
+            Paired::Whole(packet) => Ok(Some(packet)),
+            Paired::Incomplete => Err(Event::Incomplete),
+        }
+    }
+
+    /// Counts a frame that cannot be used, also with the cell whose identifier it bears.
+    fn reject(&mut self, id: Id, own: bool, event: Event) {
+        self.counters.count(event);
+        if let (false, Some(cell)) = (own, self.sender(id)) {
+            cell.uplink.reject();
+        }
+    }
+
+    /// The cell that frames of this identifier come from.
+    fn sender(&mut self, id: Id) -> Option<&mut Cell> {
+        match (id.kind, Node::from_byte(id.node)) {
+            (Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured, Node::Cell(cell)) => {
+                self.cell_mut(cell)
+            }
+            _ => None,
+        }
+    }
+
+    fn cell_mut(&mut self, cell: CellId) -> Option<&mut Cell> {
+        let place = (*self.places.get(cell.index())?)?;
+        self.cells.get_mut(place)
+    }
+
+    /// A frame of this gateway's, as it stood on the bus.
+    fn hear_own(&mut self, at: Micros, message: &Message, q: Option<[f64; WORDS]>) {
+        match *message {
+            Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, q),
+            Message::Stimulus { to, from, page } => self.expect_feeling(to, from, page),
+            Message::Halt => self.each_cell(Cell::let_go),
+            Message::Resume
+            | Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    /// A frame of somebody else's.
+    fn hear(&mut self, at: Micros, id: Id, message: &Message) {
+        // What the gateway's side sends may also come from somebody at a shell.
+        match *message {
+            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
+                self.counters.count(Event::Rival);
+                self.snapshot.rivals += 1;
+                return;
+            }
+            Message::Halt => {
+                self.snapshot.halts += 1;
+                self.each_cell(Cell::let_go);
+                return;
+            }
+            Message::Resume => {
+                self.snapshot.resumes += 1;
+                return;
+            }
+            Message::Stimulus { to, from, page } => return self.expect_feeling(to, from, page),
+            Message::Sync | Message::Report | Message::Configure { .. } => return,
+            Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configured { .. } => {}
+        }
+        let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
+            self.counters.count(Event::Stranger);
+            return;
+        };
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        let revived = cell.hear(at);
+        self.snapshot.dead -= u32::from(revived);
+        match *message {
+            Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => self.take_heartbeat(place, &heartbeat),
+            Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
+            Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refused = Some(refused),
+            Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.felt.measured(skin),
+            Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
+            Message::Sum { .. } => self.counters.count(Event::Stranger),
+            _ => {}
+        }
+        if let Some(cell) = self.cells.get_mut(place) {
+            cell.uplink.arrive();
+        }
+    }
+
+    fn take_heartbeat(&mut self, place: usize, heartbeat: &Heartbeat) {
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        if heartbeat.state.has(State::DUPLICATE) {
+            self.counters.count(Event::Duplicate);
+        }
+        let released = cell.take_heartbeat(heartbeat);
+        self.apply(released);
+    }
+
+    fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
+        let Some(broadcast) = &mut self.broadcast else {
+            return self.counters.count(Event::StaleTorque);
+        };
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        let lag = broadcast.epoch.since(epoch);
+        let number = u64::try_from(lag).ok().and_then(|lag| broadcast.number.checked_sub(lag));
+        let Some(number) = number.filter(|_| lag <= cell::LATEST) else {
+            return self.counters.count(Event::StaleTorque);
+        };
+        if cell.answered.is_some_and(|last| number <= last) {
+            let repeated = cell.answered == Some(number);
+            return self.counters.count(if repeated { Event::RepeatedTorque } else { Event::StaleTorque });
+        }
+        if words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN)) {
+            self.counters.count(Event::Saturated);
+        }
+        let was_due = cell.answer(number, lag);
+        if lag == 0 {
+            broadcast.last_reply = Some(at);
+            broadcast.in_time += u32::from(was_due);
+        }
+        if let Some(expected) = cell.expected_at(number) {
+            let error = self.accuracy.compare(cell.joint, &words, expected);
+            if lag == 0 {
+                for (sum, error) in broadcast.error.iter_mut().zip(error) {
+                    *sum += error;
+                }
+            }
+        }
+        let change = cell.hold(words);
+        self.apply(change);
+    }
+
+    /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
+    fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
+        let number = self.broadcast.map_or(0, |before| before.number + 1);
+        self.close_epoch();
+        let frames = self.comparing.then(|| self.central.frames(&joints.positions));
+        let exact = frames.map(|_| self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians))));
+        let (mut due, mut stale, mut age) = (0, 0, 0);
+        for place in 0..self.cells.len() {
+            let Some(cell) = self.cells.get_mut(place) else { break };
+            let f_z = cell.latch(epoch).map(|skin| (self.central.force(place, &skin), skin));
+            let (change, missed) = cell.open_epoch(number, f_z.is_some_and(|(force, _)| force > 0.0), &self.safety);
+            due += u32::from(cell.is_due());
+            stale += u32::from(missed > 0);
+            age = age.max(missed);
+            if let (Some(frames), Some(exact), Some((f_z, skin))) = (&frames, &exact, f_z) {
+                let plain = self.unquantised.force(place, &skin);
+                let expected = self.central.torque(place, frames, f_z);
+                cell.expect(number, expected, self.unquantised.torque(place, exact, plain));
+                if let Some(felt) = self.snapshot.felt.get_mut(place) {
+                    *felt = skin;
+                }
+            }
+            self.apply(change);
+        }
+        (self.snapshot.stale, self.snapshot.age) = (stale, age);
+        let error = [0.0; WORDS];
+        self.broadcast = Some(Broadcast { epoch, number, at, due, in_time: 0, last_reply: None, error });
+    }
+
+    fn close_epoch(&mut self) {
+        let Some(before) = self.broadcast else { return };
+        if let Some(last) = before.last_reply {
+            // The histogram grows by itself; it cannot refuse.
+            let _ = self.last_reply.record(last.since(before.at).0);
+        }
+        self.counters.epoch(before.due > 0, before.in_time == before.due);
+        if self.comparing && before.due > 0 && before.in_time == before.due {
+            self.accuracy.whole_skin(&before.error);
+        }
+    }
+
+    /// Lets time pass: who has been silent for too long is dead.
+    pub fn handle_time(&mut self, now: Micros) {
+        for place in 0..self.cells.len() {
+            let Some(cell) = self.cells.get_mut(place) else { break };
+            if cell.falls_silent(now) {
+                self.snapshot.dead += 1;
+                let change = cell.let_go();
+                self.apply(change);
+            }
+        }
+    }
+
+    /// No more broadcasts follow: closes the last epoch and settles who never answered.
+    pub fn finish(&mut self) {
+        self.close_epoch();
+        self.broadcast = None;
+        for cell in &mut self.cells {
+            cell.settle();
+        }
+    }
+
+    fn expect_feeling(&mut self, to: Node, from: protocol::message::From, page: SensorPage) {
+        let SensorPage::Skin(skin) = page else { return };
+        let last = self.broadcast.map(|broadcast| broadcast.epoch);
+        for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
+            cell.felt.push(from, skin, last);
+        }
+    }
+
+    fn each_cell(&mut self, change: impl Fn(&mut Cell) -> cell::Change) {
+        for place in 0..self.cells.len() {
+            let Some(cell) = self.cells.get_mut(place) else { break };
+            let change = change(cell);
+            self.apply(change);
+        }
+    }
+
+    /// Adds what a cell's contribution changed by to the running sum.
+    fn apply(&mut self, change: cell::Change) {
+        for ((sum, torque), difference) in self.sum.iter_mut().zip(&mut self.snapshot.torque).zip(change.torque) {
+            *sum += i64::from(difference);
+            *torque = cell::to_nm(*sum);
+        }
+        self.snapshot.contributing = self.snapshot.contributing.saturating_add_signed(change.contributing);
+    }
+
+    /// The wall's time of the last frame heard from the cells that are not dead; what a start waits for.
+    #[must_use]
+    pub fn ready(&self) -> usize {
+        self.cells.iter().filter(|cell| cell.is_ready()).count()
+    }
+
+    /// The cells' statuses now.
+    pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&Cell, Status)> {
+        let newest = self.broadcast.map(|broadcast| broadcast.number);
+        self.cells.iter().map(move |cell| (cell, cell.status(now, newest)))
+    }
+}
+
+fn i32_of<const F: u32>(word: protocol::fixed::Q<F>) -> i32 {
+    i32::from(word.to_bits())
+}
+
+/// A histogram's value as a length of time; it counts in µs.
+#[must_use]
+pub fn micros(value: u64) -> Duration {
+    Duration::from_micros(value)
+}
