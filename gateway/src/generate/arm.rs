@@ -1,0 +1,264 @@
+//! Where the cells lie on an arm, and how they are wired.
+//!
+//! ```text
+//!   a limb, unrolled; numbers go to and fro, so that each cell is wired to the next
+//!
+//!   ring 2    6 - 7 - 8          ports   0 previous in the ring    2 in the ring before
+//!            /   /   /                   1 next in the ring        3 in the ring after
+//!   ring 1    5 - 4 - 3
+//!              \   \   \         each ring is closed around the limb, and turned by half a cell
+//!   ring 0    0 - 1 - 2          against the one before
+//! ```
+
+use core::f64::consts::TAU;
+use std::collections::VecDeque;
+
+use protocol::skin::DenavitHartenberg;
+
+use super::GenerateError;
+
+/// From one cell's middle to the next one's, in mm: that of the real skin's cells.
+const PITCH_MM: usize = 28;
+/// Cells that are closer than this cannot be imagined as hardware.
+const LEAST_PITCH_MM: usize = 3;
+/// Ports of a cell.
+const PORTS: usize = 4;
+
+/// An arm that can wear a skin.
+#[derive(Debug)]
+pub(super) struct Arm {
+    pub(super) name: &'static str,
+    /// Standard Denavit-Hartenberg rows, base to tip.
+    pub(super) joints: [DenavitHartenberg; 6],
+    /// From the base outwards.
+    pub(super) limbs: [Limb; 2],
+}
+
+/// A round limb along the x axis of its joint's frame, whose origin is the limb's far end.
+#[derive(Debug)]
+pub(super) struct Limb {
+    /// What it is called.
+    pub(super) name: &'static str,
+    /// The joint that moves it.
+    pub(super) joint: u8,
+    /// The middle of the limb, in m: along x, and off the axis along z.
+    middle: [f64; 2],
+    /// How much of its length the skin may cover, in m.
+    length: f64,
+    /// The least distance of a cell from the limb's own axis, in m.
+    radius: f64,
+}
+
+/// The UR5. Its limbs lie beside the joints' frames: the shoulder is 135.85 mm wide, and the elbow
+/// leads back by 119.7 mm, which in the table is all in the fourth joint's d. The tubes' radii are 60
+/// and 50 mm, and the cells sit 5 mm above them; joints' housings are left free.
+pub(super) const UR5: Arm = Arm {
+    name: "UR5",
+    joints: [
+        row(0.0, core::f64::consts::FRAC_PI_2, 0.089_159),
+        row(-0.425, 0.0, 0.0),
+        row(-0.392_25, 0.0, 0.0),
+        row(0.0, core::f64::consts::FRAC_PI_2, 0.109_15),
+        row(0.0, -core::f64::consts::FRAC_PI_2, 0.094_65),
+        row(0.0, 0.0, 0.082_3),
+    ],
+    limbs: [
+        Limb { name: "upper arm", joint: 2, middle: [0.2125, 0.135_85], length: 0.285, radius: 0.065 },
+        Limb { name: "forearm", joint: 3, middle: [0.196_125, 0.016_15], length: 0.245, radius: 0.055 },
+    ],
+};
+
+const fn row(a: f64, alpha: f64, d: f64) -> DenavitHartenberg {
+    DenavitHartenberg { a, alpha, d, theta_offset: 0.0 }
+}
+
+/// An arm with its skin.
+#[derive(Debug)]
+pub(super) struct Covered {
+    pub(super) name: &'static str,
+    pub(super) joints: [DenavitHartenberg; 6],
+    pub(super) pitch_mm: usize,
+    /// Each limb's name and how many cells it wears.
+    pub(super) limbs: [(&'static str, usize); 2],
+    pub(super) buses: Vec<Vec<Place>>,
+}
+
+/// A cell; its node is its place in its bus, from 1.
+#[derive(Clone, Debug)]
+pub(super) struct Place {
+    pub(super) joint: u8,
+    pub(super) position: [f64; 3],
+    /// How far it is turned about the limb, from the z axis to the y axis, in rad.
+    pub(super) turn: f64,
+    /// By port, the place in the bus of what is wired to it.
+    pub(super) wires: [Option<usize>; PORTS],
+    pub(super) root: bool,
+}
+
+/// Lays this many cells around the limbs, as far apart as real ones if they fit, else closer.
+pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, GenerateError> {
+    let (pitch_mm, shares) = (LEAST_PITCH_MM..=PITCH_MM)
+        .rev()
+        .find_map(|pitch_mm| Some((pitch_mm, share(&arm.limbs, metres(pitch_mm), cells, buses)?)))
+        .ok_or(GenerateError::NoRoom { cells, least_mm: LEAST_PITCH_MM })?;
+    let mut on_buses = Vec::with_capacity(buses);
+    for (limb, share) in arm.limbs.iter().zip(&shares) {
+        let rings = Rings::of(limb, metres(pitch_mm));
+        for bus in 0..share.buses {
+            let from = bus * share.cells / share.buses;
+            on_buses.push(rings.wired(limb, share.cells, from..(bus + 1) * share.cells / share.buses));
+        }
+    }
+    if let (1, [upper, lower]) = (buses, on_buses.as_mut_slice()) {
+        join(upper, lower);
+        on_buses.truncate(1);
+    }
+    on_buses.retain(|places| !places.is_empty());
+    on_buses.iter_mut().for_each(|places| root(places));
+    let [upper, lower] = &arm.limbs;
+    let limbs = [(upper.name, shares[0].cells), (lower.name, shares[1].cells)];
+    Ok(Covered { name: arm.name, joints: arm.joints, pitch_mm, limbs, buses: on_buses })
+}
+
+/// What a limb gets.
+#[derive(Debug)]
+struct Share {
+    cells: usize,
+    buses: usize,
+}
+
+/// Gives each limb what it has room for; a bus stays on one limb, unless there is only one. `None` when
+/// it does not fit.
+fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[Share; 2]> {
+    let [upper, lower] = limbs.each_ref().map(|limb| Rings::of(limb, pitch).room());
+    let nearest = |whole: usize, part: usize, of: usize| (2 * whole * part + of) / (2 * of);
+    let shares = if buses == 1 {
+        let cells_upper = nearest(cells, upper, upper + lower);
+        [Share { cells: cells_upper, buses: 1 }, Share { cells: cells - cells_upper, buses: 1 }]
+    } else {
+        let buses_upper = nearest(buses, upper, upper + lower).clamp(1, buses - 1);
+        let cells_upper = nearest(cells, buses_upper, buses);
+        [
+            Share { cells: cells_upper, buses: buses_upper },
+            Share { cells: cells - cells_upper, buses: buses - buses_upper },
+        ]
+    };
+    (shares[0].cells <= upper && shares[1].cells <= lower).then_some(shares)
+}
+
+/// How cells lie around a limb.
+#[derive(Clone, Copy, Debug)]
+struct Rings {
+    /// Cells in a ring, at least 3.
+    around: usize,
+    /// Rings that the limb has room for.
+    count: usize,
+    pitch: f64,
+}
+
+impl Rings {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small and positive")]
+    fn of(limb: &Limb, pitch: f64) -> Self {
+        let around = (TAU * limb.radius / pitch).ceil() as usize;
+        let count = (limb.length / Self { around, count: 0, pitch }.step()).floor() as usize + 1;
+        Self { around, count, pitch }
+    }
+
+    /// From one ring to the next, in m.
+    fn step(&self) -> f64 {
+        self.pitch * 0.75_f64.sqrt()
+    }
+
+    const fn room(&self) -> usize {
+        self.around * self.count
+    }
+
+    /// Ring and place in it of the cell with this number; odd rings are counted backwards.
+    const fn spot(&self, number: usize) -> (usize, usize) {
+        let (ring, place) = (number / self.around, number % self.around);
+        (ring, if ring % 2 == 0 { place } else { self.around - 1 - place })
+    }
+
+    /// The number of the cell at a spot.
+    const fn number(&self, (ring, place): (usize, usize)) -> usize {
+        ring * self.around + if ring % 2 == 0 { place } else { self.around - 1 - place }
+    }
+
+    /// The cells with these numbers, of the `all` that the limb wears, wired among themselves.
+    fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<Place> {
+        let rings = all.div_ceil(self.around);
+        let place = |number| {
+            let (ring, place) = self.spot(number);
+            let last = self.around - 1;
+            let neighbors = [
+                Some((ring, if place == 0 { last } else { place - 1 })),
+                Some((ring, if place == last { 0 } else { place + 1 })),
+                ring.checked_sub(1).map(|ring| (ring, place)),
+                Some((ring + 1, place)),
+            ];
+            let within = |spot| Some(self.number(spot)).filter(|number| numbers.contains(number));
+            let turn = TAU * (real(place) + real(ring % 2) / 2.0) / real(self.around);
+            let radius = real(self.around) * self.pitch / TAU;
+            let [x, z] = limb.middle;
+            Place {
+                joint: limb.joint,
+                position: [
+                    x + (real(rings - 1) / 2.0 - real(ring)) * self.step(),
+                    radius * turn.sin(),
+                    z + radius * turn.cos(),
+                ],
+                turn,
+                wires: neighbors.map(|spot| Some(within(spot?)? - numbers.start)),
+                root: false,
+            }
+        };
+        numbers.clone().map(place).collect()
+    }
+}
+
+/// Puts two limbs' cells on one bus: a cable leads from the last cell of the one, whose port 3 is free,
+/// to the first of the other, whose port 2 is.
+fn join(upper: &mut Vec<Place>, lower: &mut Vec<Place>) {
+    let shift = upper.len();
+    for wire in lower.iter_mut().flat_map(|place| &mut place.wires).flatten() {
+        *wire += shift;
+    }
+    if let (Some(last), Some(first)) = (upper.last_mut(), lower.first_mut()) {
+        (last.wires[3], first.wires[2]) = (Some(shift), Some(shift - 1));
+    }
+    upper.append(lower);
+}
+
+/// Wires the gateway to the middle of a bus' cells: the first one of those from which the farthest cell
+/// is nearest, so that sums have the shortest way.
+fn root(places: &mut [Place]) {
+    let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
+    if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
+        root.root = true;
+    }
+}
+
+/// Wires from a cell to the farthest one that it can reach.
+pub(super) fn depth(places: &[Place], from: usize) -> usize {
+    let mut distance = vec![None; places.len()];
+    let mut next = VecDeque::from([(from, 0)]);
+    let mut deepest = 0;
+    while let Some((at, steps)) = next.pop_front() {
+        let (Some(seen), Some(place)) = (distance.get_mut(at), places.get(at)) else { continue };
+        if seen.is_none() {
+            *seen = Some(steps);
+            deepest = steps;
+            next.extend(place.wires.iter().flatten().map(|&wire| (wire, steps + 1)));
+        }
+    }
+    deepest
+}
+
+fn metres(pitch_mm: usize) -> f64 {
+    real(pitch_mm) / 1e3
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts of cells")]
+fn real(count: usize) -> f64 {
+    count as f64
+}

@@ -1,0 +1,137 @@
+//! `gateway skin generate`: describes a skin of hexagonal cells on a robot's arm.
+//!
+//! The cells lie in rings around the upper arm and the forearm, each ring turned by half a cell against
+//! the next, so that neighbours are a hexagon's neighbours. The result is the text of a `skin.toml`.
+
+mod arm;
+mod text;
+
+use clap::{Args, ValueEnum};
+use protocol::document::DocumentError;
+use protocol::id::CellId;
+use protocol::skin::Skin;
+use thiserror::Error;
+
+/// What to describe.
+#[derive(Args, Clone, Debug, PartialEq)]
+pub struct Wanted {
+    /// The robot that wears the skin
+    #[arg(long, value_enum, default_value = "ur5")]
+    pub robot: Robot,
+    /// How many cells, 1 to 254 a bus
+    #[arg(long, default_value_t = 253)]
+    pub cells: usize,
+    /// How many buses; cells of one bus lie together
+    #[arg(long, default_value_t = 1)]
+    pub buses: usize,
+    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop
+    #[arg(long, default_value_t = 62.5)]
+    pub broadcast_hz: f64,
+    /// What the cells answer with
+    #[arg(long, value_enum, default_value = "torque")]
+    pub reply: Reply,
+    /// What their packets travel in
+    #[arg(long, value_enum, default_value = "fd")]
+    pub format: Format,
+}
+
+impl Default for Wanted {
+    fn default() -> Self {
+        Self {
+            robot: Robot::Ur5,
+            cells: 253,
+            buses: 1,
+            broadcast_hz: 62.5,
+            reply: Reply::Torque,
+            format: Format::Fd,
+        }
+    }
+}
+
+/// A robot whose arm is known.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+pub enum Robot {
+    /// Universal Robots UR5
+    Ur5,
+}
+
+/// What the cells answer with.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+pub enum Reply {
+    /// Each cell its own torque
+    Torque,
+    /// Sums along the tree
+    Sum,
+}
+
+/// What a packet travels in.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+pub enum Format {
+    /// One CAN FD frame
+    Fd,
+    /// Two classic frames
+    Classic,
+}
+
+/// Why a skin cannot be described.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum GenerateError {
+    /// More cells than the buses have numbers for.
+    #[error(
+        "{cells} cells do not fit on {}: a bus has numbers for {most}; say --buses {needed}",
+        if *.buses == 1 { "one bus".to_owned() } else { format!("{buses} buses") },
+        most = CellId::COUNT
+    )]
+    TooMany {
+        /// Wanted cells.
+        cells: usize,
+        /// Wanted buses.
+        buses: usize,
+        /// Buses that this takes.
+        needed: usize,
+    },
+    /// Fewer cells than buses, or none.
+    #[error("{cells} cells on {buses} buses: every bus needs at least one")]
+    TooFew {
+        /// Wanted cells.
+        cells: usize,
+        /// Wanted buses.
+        buses: usize,
+    },
+    /// More cells than there is room for.
+    #[error("{cells} cells do not fit on the arm, not even {least_mm} mm apart")]
+    NoRoom {
+        /// Wanted cells.
+        cells: usize,
+        /// The least distance in mm.
+        least_mm: usize,
+    },
+    /// What came out is no skin: a number that was asked for cannot be.
+    #[error(transparent)]
+    Skin(#[from] DocumentError),
+}
+
+/// The text of a `skin.toml`; the same for the same wish.
+///
+/// # Errors
+/// When the cells do not fit on the buses or on the arm, or a number that was asked for cannot be.
+pub fn generate(wanted: &Wanted) -> Result<String, GenerateError> {
+    let (cells, buses) = (wanted.cells, wanted.buses);
+    if buses == 0 || cells < buses {
+        return Err(GenerateError::TooFew { cells, buses });
+    }
+    let needed = cells.div_ceil(CellId::COUNT);
+    if needed > buses {
+        return Err(GenerateError::TooMany { cells, buses, needed });
+    }
+    let arm = match wanted.robot {
+        Robot::Ur5 => arm::cover(&arm::UR5, cells, buses)?,
+    };
+    let text = text::toml(wanted, &arm);
+    Skin::parse("generated skin", &text)?;
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests;
