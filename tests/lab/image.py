@@ -128,21 +128,24 @@ def kernel_package(cache, making, say):
     cached = newest(cache.glob("linux-image-*.deb"))
     if cached:
         return cached
-    for attempt in ("with the lists at hand", "after an update"):
-        if attempt == "after an update":
+    why = f"apt does not know {META_PACKAGE}"
+    for attempt in range(2):
+        if attempt == 1:                    # the lists may be missing, or older than the kernel there is
             apt_update(say)
         depends = subprocess.run(["apt-cache", "depends", META_PACKAGE], stdin=subprocess.DEVNULL,
                                  capture_output=True, text=True, check=False).stdout
         names = [line.split()[1] for line in depends.splitlines() if line.strip().startswith("Depends: linux-image-")]
-        if names:
-            say(f"downloading {names[0]} (70 MB)")
-            done = subprocess.run(["apt-get", "download", "-q", names[0]], cwd=making, stdin=subprocess.DEVNULL,
-                                  capture_output=True, text=True, check=False)
-            if done.returncode == 0:
-                deb = next(making.glob("linux-image-*.deb"))
-                return deb.rename(cache / deb.name.replace("%3a", ":"))
-    raise LabError(f"cannot download a kernel: apt has no {META_PACKAGE} and {cache} has no linux-image-*.deb; "
-                   "run apt-get update with a network, or copy such a package of Debian there")
+        if not names:
+            continue
+        say(f"downloading {names[0]} (70 MB)")
+        done = subprocess.run(["apt-get", "download", "-q", names[0]], cwd=making, stdin=subprocess.DEVNULL,
+                              capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            deb = next(making.glob("linux-image-*.deb"))
+            return deb.rename(cache / deb.name)
+        why = (done.stderr.strip().splitlines() or ["no output"])[-1]
+    raise LabError(f"cannot download a kernel ({why}), and {cache} has no linux-image-*.deb; "
+                   "try again with a network, or copy that package of Debian there")
 
 
 def bare_elf(vmlinuz):
