@@ -90,7 +90,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             joint: chain.len(),
             upright: below.unwrap_or_default().iter().all(upright),
             position: parameters.pose.position.map(S::word),
-            force: parameters.pose.normal.map(|word| S::word(word.saturating_neg())),
+            force: parameters.pose.normal.map(|word| S::word(word).negative()),
             links,
         }
     }
