@@ -6,6 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
+use protocol::bus::{BusError, check_name};
 use rustix::process::Signal;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::embedded::Server;
@@ -29,6 +30,7 @@ enum Command {
     )]
     Serve {
         /// The bus's name, as an interface's: at most 15 bytes
+        #[arg(value_parser = bus_name)]
         name: String,
         /// Also stop when standard input ends or the parent process dies
         #[arg(long)]
@@ -48,6 +50,10 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+fn bus_name(word: &str) -> Result<String, BusError> {
+    check_name(word).map(|()| word.to_owned())
 }
 
 fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {

@@ -1,0 +1,102 @@
+//! What the embedded bus costs under a whole skin: 253 clients, each with one exact filter, hear a broadcast
+//! at 62.5 Hz and each answers it to one client.
+//!
+//! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS]`
+#![allow(clippy::print_stdout, reason = "an example that prints")]
+
+use std::error::Error;
+use std::thread::Builder;
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::can::{BIT_RATE_SWITCH, Frame};
+use rustix::time::{ClockId, clock_gettime};
+use vcan_setup::embedded::Server;
+
+const PERIOD: Duration = Duration::from_millis(16);
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut arguments = std::env::args().skip(1);
+    let cells: u32 = arguments.next().map_or(Ok(253), |word| word.parse())?;
+    let seconds: u32 = arguments.next().map_or(Ok(10), |word| word.parse())?;
+    let directory = std::env::temp_dir().join(format!("skin-pattern-{}", std::process::id()));
+    let server = Server::bind_in(&directory, "vcan0")?;
+    let (stop, stopped) = std::os::unix::net::UnixStream::pair()?;
+    let serving = std::thread::spawn(move || {
+        let totals = server.run(stopped);
+        (totals, clock_gettime(ClockId::ThreadCPUTime))
+    });
+
+    let exact = |id| vec![Filter { id, mask: Filter::EXACT_MASK }];
+    let open = |filters| {
+        let options = Options { filters, directory: Some(directory.clone()), ..Options::default() };
+        Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options)
+    };
+    for cell in 1..=cells {
+        let bus = open(exact(0x001))?;
+        // They end with the process.
+        Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, 0x200 + cell))?;
+    }
+    let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }])?;
+
+    let mut inbox = Inbox::new();
+    let mut last_reply = Vec::new();
+    let (mut complete, mut replies) = (0_u32, 0_u64);
+    let cycles = seconds.saturating_mul(125).div_ceil(2);
+    let start = Instant::now();
+    let mut due = start;
+    for cycle in 0..cycles {
+        due += PERIOD;
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        let sent = Instant::now();
+        gateway.send(&[Frame::fd(0x001, BIT_RATE_SWITCH, &u128::from(cycle).to_le_bytes())?])?;
+        let mut got = 0;
+        while got < cells && gateway.wait(Some((due + PERIOD).saturating_duration_since(Instant::now())))? {
+            gateway.receive(&mut inbox)?;
+            got += inbox
+                .frames()
+                .filter(|reply| reply.frame.data().starts_with(&cycle.to_le_bytes()))
+                .map(|_| 1)
+                .sum::<u32>();
+        }
+        replies += u64::from(got);
+        if got == cells {
+            complete += 1;
+            last_reply.push(sent.elapsed());
+        }
+    }
+    let took = start.elapsed();
+    drop(stop);
+    let (totals, cpu) = serving.join().expect("the bus does not panic");
+    let totals = totals?;
+    let cpu = Duration::try_from(cpu)?;
+    last_reply.sort_unstable();
+    let at = |percent: usize| {
+        last_reply.get((last_reply.len().saturating_sub(1)).saturating_mul(percent).div_ceil(100))
+    };
+    println!(
+        "{cells} cells, {cycles} cycles in {:.2} s: {complete} complete, {replies} replies",
+        took.as_secs_f64()
+    );
+    println!("last reply after the broadcast: p50 {:?}, p99 {:?}, max {:?}", at(50), at(99), at(100));
+    println!("dropped {}, garbage {}", inbox.dropped(), totals.garbage);
+    println!(
+        "the bus: {:.2} ms of CPU per cycle, {:.1} % of one core",
+        1e3 * cpu.as_secs_f64() / f64::from(cycles),
+        100.0 * cpu.as_secs_f64() / took.as_secs_f64()
+    );
+    Ok(())
+}
+
+/// A cell: answers every broadcast with its first bytes, until the bus is closed.
+fn answer(bus: &Bus, id: u32) {
+    let mut inbox = Inbox::new();
+    while bus.wait(None).is_ok() && bus.receive(&mut inbox).is_ok() {
+        for heard in inbox.frames() {
+            let reply = Frame::fd(id, BIT_RATE_SWITCH, heard.frame.data()).expect("16 bytes fit");
+            if bus.send(&[reply]).is_err() {
+                return;
+            }
+        }
+    }
+}
