@@ -6,14 +6,18 @@
 //! ```
 //!
 //! [`Kinesthetic`] lets the arm give way to who pushes it. [`Hold`] and [`Sine`] are motions of a
-//! scenario that do not listen to torques. An external controller asks another program.
+//! scenario that do not listen to torques. [`crate::external::External`] asks another program.
 
 use core::f64::consts::TAU;
+use std::path::Path;
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
+
+use crate::external::{External, SocketError};
+use crate::scenario::{Motion, MotionKind};
 
 /// What a controller is told in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -69,6 +73,31 @@ pub enum BadCycle {
 pub trait Controller: Send {
     /// One tick. Must not block, allocate, lock or log.
     fn step(&mut self, input: &Input) -> Step;
+
+    /// What it has counted, with names for people: for the end of a run, not for the tick.
+    fn counts(&self) -> Vec<(String, u64)> {
+        Vec::new()
+    }
+}
+
+/// What moves the robot in this motion of a scenario: hold, sine, or the skin's controller.
+///
+/// # Errors
+/// When the skin's controller is another program, and there is no socket to listen on for it.
+pub fn of_motion(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
+    let start = motion.start_rad;
+    Ok(match (motion.kind, &skin.controller.kind) {
+        (MotionKind::Hold, _) => Box::new(Hold::new(skin, start)),
+        (MotionKind::Sine { amplitude_rad, period_s }, _) => {
+            Box::new(Sine::new(skin, start, amplitude_rad, period_s))
+        }
+        (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
+            Box::new(Kinesthetic::with(skin, inertia, damping))
+        }
+        (MotionKind::Kinesthetic, ControllerKind::External { socket }) => {
+            Box::new(External::listen(Path::new(socket), skin)?)
+        }
+    })
 }
 
 /// `M q'' + D q' = tau`, joint by joint.
@@ -97,7 +126,13 @@ impl Kinesthetic {
     /// The controller that the skin describes; `None` when that is another kind.
     #[must_use]
     pub fn new(skin: &Skin) -> Option<Self> {
-        let ControllerKind::Kinesthetic { inertia, damping } = &skin.controller.kind else { return None };
+        match &skin.controller.kind {
+            ControllerKind::Kinesthetic { inertia, damping } => Some(Self::with(skin, inertia, damping)),
+            ControllerKind::External { .. } => None,
+        }
+    }
+
+    fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
         let tick = 1.0 / skin.timing.control_hz;
         let mut joints = [Admittance::default(); MAX_JOINTS];
         let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed_rad_s);
@@ -105,7 +140,7 @@ impl Kinesthetic {
             *joint =
                 Admittance { mobility: damping.recip(), keep: (-damping / inertia * tick).exp(), max_speed };
         }
-        Some(Self { joints })
+        Self { joints }
     }
 }
 
@@ -235,6 +270,10 @@ mod tests {
 
     const TICK: f64 = 0.002;
 
+    fn kinesthetic() -> Kinesthetic {
+        Kinesthetic::new(&skin()).unwrap()
+    }
+
     fn moved(step: Step) -> [f64; MAX_JOINTS] {
         match step {
             Step::Move(velocity) => velocity,
@@ -259,7 +298,7 @@ mod tests {
 
     #[test]
     fn a_constant_torque_gives_the_exact_velocity() {
-        let mut controller = Kinesthetic::new(&skin()).unwrap();
+        let mut controller = kinesthetic();
         let arm = run(&mut controller, [0.0; 6], 250, [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]);
         // M = 1, D = 4, so after half a second v = tau/D (1 - e^-2).
         let wanted = 0.5 * (1.0 - (-2.0_f64).exp());
@@ -271,8 +310,22 @@ mod tests {
     }
 
     #[test]
+    fn the_scenario_says_who_moves_the_robot() {
+        let mut motion = Motion { start_rad: [0.25; 6], kind: MotionKind::Hold };
+        let mut step = |kind, torque| {
+            motion.kind = kind;
+            let input = Input { q: [0.25; 6], ..pushed([torque; 6]) };
+            moved(of_motion(&skin(), &motion).unwrap().step(&input))[0]
+        };
+        assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
+        assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
+        assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "gives way");
+        assert!(step(MotionKind::Sine { amplitude_rad: [0.1; 6], period_s: 4.0 }, 0.0) > 0.0);
+    }
+
+    #[test]
     fn without_torque_the_arm_comes_to_rest() {
-        let mut controller = Kinesthetic::new(&skin()).unwrap();
+        let mut controller = kinesthetic();
         let input = Input { qdot: [1.0; 6], ..pushed([0.0; 6]) };
         for velocity in moved(controller.step(&input)) {
             assert!(velocity > 0.99 && velocity < 1.0);
@@ -281,7 +334,7 @@ mod tests {
 
     #[test]
     fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
-        let mut controller = Kinesthetic::new(&skin()).unwrap();
+        let mut controller = kinesthetic();
         assert_eq!(controller.step(&Input::default()), Step::Bad(BadCycle::Torque));
         assert_eq!(controller.step(&pushed([f64::NAN; 6])), Step::Bad(BadCycle::Torque));
         let halted = Input { halted: true, qdot: [1.0; 6], ..pushed([5.0; 6]) };
@@ -318,7 +371,7 @@ mod tests {
         fn no_torque_makes_it_quicker_than_it_may_or_unstable(
             torque in any::<[f64; 6]>(), qdot in proptest::array::uniform6(-5.0..5.0),
         ) {
-            let mut controller = Kinesthetic::new(&skin()).unwrap();
+            let mut controller = kinesthetic();
             let input = Input { qdot, ..pushed(torque) };
             match controller.step(&input) {
                 Step::Bad(why) => {

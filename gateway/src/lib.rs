@@ -3,8 +3,11 @@
 pub mod central;
 pub mod controller;
 pub mod cycle;
+pub mod external;
 pub mod generate;
 pub mod robot;
+pub mod run;
+pub mod summary;
 pub mod table;
 pub mod scenario;
 #[cfg(test)]

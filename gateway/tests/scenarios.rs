@@ -3,9 +3,9 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use gateway::central::Central;
-use gateway::controller::{Controller, Input, Kinesthetic, Sine, Step};
+use gateway::controller::{Input, Step, of_motion};
 use gateway::robot::{Robot, SimulatedArm};
-use gateway::scenario::{MotionKind, Scenario, Touches};
+use gateway::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
 use protocol::message::SkinSensors;
 use protocol::skin::Skin;
@@ -30,13 +30,7 @@ fn play(scenario: &str) -> Most {
     let skin = Skin::parse("ur5-253.toml", include_str!("../examples/ur5-253.toml")).unwrap();
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
     let start = scenario.motion.start_rad;
-    let mut controller: Box<dyn Controller> = match scenario.motion.kind {
-        MotionKind::Kinesthetic => Box::new(Kinesthetic::new(&skin).unwrap()),
-        MotionKind::Sine { amplitude_rad, period_s } => {
-            Box::new(Sine::new(&skin, start, amplitude_rad, period_s))
-        }
-        MotionKind::Hold => unreachable!("no scenario holds"),
-    };
+    let mut controller = of_motion(&skin, &scenario.motion).unwrap();
     let central = Central::new(&skin);
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);

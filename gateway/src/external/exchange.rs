@@ -1,0 +1,158 @@
+//! Who owes an answer, and what a tick makes of what came: no socket, no clock.
+
+use super::datagram::{Command, Heard, Nonsense};
+use crate::controller::{BadCycle, Input, Pace, Step};
+
+/// What happened, each since the start.
+#[derive(Clone, Debug, Default, Eq, PartialEq)]
+pub(super) struct Counts {
+    /// Hellos.
+    pub(super) hellos: u64,
+    /// Answers in time.
+    pub(super) answers: u64,
+    /// Ticks that the peer left without an answer.
+    pub(super) missing: u64,
+    /// Answers to a tick whose time was over.
+    pub(super) late: u64,
+    /// Second answers to the same tick.
+    pub(super) repeated: u64,
+    /// Datagrams of others than the peer.
+    pub(super) strangers: u64,
+    /// States that did not fit into the peer's queue.
+    pub(super) unsent: u64,
+    /// Peers that went away.
+    pub(super) gone: u64,
+    /// Datagrams that could not be received, and hellos that nobody can answer.
+    pub(super) failed: u64,
+    /// The peer's nonsense, in the order of [`Nonsense::ALL`].
+    pub(super) nonsense: [u64; Nonsense::ALL.len()],
+}
+
+impl Counts {
+    /// All of them with their names.
+    pub(super) fn each(&self) -> impl Iterator<Item = (String, u64)> {
+        let own = [
+            ("hellos", self.hellos),
+            ("answers", self.answers),
+            ("missing", self.missing),
+            ("late", self.late),
+            ("repeated", self.repeated),
+            ("strangers", self.strangers),
+            ("unsent", self.unsent),
+            ("gone", self.gone),
+            ("failed", self.failed),
+        ];
+        let nonsense = Nonsense::ALL.iter().zip(self.nonsense);
+        own.into_iter()
+            .map(|(name, count)| (name.to_owned(), count))
+            .chain(nonsense.map(|(why, count)| (format!("nonsense: {why}"), count)))
+    }
+
+    fn nonsense(&mut self, why: Nonsense) {
+        let at = Nonsense::ALL.iter().position(|it| *it == why);
+        if let Some(count) = at.and_then(|at| self.nonsense.get_mut(at)) {
+            *count += 1;
+        }
+    }
+}
+
+/// Who sent a datagram.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Sender {
+    Peer,
+    Stranger,
+}
+
+/// What became of a state.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Sent {
+    Taken,
+    QueueFull,
+    NobodyThere,
+}
+
+/// The exchange with the peer.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Exchange {
+    connected: bool,
+    /// The tick whose answer is due.
+    due: Option<u64>,
+    answer: Option<Command>,
+    nonsense: bool,
+    pub(super) counts: Counts,
+}
+
+impl Exchange {
+    /// Takes in a datagram. Whether its sender is the peer from now on.
+    pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
+        let answer = match (Heard::decode(bytes), sender) {
+            (Ok(Heard::Hello), _) => {
+                let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
+                // A peer that says hello again keeps what it owes.
+                if sender == Sender::Stranger || !self.connected {
+                    *self = Self::default();
+                }
+                (self.connected, self.counts) = (true, counts);
+                return true;
+            }
+            (_, Sender::Stranger) => {
+                self.counts.strangers += 1;
+                return false;
+            }
+            (Err(why), Sender::Peer) => {
+                self.nonsense = true;
+                self.counts.nonsense(why);
+                return false;
+            }
+            (Ok(Heard::Answer(answer)), Sender::Peer) => answer,
+        };
+        match self.due {
+            Some(due) if answer.tick > due => {
+                self.nonsense = true;
+                self.counts.nonsense(Nonsense::Ahead);
+            }
+            Some(due) if answer.tick == due => {
+                if self.answer.is_some() {
+                    self.counts.repeated += 1;
+                } else {
+                    self.answer = Some(answer.command);
+                }
+            }
+            Some(_) | None => self.counts.late += 1,
+        }
+        false
+    }
+
+    /// What the tick does, when all that came has been taken in.
+    pub(super) fn step(&mut self, input: &Input, pace: &Pace) -> Step {
+        let (due, answer) = (self.due.take(), self.answer.take());
+        let nonsense = core::mem::take(&mut self.nonsense);
+        if answer.is_some() {
+            self.counts.answers += 1;
+        } else if due.is_some() {
+            self.counts.missing += 1;
+        }
+        match (answer, due) {
+            _ if nonsense => Step::Bad(BadCycle::Nonsense),
+            (Some(Command::Velocity(velocity)), _) => Step::Move(pace.limited(velocity, input)),
+            (Some(Command::Position(goal)), _) => Step::Move(pace.towards(&goal, input)),
+            (None, Some(_)) => Step::Bad(BadCycle::NoAnswer),
+            (None, None) => Step::Bad(BadCycle::NoPeer),
+        }
+    }
+
+    /// Takes in what became of this tick's state.
+    pub(super) fn sent(&mut self, tick: u64, sent: Sent) {
+        match sent {
+            Sent::Taken => self.due = Some(tick),
+            Sent::QueueFull => {
+                self.due = Some(tick);
+                self.counts.unsent += 1;
+            }
+            Sent::NobodyThere => {
+                self.connected = false;
+                self.counts.gone += 1;
+            }
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! The socket: receives, sends, and decides nothing.
+
+use std::io::{self, ErrorKind};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::path::{Path, PathBuf};
+
+use protocol::skin::Skin;
+use thiserror::Error;
+
+use super::datagram::{ANSWER_BYTES, State};
+use super::exchange::{Exchange, Sender, Sent};
+use crate::controller::{Controller, Input, Pace, Step};
+
+/// Datagrams taken in one tick: what is more waits, so that nobody can hold the tick up.
+const PER_TICK: usize = 16;
+
+/// A controller in another program.
+#[derive(Debug)]
+pub struct External {
+    socket: UnixDatagram,
+    path: PathBuf,
+    /// Device and inode of the socket's file, so that only our own is removed.
+    file: Option<(u64, u64)>,
+    peer: Option<SocketAddr>,
+    exchange: Exchange,
+    pace: Pace,
+    joints: u32,
+}
+
+/// Why there is no socket to listen on.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum SocketError {
+    /// Somebody listens there.
+    #[error("{}: another program listens on this socket; end it, or name another path", path.display())]
+    Live {
+        /// The socket's path.
+        path: PathBuf,
+    },
+    /// Something else has that name.
+    #[error("{}: exists and is no socket; it is left alone", path.display())]
+    NotASocket {
+        /// The socket's path.
+        path: PathBuf,
+    },
+    /// The system refused.
+    #[error("{}: cannot listen on this socket", path.display())]
+    System {
+        /// The socket's path.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+impl External {
+    /// Listens at a path, and replaces the file of a socket on which nobody listens any more.
+    ///
+    /// # Errors
+    /// When somebody listens there already, something else has that name, or the system refuses.
+    pub fn listen(path: &Path, skin: &Skin) -> Result<Self, SocketError> {
+        let path = path.to_owned();
+        let socket = match bind(&path) {
+            Ok(socket) => socket,
+            Err(Refused::Live) => return Err(SocketError::Live { path }),
+            Err(Refused::NotASocket) => return Err(SocketError::NotASocket { path }),
+            Err(Refused::System(source)) => return Err(SocketError::System { path, source }),
+        };
+        Ok(Self {
+            socket,
+            file: file(&path),
+            path,
+            peer: None,
+            exchange: Exchange::default(),
+            pace: Pace::of(skin),
+            joints: u32::try_from(skin.robot.joints.len()).unwrap_or_default(),
+        })
+    }
+
+    fn receive(&mut self) {
+        // One byte more than the longest datagram, so that a longer one is seen to be longer.
+        let mut bytes = [0; ANSWER_BYTES + 1];
+        for _ in 0..PER_TICK {
+            let (length, from) = match self.socket.recv_from(&mut bytes) {
+                Ok(received) => received,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return,
+                Err(_) => {
+                    self.exchange.counts.failed += 1;
+                    return;
+                }
+            };
+            if from.is_unnamed() {
+                self.exchange.counts.failed += 1;
+                continue;
+            }
+            let known = self.peer.as_ref().is_some_and(|peer| same(peer, &from));
+            let sender = if known { Sender::Peer } else { Sender::Stranger };
+            if self.exchange.handle(bytes.get(..length).unwrap_or(&bytes), sender) {
+                self.peer = Some(from);
+            }
+        }
+    }
+
+    fn send(&mut self, input: &Input) {
+        let Some(peer) = &self.peer else { return };
+        let state = State { input: *input, joints: self.joints }.encode();
+        let sent = match self.socket.send_to_addr(&state, peer) {
+            Ok(_) => Sent::Taken,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Sent::QueueFull,
+            Err(_) => Sent::NobodyThere,
+        };
+        if sent == Sent::NobodyThere {
+            self.peer = None;
+        }
+        self.exchange.sent(input.tick, sent);
+    }
+}
+
+impl Controller for External {
+    fn step(&mut self, input: &Input) -> Step {
+        self.receive();
+        let step = self.exchange.step(input, &self.pace);
+        self.send(input);
+        step
+    }
+
+    fn counts(&self) -> Vec<(String, u64)> {
+        self.exchange.counts.each().collect()
+    }
+}
+
+impl Drop for External {
+    fn drop(&mut self) {
+        if self.file.is_some() && file(&self.path) == self.file {
+            // Nothing is to be done when that fails: the next gateway replaces a dead socket.
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
+
+enum Refused {
+    Live,
+    NotASocket,
+    System(io::Error),
+}
+
+fn bind(path: &Path) -> Result<UnixDatagram, Refused> {
+    let socket = match UnixDatagram::bind(path) {
+        Err(error) if error.kind() == ErrorKind::AddrInUse => {
+            let kind = std::fs::symlink_metadata(path).map_err(Refused::System)?.file_type();
+            if !kind.is_socket() {
+                return Err(Refused::NotASocket);
+            }
+            match UnixDatagram::unbound().and_then(|probe| probe.connect(path)) {
+                Err(error) if error.kind() == ErrorKind::ConnectionRefused => {
+                    std::fs::remove_file(path).and_then(|()| UnixDatagram::bind(path))
+                }
+                Ok(()) | Err(_) => return Err(Refused::Live),
+            }
+        }
+        bound => bound,
+    };
+    let socket = socket.map_err(Refused::System)?;
+    socket.set_nonblocking(true).map_err(Refused::System)?;
+    Ok(socket)
+}
+
+/// Device and inode of a file.
+fn file(path: &Path) -> Option<(u64, u64)> {
+    std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
+}
+
+/// Whether two addresses, neither of them unnamed, are the same.
+fn same(one: &SocketAddr, other: &SocketAddr) -> bool {
+    one.as_pathname() == other.as_pathname() && one.as_abstract_name() == other.as_abstract_name()
+}
