@@ -95,7 +95,7 @@ fn what_the_answer_asks_for_is_done_in_the_next_tick() {
     let command = Command::Position([0.001, 0.0, 0.0, 0.0, 0.0, -9.0]);
     program.send(&Answer { tick: 2, command }.encode()).unwrap();
     let Step::Move([first, .., last]) = gateway.step(&input(3)) else { panic!("an answer was there") };
-    assert!((first - 0.5).abs() < 1e-12, "a millimetre-radian in 2 ms");
+    assert!((first - 0.5).abs() < 1e-12, "a thousandth of a radian in 2 ms");
     assert!((last + 3.0).abs() < 1e-12, "no quicker than it may");
     program.send(&velocity(3, 99.0)).unwrap();
     assert_eq!(gateway.step(&input(4)), Step::Move([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
