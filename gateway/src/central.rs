@@ -190,4 +190,5 @@ fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "words, their sums and their products are exact in f64")]
 mod tests;

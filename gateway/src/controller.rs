@@ -262,6 +262,7 @@ fn seconds(time: Micros) -> f64 {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
 mod tests {
     use super::*;
     use crate::robot::{Robot, SimulatedArm};

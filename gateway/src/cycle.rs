@@ -102,7 +102,10 @@ pub struct Cycle {
 
 impl core::fmt::Debug for Cycle {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.debug_struct("Cycle").field("epoch", &self.epoch).field("halted", &self.halted).finish_non_exhaustive()
+        f.debug_struct("Cycle")
+            .field("epoch", &self.epoch)
+            .field("halted", &self.halted)
+            .finish_non_exhaustive()
     }
 }
 

@@ -7,8 +7,8 @@ pub mod external;
 pub mod generate;
 pub mod robot;
 pub mod run;
+pub mod scenario;
 pub mod summary;
 pub mod table;
-pub mod scenario;
 #[cfg(test)]
 mod testing;

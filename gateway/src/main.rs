@@ -1,2 +1,9 @@
-//! To be written.
-fn main() {}
+//! `gateway`: the bench's command line.
+
+mod cli;
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    cli::main()
+}

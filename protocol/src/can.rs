@@ -76,6 +76,10 @@ pub enum FrameError {
 }
 
 impl Frame {
+    /// A classic frame with identifier 0 and no data, to fill buffers with.
+    pub const EMPTY: Self =
+        Self { id: 0, format: Format::Classic, flags: 0, raw_dlc: 0, len: 0, data: [0; 64] };
+
     /// A classic data frame. `id` carries the flag [`EXTENDED`] for 29 bits.
     ///
     /// # Errors

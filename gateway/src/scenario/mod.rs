@@ -247,4 +247,5 @@ impl Scenario {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "words are exact in f64")]
 mod tests;

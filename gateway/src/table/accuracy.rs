@@ -60,7 +60,12 @@ pub struct Accuracy {
 
 impl Accuracy {
     /// Compares one cell's torque; returns distributed less central, zero where saturated.
-    pub(super) fn compare(&mut self, joint: usize, words: &[i32; WORDS], expected: &Expected) -> [f64; WORDS] {
+    pub(super) fn compare(
+        &mut self,
+        joint: usize,
+        words: &[i32; WORDS],
+        expected: &Expected,
+    ) -> [f64; WORDS] {
         let mut errors = [0.0; WORDS];
         let both = expected.quantised.iter().zip(&expected.unquantised);
         for ((error, &word), (quantised, unquantised)) in errors.iter_mut().zip(words).zip(both).take(joint) {

@@ -7,9 +7,9 @@ use protocol::parameters::Parameters;
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
+use super::DEAD_AFTER;
 use super::felt::Felt;
 use super::ledger::{Replies, Uplink};
-use super::DEAD_AFTER;
 
 /// A torque may answer the newest epoch, or one of so many before it.
 pub(super) const LATEST: i8 = 3;
@@ -86,6 +86,8 @@ pub struct Cell {
     held: Option<[i32; WORDS]>,
     /// What of it is in the running sum.
     contribution: [i32; WORDS],
+    /// Broadcasts since the first of the two pages in `heard`.
+    told: u64,
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
     due: u8,
     expected: [Option<Expected>; LATEST as usize + 1],
@@ -108,6 +110,7 @@ impl Cell {
             answered: None,
             held: None,
             contribution: [0; WORDS],
+            told: 0,
             due: 0,
             expected: [None; LATEST as usize + 1],
         }
@@ -129,13 +132,20 @@ impl Cell {
         falls
     }
 
+    /// Whether this first word of a cell comes from one that had spoken before.
+    pub(super) const fn has_restarted(&self, heartbeat: &Heartbeat) -> bool {
+        self.heartbeat.is_some() && is_first(heartbeat)
+    }
+
     pub(super) fn take_heartbeat(&mut self, heartbeat: &Heartbeat) -> Change {
-        let restarted = heartbeat.sent == 0 && heartbeat.state.has(State::CLAIMING);
+        let restarted = is_first(heartbeat);
         self.uplink.settle(heartbeat.sent, restarted);
         if restarted {
             self.felt.restart();
             self.doubt();
-            self.heard = None;
+            // It counts from zero.
+            self.heard = Some(<(Heard, Heard)>::default());
+            self.told = 0;
         }
         self.heartbeat = Some(*heartbeat);
         if heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
@@ -143,17 +153,21 @@ impl Cell {
 
     /// Counters that the cell reports; the first ones since a start are what later ones are compared to.
     pub(super) fn report(&mut self, heard: Heard) {
-        let first = self.heard.map_or(heard, |(first, _)| first);
+        let (first, _) = *self.heard.get_or_insert_with(|| {
+            self.told = 0;
+            (heard, heard)
+        });
         self.heard = Some((first, heard));
     }
 
     /// Whether it can be expected to answer: configured, awake, and not halted.
     #[must_use]
     pub fn is_ready(&self) -> bool {
-        !self.dead && self.heartbeat.is_some_and(|heartbeat| {
-            let state = heartbeat.state;
-            state.has(State::CONFIGURED) && !state.has(State::CLAIMING) && !state.has(State::HALTED)
-        })
+        !self.dead
+            && self.heartbeat.is_some_and(|heartbeat| {
+                let state = heartbeat.state;
+                state.has(State::CONFIGURED) && !state.has(State::CLAIMING) && !state.has(State::HALTED)
+            })
     }
 
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
@@ -167,6 +181,7 @@ impl Cell {
         if self.due & oldest != 0 {
             self.miss(1);
         }
+        self.told += 1;
         let due = in_contact && self.is_ready();
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
         self.replies.due += u64::from(due);
@@ -234,6 +249,17 @@ impl Cell {
         self.expected.iter().flatten().find(|expected| expected.number == number)
     }
 
+    /// Joints that the cell itself says it skipped because they were old, and joints that it was sent and
+    /// does not say it heard; of a cell that has reported.
+    #[must_use]
+    pub fn unanswered(&self) -> Option<(u64, u64)> {
+        let (first, last) = self.heard?;
+        let since = |count: fn(&Heard) -> u16| u64::from(count(&last).wrapping_sub(count(&first)));
+        let skipped = since(|heard| heard.joints_late);
+        let heard = since(|heard| heard.joints) + since(|heard| heard.joints_repeated) + skipped;
+        Some((skipped, self.told.saturating_sub(heard)))
+    }
+
     /// Nothing more will come: what is still due is missing.
     pub(super) fn settle(&mut self) {
         self.miss(self.due.count_ones());
@@ -267,6 +293,11 @@ impl Cell {
             (Some(_), _, _) => Status::Active,
         }
     }
+}
+
+/// Whether a heartbeat is the first word of a cell that has just started.
+const fn is_first(heartbeat: &Heartbeat) -> bool {
+    heartbeat.sent == 0 && heartbeat.state.has(State::CLAIMING)
 }
 
 /// A sum of words of Q3.12 in Nm.

@@ -15,11 +15,11 @@ mod counters;
 mod felt;
 mod ledger;
 
-use core::time::Duration;
+use std::collections::VecDeque;
 
 use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q1_14;
+use protocol::fixed::{Q, Q1_14};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
@@ -59,6 +59,37 @@ pub struct Snapshot {
     pub felt: Vec<SkinSensors>,
 }
 
+impl Snapshot {
+    /// Takes over another one without allocating; what cells feel only if `felt`.
+    pub fn take(&mut self, other: &Self, felt: bool) {
+        let Self { torque, contributing, age, stale, dead, halts, resumes, rivals, felt: skins } = self;
+        *torque = other.torque;
+        (*contributing, *age, *stale, *dead) = (other.contributing, other.age, other.stale, other.dead);
+        (*halts, *resumes, *rivals) = (other.halts, other.resumes, other.rivals);
+        if felt {
+            skins.clone_from(&other.felt);
+        }
+    }
+}
+
+/// Something that people should know at once.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Notice {
+    /// A cell has fallen silent.
+    Dead(CellId),
+    /// A cell that was thought dead speaks again.
+    Back(CellId),
+    /// A cell started anew: nothing touches it until it is told so again.
+    Restarted(CellId),
+    /// A cell heard another one under its number.
+    Duplicate(CellId),
+    /// Another gateway speaks on this bus.
+    Rival,
+}
+
+/// The positions in rad that the words of a broadcast were rounded from.
+pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; WORDS]> + 'a;
+
 /// The broadcast that cells are answering.
 #[derive(Clone, Copy, Debug)]
 struct Broadcast {
@@ -91,6 +122,7 @@ pub struct Table {
     counters: Counters,
     accuracy: Accuracy,
     last_reply: Histogram<u64>,
+    notices: VecDeque<Notice>,
 }
 
 impl Table {
@@ -132,6 +164,7 @@ impl Table {
             counters: Counters::default(),
             accuracy: Accuracy::default(),
             last_reply: Histogram::new(3).expect("three digits are a valid precision"),
+            notices: VecDeque::new(),
         }
     }
 
@@ -170,34 +203,32 @@ impl Table {
         &self.last_reply
     }
 
-    /// Takes a frame that stood on the bus at `at`; `own` if this gateway sent it. For joints of its own
-    /// `q` are the positions in rad that were rounded to words, if known. Returns whether the snapshot
-    /// may have changed.
-    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, q: Option<[f64; WORDS]>) -> bool {
+    /// What people should know, oldest first, each once.
+    pub fn notices(&mut self) -> impl Iterator<Item = Notice> {
+        self.notices.drain(..)
+    }
+
+    /// Takes a frame that stood on the bus at `at`; `own` if this gateway sent it. `positions` is asked for
+    /// the positions in rad that an own broadcast's words were rounded from, if they are known.
+    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
         let Ok(id) = packet::data_id(frame) else {
             self.counters.count(if frame.is_error() { Event::ErrorFrame } else { Event::Foreign });
-            return false;
+            return;
         };
         let packet = match self.packet(at, id, frame) {
             Ok(Some(packet)) => packet,
-            Ok(None) => return false,
+            Ok(None) => return,
             Err(event) => {
                 self.counters.frame(id.kind, own);
-                self.reject(id, own, event);
-                return false;
+                return self.reject(id, own, event);
             }
         };
         self.counters.frame(id.kind, own);
-        let Ok(message) = Message::decode(&packet) else {
-            self.reject(id, own, Event::Meaning);
-            return false;
-        };
-        if own {
-            self.hear_own(at, &message, q);
-        } else {
-            self.hear(at, id, &message);
+        match Message::decode(&packet) {
+            Err(_) => self.reject(id, own, Event::Meaning),
+            Ok(message) if own => self.hear_own(at, &message, positions),
+            Ok(message) => self.hear(at, id, &message),
         }
-        true
     }
 
     /// The packet that a frame is or completes; `None` for half of one.
@@ -232,9 +263,10 @@ impl Table {
     /// The cell that frames of this identifier come from.
     fn sender(&mut self, id: Id) -> Option<&mut Cell> {
         match (id.kind, Node::from_byte(id.node)) {
-            (Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured, Node::Cell(cell)) => {
-                self.cell_mut(cell)
-            }
+            (
+                Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured,
+                Node::Cell(cell),
+            ) => self.cell_mut(cell),
             _ => None,
         }
     }
@@ -245,9 +277,9 @@ impl Table {
     }
 
     /// A frame of this gateway's, as it stood on the bus.
-    fn hear_own(&mut self, at: Micros, message: &Message, q: Option<[f64; WORDS]>) {
+    fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
         match *message {
-            Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, q),
+            Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, positions(epoch)),
             Message::Stimulus { to, from, page } => self.expect_feeling(to, from, page),
             Message::Halt => self.each_cell(Cell::let_go),
             Message::Resume
@@ -269,6 +301,7 @@ impl Table {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
                 self.counters.count(Event::Rival);
                 self.snapshot.rivals += 1;
+                self.notices.push_back(Notice::Rival);
                 return;
             }
             Message::Halt => {
@@ -293,10 +326,14 @@ impl Table {
             return;
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let revived = cell.hear(at);
-        self.snapshot.dead -= u32::from(revived);
+        if cell.hear(at) {
+            self.snapshot.dead -= 1;
+            self.notices.push_back(Notice::Back(cell.node));
+        }
         match *message {
-            Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => self.take_heartbeat(place, &heartbeat),
+            Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                self.take_heartbeat(place, &heartbeat)
+            }
             Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refused = Some(refused),
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.felt.measured(skin),
@@ -313,6 +350,10 @@ impl Table {
         let Some(cell) = self.cells.get_mut(place) else { return };
         if heartbeat.state.has(State::DUPLICATE) {
             self.counters.count(Event::Duplicate);
+            self.notices.push_back(Notice::Duplicate(cell.node));
+        }
+        if cell.has_restarted(heartbeat) {
+            self.notices.push_back(Notice::Restarted(cell.node));
         }
         let released = cell.take_heartbeat(heartbeat);
         self.apply(released);
@@ -357,12 +398,15 @@ impl Table {
         let number = self.broadcast.map_or(0, |before| before.number + 1);
         self.close_epoch();
         let frames = self.comparing.then(|| self.central.frames(&joints.positions));
-        let exact = frames.map(|_| self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians))));
+        let exact = frames.map(|_| {
+            self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians)))
+        });
         let (mut due, mut stale, mut age) = (0, 0, 0);
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let f_z = cell.latch(epoch).map(|skin| (self.central.force(place, &skin), skin));
-            let (change, missed) = cell.open_epoch(number, f_z.is_some_and(|(force, _)| force > 0.0), &self.safety);
+            let (change, missed) =
+                cell.open_epoch(number, f_z.is_some_and(|(force, _)| force > 0.0), &self.safety);
             due += u32::from(cell.is_due());
             stale += u32::from(missed > 0);
             age = age.max(missed);
@@ -399,6 +443,7 @@ impl Table {
             let Some(cell) = self.cells.get_mut(place) else { break };
             if cell.falls_silent(now) {
                 self.snapshot.dead += 1;
+                self.notices.push_back(Notice::Dead(cell.node));
                 let change = cell.let_go();
                 self.apply(change);
             }
@@ -432,17 +477,13 @@ impl Table {
 
     /// Adds what a cell's contribution changed by to the running sum.
     fn apply(&mut self, change: cell::Change) {
-        for ((sum, torque), difference) in self.sum.iter_mut().zip(&mut self.snapshot.torque).zip(change.torque) {
+        for ((sum, torque), difference) in
+            self.sum.iter_mut().zip(&mut self.snapshot.torque).zip(change.torque)
+        {
             *sum += i64::from(difference);
             *torque = cell::to_nm(*sum);
         }
         self.snapshot.contributing = self.snapshot.contributing.saturating_add_signed(change.contributing);
-    }
-
-    /// The wall's time of the last frame heard from the cells that are not dead; what a start waits for.
-    #[must_use]
-    pub fn ready(&self) -> usize {
-        self.cells.iter().filter(|cell| cell.is_ready()).count()
     }
 
     /// The cells' statuses now.
@@ -452,12 +493,7 @@ impl Table {
     }
 }
 
-fn i32_of<const F: u32>(word: protocol::fixed::Q<F>) -> i32 {
+/// A word as a whole number of steps.
+fn i32_of<const F: u32>(word: Q<F>) -> i32 {
     i32::from(word.to_bits())
-}
-
-/// A histogram's value as a length of time; it counts in µs.
-#[must_use]
-pub fn micros(value: u64) -> Duration {
-    Duration::from_micros(value)
 }

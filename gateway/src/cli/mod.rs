@@ -1,0 +1,57 @@
+//! The commands. Each is a thin layer over the library; errors are one line, exit codes are 0 (done),
+//! 1 (the run failed) and 2 (wrong use or configuration).
+
+mod print;
+mod run;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Bridges a robot skin's bus to a control loop.
+#[derive(Debug, Parser)]
+#[command(version, after_help = "Example:\n  gateway demo")]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(run::Demo),
+    Run(run::Run),
+}
+
+/// An error for people, and the exit code that goes with it.
+#[derive(Debug)]
+pub(crate) struct Failure {
+    text: String,
+    code: u8,
+}
+
+impl Failure {
+    /// Wrong use or configuration.
+    pub(crate) fn usage(text: impl core::fmt::Display) -> Self {
+        Self { text: text.to_string(), code: 2 }
+    }
+
+    /// Something failed.
+    pub(crate) fn run(text: impl core::fmt::Display) -> Self {
+        Self { text: text.to_string(), code: 1 }
+    }
+}
+
+/// Reads the command line and does it.
+pub(crate) fn main() -> ExitCode {
+    let done = match Arguments::parse().command {
+        Command::Demo(command) => command.run(),
+        Command::Run(command) => command.run(),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure { text, code }) => {
+            eprintln!("gateway: {text}");
+            ExitCode::from(code)
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! The table at the end of a run.
+
+use std::fmt::Display;
+
+use comfy_table::{ContentArrangement, Table, presets};
+use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
+
+/// The paper's mean absolute error of single torques, in Nm.
+const PAPER_SINGLE_NM: f64 = 0.0054;
+
+/// Prints the whole run on standard output.
+#[expect(clippy::print_stdout, reason = "this is the command's output")]
+pub(crate) fn summary(summary: &Summary) {
+    println!("{}", table(summary));
+}
+
+/// What is printed: a name, a value, and what it is to be compared with.
+struct Rows(Table);
+
+impl Rows {
+    fn section(&mut self, name: impl Display) {
+        self.0.add_row([name.to_string(), String::new(), String::new()]);
+    }
+
+    fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+        self.0.add_row([format!("  {name}"), value.to_string(), beside.to_string()]);
+    }
+}
+
+fn table(summary: &Summary) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    let ended = if summary.interrupted { "interrupted" } else { "done" };
+    let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
+    table.set_header([summary.skin.clone(), cells, String::new()]);
+    let mut rows = Rows(table);
+    accuracy(&mut rows, summary);
+    control(&mut rows, summary);
+    for bus in &summary.buses {
+        replies(&mut rows, bus);
+        frames(&mut rows, bus);
+    }
+    costs(&mut rows, summary);
+    rows.0
+}
+
+fn accuracy(rows: &mut Rows, summary: &Summary) {
+    let accuracy = &summary.accuracy;
+    if accuracy.single.mean_nm.is_none() {
+        return;
+    }
+    let paper = format!("paper {PAPER_SINGLE_NM} Nm");
+    rows.section("distributed against central torque, mean (greatest) absolute error");
+    rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
+    rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
+    rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
+    if accuracy.saturated > 0 {
+        rows.row("saturated words, left out", accuracy.saturated, "above 8 Nm");
+    }
+}
+
+fn errors(errors: &ErrorsSummary) -> String {
+    errors.mean_nm.map_or_else(
+        || "nothing compared".to_owned(),
+        |mean| format!("{mean:.2e} ({:.1e}) Nm of {}", errors.max_nm, errors.count),
+    )
+}
+
+fn control(rows: &mut Rows, summary: &Summary) {
+    let control = &summary.control;
+    rows.section("control loop, µs: median / 90 % / 99 % / greatest");
+    rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
+    if control.central_us.count > 0 {
+        rows.row("tick, comparing", quantiles(&control.took_us), "");
+        rows.row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
+    }
+    if control.took_distributed_us.count > 0 {
+        rows.row("tick, distributed", quantiles(&control.took_distributed_us), "");
+    }
+    rows.row("ticks", control.ticks, format!("{} skipped", control.ticks_skipped));
+    rows.row("broadcasts", control.broadcasts, format!("{} skipped", control.broadcasts_skipped));
+    for (reason, count) in &control.bad_cycles {
+        rows.row("bad cycles", count, reason);
+    }
+    if let Some(why) = &summary.halted {
+        rows.row("halted", why, "`gateway ack` leaves the halted state");
+    }
+    let granted = |granted| if granted { "granted" } else { "refused" };
+    let locked = granted(control.memory_locked);
+    rows.row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+}
+
+fn replies(rows: &mut Rows, bus: &BusSummary) {
+    let replies = &bus.replies;
+    let statuses: Vec<_> = bus.cells.iter().map(|(status, count)| format!("{count} {status}")).collect();
+    rows.section(format!("{} ({}): {}", bus.name, bus.kind, statuses.join(", ")));
+    if !bus.silent_cells.is_empty() {
+        let names: Vec<_> = bus.silent_cells.iter().map(u8::to_string).collect();
+        rows.row("silent cells", names.join(" "), "");
+    }
+    let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
+    rows.row("replies due", replies.due, complete);
+    rows.row("  in time", replies.in_time, format!("{} late", replies.late));
+    let missing = replies.due - replies.in_time - replies.late;
+    let why = format!(
+        "{} skipped, {} not heard, {} lost, {} in doubt, {} unknown",
+        replies.skipped, replies.not_heard, replies.lost, replies.in_doubt, replies.unknown
+    );
+    rows.row("  missing", missing, why);
+    rows.row("broadcast to last reply, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+}
+
+fn frames(rows: &mut Rows, bus: &BusSummary) {
+    let up = &bus.uplink;
+    let lost = up.dropped + up.unknown;
+    rows.row("packets sent by cells", up.sent, "by their own count");
+    rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
+    rows.row("  lost", lost, format!("{} dropped by the bus, {} unknown", up.dropped, up.unknown));
+    for (name, count) in [("surplus", up.surplus), ("after the last heartbeat", up.unsettled)] {
+        if count > 0 {
+            rows.row(format!("  {name}"), count, "");
+        }
+    }
+    if up.restarts > 0 {
+        rows.row("  restarts of cells", up.restarts, "what they sent last is in doubt");
+    }
+    let list = |kinds: &std::collections::BTreeMap<&str, u64>| {
+        kinds.iter().map(|(kind, count)| format!("{count} {kind}")).collect::<Vec<_>>().join(", ")
+    };
+    rows.row("received", list(&bus.received), "");
+    rows.row("sent", list(&bus.sent), "");
+    if !bus.events.is_empty() {
+        rows.row("odd", list(&bus.events), "");
+    }
+}
+
+fn costs(rows: &mut Rows, summary: &Summary) {
+    let processor = &summary.processor;
+    rows.section("cost");
+    rows.row(
+        "processor, cores",
+        format!("{:.3}", processor.gateway + processor.cells + processor.buses),
+        format!(
+            "gateway {:.3}, cells {:.3}, buses {:.3}",
+            processor.gateway, processor.cells, processor.buses
+        ),
+    );
+    if let Some(kib) = summary.cell_private_kib {
+        rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
+    }
+    rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
+    if let Some(recording) = &summary.recording {
+        rows.row(
+            "recording",
+            &recording.path,
+            format!("{} frames, {} lost", recording.frames, recording.lost),
+        );
+    }
+}
+
+fn quantiles(quantiles: &Quantiles) -> String {
+    let Quantiles { p50, p90, p99, max, .. } = quantiles;
+    format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
+}

@@ -1,0 +1,175 @@
+//! `gateway run` and `gateway demo`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use gateway::run::{self, Options, RunError};
+use gateway::scenario::Scenario;
+use gateway::summary::Summary;
+use protocol::bus::{BusKind, Choice};
+use protocol::skin::Skin;
+use protocol::time::Span;
+
+use super::{Failure, print};
+
+/// The skin and the scenario of the demonstration.
+const SKIN: &str = include_str!("../../examples/ur5-253.toml");
+const SCENARIO: &str = include_str!("../../examples/demo.toml");
+
+/// How long a run without a scenario takes, unless it is told.
+const IDLE: Span = Span::from_millis(10_000);
+
+/// What both commands can be told.
+#[derive(Args, Debug)]
+struct Common {
+    /// End after so many seconds; else after the scenario's duration
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Write the figures of the end as JSON; docs/summary.md explains its keys
+    #[arg(long, value_name = "FILE")]
+    summary: Option<PathBuf>,
+    /// Put up to N cells into one process
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
+    cells_per_process: u8,
+    /// The program of the cells, when it is not beside this one
+    #[arg(long, value_name = "PATH")]
+    cell_node: Option<PathBuf>,
+    /// The program that serves embedded buses, when it is not beside this one
+    #[arg(long, value_name = "PATH")]
+    vcan_setup: Option<PathBuf>,
+    /// Show no progress, only the table at the end
+    #[arg(long, short)]
+    quiet: bool,
+}
+
+/// Show everything at once: 253 cells on an arm, touched here and there
+///
+/// Needs nothing: the cells are processes on an embedded bus, private to you. Frames are recorded as
+/// candump text; the end's table says where.
+#[derive(Args, Debug)]
+#[command(after_help = "Example:\n  gateway demo --duration 5")]
+pub(crate) struct Demo {
+    #[command(flatten)]
+    common: Common,
+    /// Where the frames are recorded
+    #[arg(long, value_name = "FILE", default_value = "skinbus-demo.log")]
+    candump: PathBuf,
+    /// embedded, socketcan, or auto for SocketCAN where the kernel has it
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Only(BusKind::Embedded))]
+    bus_kind: Choice,
+}
+
+/// Run a bench: cells, buses, the control loop
+///
+/// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
+/// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
+/// table. Exit code 0: it came to its end; 1: it did not; 2: wrong use or configuration.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
+  gateway run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
+pub(crate) struct Run {
+    /// The skin's description
+    skin: PathBuf,
+    /// What happens: touches, motion, faults; else nothing touches the skin
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
+    #[command(flatten)]
+    common: Common,
+    /// Write all frames as candump text
+    #[arg(long, value_name = "FILE")]
+    candump: Option<PathBuf>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    bus_kind: Choice,
+    /// Start no cells: they are on the bus already, or are real
+    #[arg(long)]
+    no_spawn: bool,
+    /// Let cells keep their parameters in files of this directory
+    #[arg(long, value_name = "DIR")]
+    flash: Option<PathBuf>,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if seconds > 0.0 && seconds <= 1e7 => Ok(seconds),
+        _ => Err("a number of seconds above 0, up to 1e7".to_owned()),
+    }
+}
+
+impl Demo {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        // The cells read the skin from a file.
+        let directory =
+            tempfile::tempdir().map_err(|error| Failure::run(format!("temporary directory: {error}")))?;
+        let skin_file = directory.path().join("ur5-253.toml");
+        std::fs::write(&skin_file, SKIN)
+            .map_err(|error| Failure::run(format!("{}: {error}", skin_file.display())))?;
+        let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
+        let scenario =
+            Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
+        let mut options = self.common.options(skin_file, skin, scenario);
+        options.kind = self.bus_kind;
+        options.candump = Some(self.candump);
+        bench(&options, self.common.summary.as_deref())
+    }
+}
+
+impl Run {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
+        let scenario = match &self.scenario {
+            Some(path) => Scenario::read(path, &skin).map_err(Failure::usage)?,
+            None => Scenario::idle(IDLE),
+        };
+        let mut options = self.common.options(self.skin, skin, scenario);
+        options.kind = self.bus_kind;
+        options.candump = self.candump;
+        options.spawn = !self.no_spawn;
+        options.flash = self.flash;
+        bench(&options, self.common.summary.as_deref())
+    }
+}
+
+impl Common {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
+    fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> Options {
+        if let Some(seconds) = self.duration {
+            scenario.duration = Span((seconds * 1e6) as u64);
+        }
+        Options {
+            skin_file,
+            skin,
+            scenario,
+            kind: Choice::Auto,
+            spawn: true,
+            cells_per_process: self.cells_per_process.into(),
+            flash: None,
+            cell_node: self.cell_node.clone(),
+            vcan_setup: self.vcan_setup.clone(),
+            candump: None,
+            quiet: self.quiet,
+        }
+    }
+}
+
+fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
+    let failure = |error: RunError| Failure { code: error.exit_code(), text: error.to_string() };
+    let summary = run::run(options).map_err(failure)?;
+    print::summary(&summary);
+    if let Some(path) = summary_file {
+        write_json(path, &summary)?;
+    }
+    Ok(())
+}
+
+/// A whole file, or none under this name.
+fn write_json(path: &Path, summary: &Summary) -> Result<(), Failure> {
+    let failure = |error: &dyn core::fmt::Display| Failure::run(format!("{}: {error}", path.display()));
+    let text = serde_json::to_string_pretty(summary).map_err(|error| failure(&error))?;
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    std::fs::write(&part, text + "\n")
+        .and_then(|()| std::fs::rename(&part, path))
+        .map_err(|error| failure(&error))
+}

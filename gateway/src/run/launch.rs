@@ -1,0 +1,310 @@
+//! The processes of a bench: embedded buses and cells. All of them end with the gateway, however it
+//! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use protocol::bus::Choice;
+use protocol::skin::Skin;
+use rustix::process::{Pid, Signal, kill_process};
+use thiserror::Error;
+
+use crate::scenario::ProcessAction;
+
+/// How long processes may take to end when asked to.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Why a process could not be started.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum LaunchError {
+    /// There is no such program.
+    #[error(
+        "{name} is not at {path}: build it with `cargo build --release`, or say where it is with --{name}"
+    )]
+    Missing {
+        /// The program.
+        name: &'static str,
+        /// Where it should be.
+        path: PathBuf,
+    },
+    /// It is there and does not start.
+    #[error("{path} does not start: {source}")]
+    Start {
+        /// The program.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// An embedded bus is not served.
+    #[error("{path} does not serve {bus}; see its own message above")]
+    Serve {
+        /// The program.
+        path: PathBuf,
+        /// The bus.
+        bus: String,
+    },
+}
+
+/// Where a program of this project is: named by the user, or beside this one.
+///
+/// # Errors
+/// When it is not there.
+pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, LaunchError> {
+    let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
+    let path = given.map(Path::to_owned).or_else(beside).unwrap_or_else(|| PathBuf::from(name));
+    if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
+}
+
+/// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is
+/// killed.
+#[derive(Debug)]
+pub struct ServedBus {
+    child: Child,
+}
+
+impl ServedBus {
+    /// Serves a bus and waits until clients can connect.
+    ///
+    /// # Errors
+    /// When the program does not start or does not say that it serves.
+    pub fn start(program: &Path, bus: &str) -> Result<Self, LaunchError> {
+        let mut command = Command::new(program);
+        command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let start = |source| LaunchError::Start { path: program.to_owned(), source };
+        let mut served = Self { child: command.spawn().map_err(start)? };
+        let mut line = String::new();
+        if let Some(out) = served.child.stdout.take() {
+            BufReader::new(out).read_line(&mut line).map_err(start)?;
+        }
+        if line.starts_with("serving ") {
+            Ok(served)
+        } else {
+            Err(LaunchError::Serve { path: program.to_owned(), bus: bus.to_owned() })
+        }
+    }
+
+    /// Its process.
+    #[must_use]
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+}
+
+impl Drop for ServedBus {
+    fn drop(&mut self) {
+        // Its standard input ends, and so does it.
+        drop(self.child.stdin.take());
+        end(&mut [&mut self.child]);
+    }
+}
+
+/// How a process is told which cells it is.
+#[derive(Clone, Debug)]
+struct Start {
+    program: PathBuf,
+    arguments: Vec<String>,
+}
+
+/// The process of one cell or of several.
+#[derive(Debug)]
+struct Process {
+    start: Start,
+    bus: usize,
+    nodes: (u8, u8),
+    child: Child,
+    ended: bool,
+}
+
+/// A process that ended by itself or was killed.
+#[derive(Clone, Copy, Debug)]
+pub struct Ended {
+    /// Its bus.
+    pub bus: usize,
+    /// The first and last of its cells.
+    pub nodes: (u8, u8),
+    /// How it ended.
+    pub status: ExitStatus,
+}
+
+/// All cells' processes.
+#[derive(Debug, Default)]
+pub struct Processes {
+    all: Vec<Process>,
+}
+
+/// How cells are started.
+#[derive(Clone, Copy, Debug)]
+pub struct Plan<'a> {
+    /// The program.
+    pub program: &'a Path,
+    /// The skin's file.
+    pub skin_file: &'a Path,
+    /// The skin.
+    pub skin: &'a Skin,
+    /// Which kind of bus.
+    pub kind: Choice,
+    /// At most so many cells in a process.
+    pub per_process: usize,
+    /// Where cells keep their parameters, if they do.
+    pub flash: Option<&'a Path>,
+}
+
+impl Processes {
+    /// Starts all cells of a skin. Call it from the thread that lives as long as the cells shall.
+    ///
+    /// # Errors
+    /// When a process does not start; those before it are ended again.
+    pub fn start(plan: &Plan<'_>) -> Result<Self, LaunchError> {
+        let mut processes = Self::default();
+        for (bus, described) in plan.skin.buses.iter().enumerate() {
+            let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+            nodes.sort_unstable();
+            for nodes in groups(&nodes, plan.per_process) {
+                let start = plan.of(&described.name, nodes);
+                let child = start.spawn()?;
+                processes.all.push(Process { start, bus, nodes, child, ended: false });
+            }
+        }
+        Ok(processes)
+    }
+
+    /// The processes' numbers.
+    pub fn pids(&self) -> impl Iterator<Item = u32> {
+        self.all.iter().filter(|process| !process.ended).map(|process| process.child.id())
+    }
+
+    /// Processes that have ended since the last call.
+    pub fn ended(&mut self) -> Vec<Ended> {
+        let mut ended = Vec::new();
+        for process in self.all.iter_mut().filter(|process| !process.ended) {
+            if let Ok(Some(status)) = process.child.try_wait() {
+                process.ended = true;
+                ended.push(Ended { bus: process.bus, nodes: process.nodes, status });
+            }
+        }
+        ended
+    }
+
+    /// Does something to the process of a cell; returns whether there is one.
+    ///
+    /// # Errors
+    /// When a process is to be started again and does not start.
+    pub fn act(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
+        let holds =
+            |process: &&mut Process| process.bus == bus && process.nodes.0 <= node && node <= process.nodes.1;
+        let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
+        match action {
+            ProcessAction::Kill => process.signal(Signal::KILL),
+            ProcessAction::Stop => process.signal(Signal::STOP),
+            ProcessAction::Continue => process.signal(Signal::CONT),
+            ProcessAction::Restart => {
+                process.signal(Signal::KILL);
+                let _ = process.child.wait();
+                process.child = process.start.spawn()?;
+                process.ended = false;
+            }
+        }
+        Ok(true)
+    }
+}
+
+impl Process {
+    fn signal(&self, signal: Signal) {
+        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| !self.ended) {
+            let _ = kill_process(pid, signal);
+        }
+    }
+}
+
+impl Drop for Processes {
+    fn drop(&mut self) {
+        for process in &self.all {
+            // A stopped process would not hear the other signal.
+            process.signal(Signal::CONT);
+            process.signal(Signal::TERM);
+        }
+        let mut children: Vec<_> =
+            self.all.iter_mut().filter(|process| !process.ended).map(|process| &mut process.child).collect();
+        end(&mut children);
+    }
+}
+
+impl Plan<'_> {
+    fn of(&self, bus: &str, (first, last): (u8, u8)) -> Start {
+        let mut arguments = vec!["--bus".to_owned(), bus.to_owned()];
+        if first == last {
+            arguments.extend(["--node".to_owned(), first.to_string()]);
+        } else {
+            arguments.extend(["--nodes".to_owned(), format!("{first}-{last}")]);
+        }
+        arguments.extend(["--skin".to_owned(), self.skin_file.display().to_string()]);
+        arguments.extend(["--bus-kind".to_owned(), self.kind.to_string()]);
+        arguments.extend(["--with-parent".to_owned(), std::process::id().to_string()]);
+        if let Some(flash) = self.flash {
+            arguments.extend(["--flash".to_owned(), flash.display().to_string()]);
+        }
+        Start { program: self.program.to_owned(), arguments }
+    }
+}
+
+impl Start {
+    fn spawn(&self) -> Result<Child, LaunchError> {
+        let mut command = Command::new(&self.program);
+        command.args(&self.arguments).stdin(Stdio::null()).stdout(Stdio::null());
+        command.spawn().map_err(|source| LaunchError::Start { path: self.program.clone(), source })
+    }
+}
+
+/// Runs of consecutive numbers, at most `size` long.
+fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
+    let mut groups: Vec<(u8, u8)> = Vec::new();
+    for &node in nodes {
+        match groups.last_mut() {
+            Some((first, last)) if *last + 1 == node && usize::from(node - *first) < size => *last = node,
+            _ => groups.push((node, node)),
+        }
+    }
+    groups
+}
+
+/// Waits for processes that were asked to end, and kills those that do not.
+fn end(children: &mut [&mut Child]) {
+    let give_up = Instant::now() + PATIENCE;
+    loop {
+        let running = children
+            .iter_mut()
+            .filter_map(|child| child.try_wait().is_ok_and(|status| status.is_none()).then_some(()));
+        if running.count() == 0 {
+            return;
+        }
+        if Instant::now() > give_up {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    for child in children {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_are_grouped_in_runs_of_consecutive_numbers() {
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 1).len(), 6);
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 2), [(1, 2), (3, 3), (5, 6), (254, 254)]);
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 64), [(1, 3), (5, 6), (254, 254)]);
+    }
+
+    #[test]
+    fn a_missing_program_is_named_with_the_remedy() {
+        let error = program("cell-node", Some(Path::new("/nowhere/cell-node"))).unwrap_err().to_string();
+        assert!(error.starts_with("cell-node is not at /nowhere/cell-node: build it with"), "{error}");
+    }
+}

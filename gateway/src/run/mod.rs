@@ -1,0 +1,113 @@
+//! A bench, live: buses, cells, receivers, the control loop, and the thread that watches over them.
+//!
+//! ```text
+//!   main thread ── starts ──> cells, embedded buses (processes)
+//!       │  ▲
+//!       │  └── news, view, records, captured frames ──┐
+//!       │                                             │
+//!       ├─ stimuli ─> bus ─> receiver (one a bus) ────┤
+//!       │              ▲         └─ snapshot ─> control loop (SCHED_FIFO)
+//!       │              └──────────── joints ────────────┘
+//!       └─ progress line, log file, summary
+//! ```
+
+#[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
+mod io;
+pub mod launch;
+mod log;
+mod progress;
+pub mod realtime;
+pub mod receiver;
+mod start;
+pub mod turn;
+mod usage;
+mod watch;
+
+use std::path::PathBuf;
+
+use protocol::bus::{BusError, Choice};
+use protocol::document::DocumentError;
+use protocol::skin::Skin;
+use thiserror::Error;
+
+use crate::external::SocketError;
+use crate::scenario::Scenario;
+use crate::summary::Summary;
+
+/// What a run needs to know.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The skin's file, which cells read too.
+    pub skin_file: PathBuf,
+    /// The skin.
+    pub skin: Skin,
+    /// What happens.
+    pub scenario: Scenario,
+    /// Which kind of bus.
+    pub kind: Choice,
+    /// Whether cells are started; else they are on the bus already.
+    pub spawn: bool,
+    /// At most so many cells in a process.
+    pub cells_per_process: usize,
+    /// Where cells keep their parameters, if they do.
+    pub flash: Option<PathBuf>,
+    /// The cells' program, when it is not beside this one.
+    pub cell_node: Option<PathBuf>,
+    /// The embedded bus' program, when it is not beside this one.
+    pub vcan_setup: Option<PathBuf>,
+    /// Where frames are written as candump text, if they are.
+    pub candump: Option<PathBuf>,
+    /// Whether progress is shown.
+    pub quiet: bool,
+}
+
+/// Why a run did not come to its end.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// A file says something that cannot be.
+    #[error(transparent)]
+    Document(#[from] DocumentError),
+    /// A bus does not open.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A program does not start.
+    #[error(transparent)]
+    Launch(#[from] launch::LaunchError),
+    /// The socket of an external controller cannot be had.
+    #[error(transparent)]
+    External(#[from] SocketError),
+    /// What was asked for cannot be done.
+    #[error("{0}")]
+    Usage(String),
+    /// It began and failed.
+    #[error("{0}")]
+    Failed(String),
+    /// A file cannot be written.
+    #[error("{path}: {source}")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+impl RunError {
+    /// 2 for wrong use or configuration, 1 for a run that failed.
+    #[must_use]
+    pub const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Document(_) | Self::Bus(_) | Self::Launch(_) | Self::External(_) | Self::Usage(_) => 2,
+            Self::Failed(_) | Self::Write { .. } => 1,
+        }
+    }
+}
+
+/// Runs a bench to its end, or until SIGINT or SIGTERM.
+///
+/// # Errors
+/// When it cannot begin, or does not come to its end; cells and buses that were started are ended again.
+pub fn run(options: &Options) -> Result<Summary, RunError> {
+    start::start(options)?.watch()
+}

@@ -1,0 +1,61 @@
+//! One line that says how a run goes: rewritten in place on a terminal, now and then elsewhere.
+
+use std::io::{IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+/// How often the line is renewed on a terminal, and elsewhere.
+const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
+
+/// The progress line, on standard error.
+#[derive(Debug)]
+pub(super) struct Progress {
+    terminal: bool,
+    quiet: bool,
+    due: Instant,
+    shown: bool,
+}
+
+impl Progress {
+    pub(super) fn new(quiet: bool) -> Self {
+        Self { terminal: std::io::stderr().is_terminal(), quiet, due: Instant::now(), shown: false }
+    }
+
+    /// Shows the line when its time has come.
+    pub(super) fn show(&mut self, line: impl FnOnce() -> String) {
+        let now = Instant::now();
+        if self.quiet || now < self.due {
+            return;
+        }
+        let [here, elsewhere] = PERIODS;
+        self.due = now + if self.terminal { here } else { elsewhere };
+        self.write(&line());
+    }
+
+    /// Writes something above the line.
+    pub(super) fn note(&mut self, text: &str) {
+        if self.quiet {
+            return;
+        }
+        self.clear();
+        eprintln!("{text}");
+    }
+
+    /// Takes the line away.
+    pub(super) fn clear(&mut self) {
+        if self.terminal && self.shown {
+            eprint!("\r\x1b[2K");
+            self.shown = false;
+        }
+    }
+
+    fn write(&mut self, line: &str) {
+        if self.terminal {
+            eprint!("\r\x1b[2K{line}");
+            // A terminal that is gone needs no progress.
+            let _ = std::io::stderr().flush();
+            self.shown = true;
+        } else {
+            eprintln!("{line}");
+        }
+    }
+}

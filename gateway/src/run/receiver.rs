@@ -1,0 +1,194 @@
+//! The thread that receives on one bus: it keeps the table, and leaves snapshots for the tick.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::bus::{Bus, Inbox};
+use protocol::can::Frame;
+use protocol::packet::{Epoch, WORDS};
+use protocol::time::Micros;
+
+use super::turn::Shared;
+use crate::table::{Notice, Snapshot, Table};
+
+/// Frames are left to gather for so long, so that one wake-up takes many.
+const GATHER: Duration = Duration::from_micros(300);
+/// How often time is let pass when nothing comes, and the view is renewed.
+const LOOK: Duration = Duration::from_millis(20);
+/// The pause while an interface is down.
+const DOWN: Duration = Duration::from_millis(50);
+
+/// A frame for whoever records.
+#[derive(Clone, Copy, Debug)]
+pub struct Captured {
+    /// The kernel's time stamp, ns since 1970.
+    pub at_nanos: u64,
+    /// The frame.
+    pub frame: Frame,
+}
+
+/// What a receiver tells the main thread at once.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum News {
+    /// Of a cell, or another gateway.
+    Notice(Notice),
+    /// The bus does not work for now.
+    Down(String),
+    /// It works again.
+    Up,
+    /// The bus is gone for good.
+    Lost(String),
+}
+
+/// The state of a bus' cells, renewed every [`LOOK`].
+#[derive(Clone, Debug, Default)]
+pub struct View {
+    /// For each cell, in the bus' order: its number, whether it can be expected to answer, and whether
+    /// its configuration is not the skin's.
+    pub cells: Vec<(u8, bool, bool)>,
+    /// Cells in contact.
+    pub active: usize,
+    /// Cells that reported their counters since somebody cleared this.
+    pub reports: usize,
+}
+
+/// One bus, as its receiver sees it.
+#[derive(Debug)]
+pub struct Receiver {
+    /// Where this bus stands among the skin's.
+    pub index: usize,
+    /// The bus.
+    pub bus: Arc<Bus>,
+    /// What is known of it.
+    pub table: Table,
+    /// Where snapshots go.
+    pub snapshots: triple_buffer::Input<Snapshot>,
+    /// Unrounded positions of the broadcasts.
+    pub positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+    /// Where frames go that are to be recorded, if they are.
+    pub captured: Option<rtrb::Producer<Captured>>,
+    /// What everyone looks at.
+    pub shared: Arc<Shared>,
+    /// Whether the bus works.
+    pub works: Arc<AtomicBool>,
+    /// What the main thread sees.
+    pub view: Arc<Mutex<View>>,
+    /// What it is told at once.
+    pub news: Sender<(usize, News)>,
+}
+
+/// What a receiver leaves at the end.
+#[derive(Debug)]
+pub struct Received {
+    /// All that is known of the bus.
+    pub table: Table,
+    /// Frames that the bus dropped because we did not take them in time.
+    pub dropped: u64,
+    /// Frames that did not fit into the recorder's queue.
+    pub unrecorded: u64,
+    /// Bytes that were no frame.
+    pub unreadable: u64,
+}
+
+impl Receiver {
+    /// Receives until someone says stop or the bus is gone.
+    #[must_use]
+    pub fn run(mut self) -> Received {
+        let mut inbox = Inbox::new();
+        let mut unrecorded = 0;
+        let mut looked = Instant::now();
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            let came = self
+                .bus
+                .wait(Some(LOOK))
+                .and_then(|ready| if ready { self.bus.receive(&mut inbox) } else { Ok(0) });
+            let count = match came {
+                Ok(count) => count,
+                Err(error) if error.may_pass() => {
+                    if self.works.swap(false, Ordering::Relaxed) {
+                        self.tell(News::Down(error.to_string()));
+                    }
+                    std::thread::sleep(DOWN);
+                    continue;
+                }
+                Err(error) => {
+                    self.works.store(false, Ordering::Relaxed);
+                    self.tell(News::Lost(error.to_string()));
+                    break;
+                }
+            };
+            if count > 0 && !self.works.swap(true, Ordering::Relaxed) {
+                self.tell(News::Up);
+            }
+            self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
+            if count > 0 {
+                for received in inbox.frames() {
+                    let at = Micros(received.at_nanos / 1_000);
+                    let queue = &mut self.positions;
+                    let mut positions = |epoch| positions_of(queue, epoch);
+                    self.table.handle_frame(at, received.own, &received.frame, &mut positions);
+                    let captured = Captured { at_nanos: received.at_nanos, frame: received.frame };
+                    if let Some(queue) = &mut self.captured
+                        && queue.push(captured).is_err()
+                    {
+                        unrecorded += 1;
+                    }
+                }
+            }
+            if count == 0 || looked.elapsed() >= LOOK {
+                looked = Instant::now();
+                self.look();
+            }
+            self.publish();
+            if count > 0 {
+                std::thread::sleep(GATHER);
+            }
+        }
+        self.table.finish();
+        let (dropped, unreadable) = (u64::from(inbox.dropped()), inbox.unreadable());
+        Received { table: self.table, dropped, unrecorded, unreadable }
+    }
+
+    fn publish(&mut self) {
+        let comparing = self.shared.comparing.load(Ordering::Relaxed);
+        self.snapshots.input_buffer_mut().take(self.table.snapshot(), comparing);
+        self.snapshots.publish();
+    }
+
+    /// Lets time pass, and shows the main thread how things are.
+    fn look(&mut self) {
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        self.table.handle_time(Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX)));
+        let notices: Vec<_> = self.table.notices().collect();
+        for notice in notices {
+            self.tell(News::Notice(notice));
+        }
+        let cells = self.table.cells().iter().map(|cell| {
+            let other = cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration);
+            (cell.node.get(), cell.is_ready(), other)
+        });
+        let cells = cells.collect();
+        let active = usize::try_from(self.table.snapshot().contributing).unwrap_or(usize::MAX);
+        let reports = self.table.cells().iter().filter(|cell| cell.refused.is_some()).count();
+        if let Ok(mut view) = self.view.lock() {
+            *view = View { cells, active, reports };
+        }
+    }
+
+    fn tell(&self, news: News) {
+        // Nobody listens any more when the run ends.
+        let _ = self.news.send((self.index, news));
+    }
+}
+
+/// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.
+fn positions_of(queue: &mut rtrb::Consumer<(Epoch, [f64; WORDS])>, epoch: Epoch) -> Option<[f64; WORDS]> {
+    while let Ok((of, q)) = queue.pop() {
+        if of == epoch {
+            return Some(q);
+        }
+    }
+    None
+}

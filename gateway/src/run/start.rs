@@ -1,0 +1,332 @@
+//! From a description to a bench whose cells are ready.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Receiver as Inlet};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use hdrhistogram::Histogram;
+use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Options as BusOptions};
+use protocol::can::Frame;
+use protocol::message::Message;
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Reply;
+
+use super::launch::{Plan, Processes, ServedBus, program};
+use super::log::Log;
+use super::receiver::{Captured, News, Received, Receiver, View};
+use super::turn::{Line, Shared, Timed};
+use super::{Options, RunError, realtime};
+use crate::scenario::FaultKind;
+use crate::table::{Notice, Table};
+
+/// Bytes asked for the gateway's socket: all cells may answer a report at once.
+const RECEIVE_BUFFER: usize = 8 << 20;
+/// How long the loop's own sends may wait for a bus.
+const SEND_PATIENCE: Duration = Duration::from_millis(1);
+/// Two gateways on one bus notice each other in this time.
+const LISTEN: Duration = Duration::from_millis(500);
+/// Cells that make no progress for so long are given up.
+const STARTING: Duration = Duration::from_secs(15);
+/// Cells that were there before are given so long to show up.
+const SHOWING: Duration = Duration::from_secs(2);
+/// Wake-ups of the idle machine that are measured, at the loop's period.
+const IDLE_WAKEUPS: u32 = 100;
+/// Records that wait for the main thread: more than a second of ticks.
+const RECORDS: usize = 1_024;
+/// Frames that wait for the main thread: more than a second of a full bus.
+const CAPTURED: usize = 65_536;
+
+/// One bus of a bench.
+#[derive(Debug)]
+pub(super) struct Lane {
+    pub(super) bus: Arc<Bus>,
+    pub(super) view: Arc<Mutex<View>>,
+    pub(super) captured: Option<rtrb::Consumer<Captured>>,
+    pub(super) receiver: Option<JoinHandle<Received>>,
+}
+
+/// A bench whose cells are ready and whose loop has not begun.
+#[derive(Debug)]
+pub(super) struct Bench<'a> {
+    pub(super) options: &'a Options,
+    pub(super) began: Instant,
+    pub(super) idle: Histogram<u64>,
+    pub(super) shared: Arc<Shared>,
+    pub(super) lanes: Vec<Lane>,
+    pub(super) lines: Vec<Line>,
+    pub(super) news: Inlet<(usize, News)>,
+    pub(super) signalled: Arc<AtomicBool>,
+    pub(super) log: Option<Log>,
+    // In this order they end: the cells before their buses.
+    pub(super) processes: Processes,
+    pub(super) served: Vec<ServedBus>,
+}
+
+/// Gets everything ready.
+pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
+    let began = Instant::now();
+    refuse(options)?;
+    let signalled = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&signalled))
+            .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
+    }
+    let idle = idle_lateness(options.skin.timing.tick_nanos());
+    let log = options.candump.as_deref().map(Log::create).transpose()?;
+    let mut served = Vec::new();
+    let mut buses = Vec::new();
+    for described in &options.skin.buses {
+        let bus = open(options, &described.name, &mut served)?;
+        if !options.quiet {
+            let kib = bus.receive_buffer() / 1_024;
+            eprintln!("{} is {}, with a receive buffer of {kib} KiB", described.name, bus.kind());
+        }
+        buses.push(Arc::new(bus));
+    }
+    let shared = Arc::new(Shared::default());
+    let (tell, news) = mpsc::channel();
+    let (mut lanes, mut lines) = (Vec::new(), Vec::new());
+    for (index, bus) in buses.into_iter().enumerate() {
+        let (lane, line) = listen(options, index, bus, &shared, tell.clone())?;
+        lanes.push(lane);
+        lines.push(line);
+    }
+    let processes = Processes::default();
+    let mut bench =
+        Bench { options, began, idle, shared, lanes, lines, news, signalled, log, processes, served };
+    if let Err(error) = bench.begin() {
+        bench.stop_receivers();
+        return Err(error);
+    }
+    Ok(bench)
+}
+
+/// What a description may say and this program cannot do.
+fn refuse(options: &Options) -> Result<(), RunError> {
+    for bus in &options.skin.buses {
+        if bus.reply != Reply::Torque {
+            let name = &bus.name;
+            return Err(RunError::Usage(format!(
+                "bus {name} has reply = \"sum\", which this version cannot run; \"torque\" can"
+            )));
+        }
+    }
+    if options.scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
+        return Err(RunError::Usage(
+            "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, \
+             restart, stuck and drift it can"
+                .to_owned(),
+        ));
+    }
+    Ok(())
+}
+
+/// Measured in a thread as punctual as the loop's.
+fn idle_lateness(period_ns: u64) -> Histogram<u64> {
+    let measure = move || {
+        realtime::prepare();
+        realtime::idle_lateness(period_ns, IDLE_WAKEUPS)
+    };
+    let empty = || Histogram::new(3).expect("three digits are a valid precision");
+    thread::spawn(measure).join().unwrap_or_else(|_| empty())
+}
+
+/// Opens a bus; an embedded one that nobody serves is served.
+fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bus, RunError> {
+    let wanted = BusOptions {
+        filters: vec![Filter::ALL],
+        own_frames: true,
+        error_mask: u32::MAX,
+        receive_buffer: RECEIVE_BUFFER,
+        send_patience: SEND_PATIENCE,
+        ..BusOptions::default()
+    };
+    match Bus::open(name, options.kind, &wanted) {
+        Err(BusError::NotServed { .. }) => {
+            let program = program("vcan-setup", options.vcan_setup.as_deref())?;
+            served.push(ServedBus::start(&program, name)?);
+            Ok(Bus::open(name, options.kind, &wanted)?)
+        }
+        opened => Ok(opened?),
+    }
+}
+
+/// Starts a bus' receiver.
+fn listen(
+    options: &Options,
+    index: usize,
+    bus: Arc<Bus>,
+    shared: &Arc<Shared>,
+    news: mpsc::Sender<(usize, News)>,
+) -> Result<(Lane, Line), RunError> {
+    let table = Table::new(&options.skin, index);
+    let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
+    let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
+    let (captured, frames) = match options.candump {
+        Some(_) => Some(rtrb::RingBuffer::new(CAPTURED)).unzip(),
+        None => (None, None),
+    };
+    let works = Arc::new(AtomicBool::new(true));
+    let view = Arc::new(Mutex::new(View::default()));
+    let format = options.skin.buses.get(index).map_or(protocol::can::Format::Fd, |bus| bus.format);
+    let line = Line { format, snapshot, positions, works: Arc::clone(&works) };
+    let receiver = Receiver {
+        index,
+        bus: Arc::clone(&bus),
+        table,
+        snapshots,
+        positions: of_broadcasts,
+        captured,
+        shared: Arc::clone(shared),
+        works,
+        view: Arc::clone(&view),
+        news,
+    };
+    let name = format!("rx {}", bus.name());
+    let thread = thread::Builder::new().name(name).spawn(move || receiver.run());
+    let thread = thread.map_err(|error| RunError::Failed(format!("cannot start a thread: {error}")))?;
+    Ok((Lane { bus, view, captured: frames, receiver: Some(thread) }, line))
+}
+
+impl Bench<'_> {
+    /// Starts the cells, listens for another gateway, and waits until all cells are ready.
+    fn begin(&mut self) -> Result<(), RunError> {
+        let options = self.options;
+        let listened = Instant::now() + LISTEN;
+        if options.spawn {
+            let program = program("cell-node", options.cell_node.as_deref())?;
+            self.processes = Processes::start(&Plan {
+                program: &program,
+                skin_file: &options.skin_file,
+                skin: &options.skin,
+                kind: Choice::Only(self.lanes.first().map_or(BusKind::Embedded, |lane| lane.bus.kind())),
+                per_process: options.cells_per_process,
+                flash: options.flash.as_deref(),
+            })?;
+        }
+        let patience = if options.spawn { STARTING } else { SHOWING };
+        let (mut ready, mut progress) = (0, Instant::now());
+        loop {
+            thread::sleep(Duration::from_millis(5));
+            self.hear_while_starting()?;
+            let now_ready = self.count(|&(_, ready, _)| ready);
+            if now_ready > ready {
+                (ready, progress) = (now_ready, Instant::now());
+            }
+            if Instant::now() >= listened
+                && (ready == options.skin.cells.len() || progress.elapsed() > patience)
+            {
+                break;
+            }
+        }
+        self.judge_start(ready)?;
+        // What a gateway before this one halted goes on; what cells have counted and feel is asked for.
+        self.say(&Message::Resume)?;
+        self.say(&Message::Report)
+    }
+
+    fn judge_start(&self, ready: usize) -> Result<(), RunError> {
+        let silent = self.names(|&(_, ready, _)| !ready);
+        if ready == 0 || (self.options.spawn && !silent.is_empty()) {
+            let remedy = if self.options.spawn {
+                "see their own messages above"
+            } else {
+                "start them with cell-node, or leave out --no-spawn"
+            };
+            return Err(RunError::Failed(format!("cells that are not ready: {silent}; {remedy}")));
+        }
+        let other = self.names(|&(_, ready, other)| ready && other);
+        if !other.is_empty() {
+            let remedy = "configure them for it, or delete their flash files";
+            return Err(RunError::Failed(format!(
+                "cells that are configured for another skin than {}: {other}; {remedy}",
+                self.options.skin_file.display()
+            )));
+        }
+        if !silent.is_empty() && !self.options.quiet {
+            eprintln!("cells that do not answer, the run goes on without them: {silent}");
+        }
+        Ok(())
+    }
+
+    /// Another gateway, a process that ends or a bus that is gone end the start.
+    fn hear_while_starting(&mut self) -> Result<(), RunError> {
+        if self.signalled.load(Ordering::Relaxed) {
+            return Err(RunError::Failed("interrupted while starting".to_owned()));
+        }
+        for (bus, news) in self.news.try_iter() {
+            let name = self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
+            match news {
+                News::Notice(Notice::Rival) => return Err(rival(name)),
+                News::Down(why) | News::Lost(why) => return Err(RunError::Failed(why)),
+                News::Notice(_) | News::Up => {}
+            }
+        }
+        if let Some(ended) = self.processes.ended().first() {
+            let name = self.options.skin.buses.get(ended.bus).map_or("", |bus| bus.name.as_str());
+            let (first, last) = ended.nodes;
+            let cells =
+                if first == last { format!("cell {first}") } else { format!("cells {first} to {last}") };
+            return Err(RunError::Failed(format!(
+                "{cells} on {name} ended while starting ({}); see the message above",
+                ended.status
+            )));
+        }
+        Ok(())
+    }
+
+    fn count(&self, wanted: impl Fn(&(u8, bool, bool)) -> bool) -> usize {
+        self.each_view(|_, view| view.cells.iter().filter(|cell| wanted(cell)).count()).into_iter().sum()
+    }
+
+    /// The names of some cells, for people: `1, 2, 5 on vcan0`.
+    fn names(&self, wanted: impl Fn(&(u8, bool, bool)) -> bool) -> String {
+        let names = self.each_view(|bus, view| {
+            let nodes = view.cells.iter().filter(|cell| wanted(cell)).map(|(node, ..)| node.to_string());
+            let nodes: Vec<_> = nodes.collect();
+            match nodes.len() {
+                0 => String::new(),
+                count @ 13.. => {
+                    format!("{count} cells on {bus} ({} ...)", nodes.get(..6).unwrap_or_default().join(", "))
+                }
+                _ => format!("{} on {bus}", nodes.join(", ")),
+            }
+        });
+        names.into_iter().filter(|names| !names.is_empty()).collect::<Vec<_>>().join("; ")
+    }
+
+    fn each_view<T>(&self, look: impl Fn(&str, &View) -> T) -> Vec<T> {
+        let look = |lane: &Lane| lane.view.lock().ok().map(|view| look(lane.bus.name(), &view));
+        self.lanes.iter().filter_map(look).collect()
+    }
+
+    /// Sends a message on every bus.
+    pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
+        for (lane, described) in self.lanes.iter().zip(&self.options.skin.buses) {
+            let frames: Vec<Frame> = message.encode().frames(described.format).collect();
+            lane.bus.send(&frames).map_err(BusError::from)?;
+        }
+        Ok(())
+    }
+
+    /// Lets the receivers end and takes what they leave.
+    pub(super) fn stop_receivers(&mut self) -> Vec<Option<Received>> {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        let end = |lane: &mut Lane| lane.receiver.take().and_then(|thread| thread.join().ok());
+        self.lanes.iter_mut().map(end).collect()
+    }
+
+    /// The queue through which the loop's records come, both ends.
+    pub(super) fn records() -> (rtrb::Producer<Timed>, rtrb::Consumer<Timed>) {
+        rtrb::RingBuffer::new(RECORDS)
+    }
+}
+
+/// Another gateway is on a bus.
+pub(super) fn rival(bus: &str) -> RunError {
+    RunError::Failed(format!(
+        "another gateway is on {bus}: stop one of the two, or give this one another bus"
+    ))
+}

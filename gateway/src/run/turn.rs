@@ -1,0 +1,153 @@
+//! What happens in one tick outside the pure cycle: reading what the receivers left, encoding, sending,
+//! and handing a record on. Nothing here allocates, locks, logs or waits.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use protocol::can::{Format, Frame};
+use protocol::message::Message;
+use protocol::packet::{Epoch, Packet, WORDS};
+
+use crate::central::Felt;
+use crate::cycle::{Cycle, Record, Tick};
+use crate::scenario::{Mode, Scenario};
+use crate::table::Snapshot;
+
+/// What all threads of a run look at.
+#[derive(Debug, Default)]
+pub struct Shared {
+    /// Set once: the loop ends.
+    pub stop_loop: AtomicBool,
+    /// Set once, after the loop's end: the receivers end.
+    pub stop: AtomicBool,
+    /// Whether torques are compared with central ones.
+    pub comparing: AtomicBool,
+    /// Broadcasts sent so far.
+    pub broadcasts: AtomicU64,
+    /// Records that did not fit into their queue.
+    pub records_lost: AtomicU64,
+    /// Broadcasts that were skipped with their ticks.
+    pub broadcasts_skipped: AtomicU64,
+    /// Frames that a bus did not take.
+    pub unsent: AtomicU64,
+}
+
+/// A record and its times.
+#[derive(Clone, Copy, Debug)]
+pub struct Timed {
+    /// What the tick was like.
+    pub record: Record,
+    /// How long after its time it began, in ns.
+    pub late_ns: u64,
+    /// How long it took, in ns.
+    pub took_ns: u64,
+    /// How long the central computation took of that, in ns, and its result.
+    pub central: Option<(u64, Felt)>,
+}
+
+/// One bus, as a tick sees it.
+#[derive(Debug)]
+pub struct Line {
+    /// One FD frame a packet, or two classic ones.
+    pub format: Format,
+    /// What the receiver left.
+    pub snapshot: triple_buffer::Output<Snapshot>,
+    /// Positions in rad of each broadcast, for the receiver to compare with.
+    pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
+    /// Whether the bus works, as the receiver sees it.
+    pub works: Arc<AtomicBool>,
+}
+
+/// The control loop between two looks at the clock.
+#[derive(Debug)]
+pub struct Turn {
+    cycle: Cycle,
+    lines: Vec<Line>,
+    scenario: Arc<Scenario>,
+    shared: Arc<Shared>,
+    records: rtrb::Producer<Timed>,
+}
+
+impl Turn {
+    /// A loop over some buses that has not begun.
+    #[must_use]
+    pub const fn new(
+        cycle: Cycle,
+        lines: Vec<Line>,
+        scenario: Arc<Scenario>,
+        shared: Arc<Shared>,
+        records: rtrb::Producer<Timed>,
+    ) -> Self {
+        Self { cycle, lines, scenario, shared, records }
+    }
+
+    /// One tick. `now` is a monotonic clock in ns, `due` when the tick should have begun by it; `send`
+    /// puts frames on the bus of an index and says whether it took them.
+    pub fn turn(
+        &mut self,
+        tick: Tick,
+        skipped: u64,
+        due: u64,
+        now: impl Fn() -> u64,
+        mut send: impl FnMut(usize, &[Frame]) -> bool,
+    ) {
+        let began = now();
+        let mode = self.scenario.mode_at(tick.time);
+        self.shared.comparing.store(mode == Mode::Compare, Ordering::Relaxed);
+        for line in &mut self.lines {
+            line.snapshot.update();
+        }
+        let valid = self.lines.iter().all(|line| line.works.load(Ordering::Relaxed));
+        let snapshots = || self.lines.iter().map(|line| line.snapshot.output_buffer());
+        let outcome = self.cycle.tick(tick, skipped, snapshots(), valid);
+        let central = (mode == Mode::Compare).then(|| {
+            let before = now();
+            let felt = self.cycle.central(snapshots());
+            (now().saturating_sub(before), felt)
+        });
+        if let Some((epoch, joints)) = outcome.joints {
+            for line in &mut self.lines {
+                // A full queue costs the receiver the unrounded positions, and nothing else.
+                let _ = line.positions.push((epoch, outcome.record.q));
+            }
+            self.say(&Message::Joints { epoch, joints }, &mut send);
+            self.shared.broadcasts.fetch_add(1, Ordering::Release);
+            self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
+        }
+        if outcome.halt {
+            self.say(&Message::Halt, &mut send);
+        }
+        let timed = Timed {
+            record: outcome.record,
+            late_ns: began.saturating_sub(due),
+            took_ns: now().saturating_sub(began),
+            central,
+        };
+        if self.records.push(timed).is_err() {
+            self.shared.records_lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Sends a message on every bus.
+    fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        let packet = message.encode();
+        for (bus, line) in self.lines.iter().enumerate() {
+            let (frames, count) = frames(&packet, line.format);
+            let frames = frames.get(..count).unwrap_or_default();
+            if !send(bus, frames) {
+                self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+            }
+        }
+    }
+}
+
+/// A packet's frames in place: an array, and how many of it are used.
+fn frames(packet: &Packet, format: Format) -> ([Frame; 2], usize) {
+    let mut frames = [Frame::EMPTY; 2];
+    let mut count = 0;
+    for (place, frame) in frames.iter_mut().zip(packet.frames(format)) {
+        *place = frame;
+        count += 1;
+    }
+    (frames, count)
+}

@@ -1,0 +1,485 @@
+//! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, news and
+//! progress for people, frames into the log, and at the end the summary.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use hdrhistogram::Histogram;
+use protocol::bus::Bus;
+use protocol::can::Frame;
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage};
+use protocol::packet::Epoch;
+use protocol::skin::ControllerKind;
+use protocol::time::Micros;
+
+use super::progress::Progress;
+use super::realtime::{self, Granted};
+use super::receiver::{News, Received};
+use super::start::{Bench, rival};
+use super::turn::{Timed, Turn};
+use super::{RunError, usage};
+use crate::controller::{Controller, Hold, Kinesthetic, Sine};
+use crate::cycle::{Cycle, Halt};
+use crate::external::External;
+use crate::robot::SimulatedArm;
+use crate::scenario::{FaultKind, MotionKind, Stimulus, Touches};
+use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary};
+use crate::table::{Accuracy, Notice};
+
+/// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
+const LEAD: u64 = 5;
+/// The main thread's rhythm.
+const LOOK: Duration = Duration::from_millis(4);
+/// How long the cells may take to say their last words.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+
+/// What the loop's records add up to.
+#[derive(Debug)]
+struct Measured {
+    late: Histogram<u64>,
+    took: Histogram<u64>,
+    took_distributed: Histogram<u64>,
+    central: Histogram<u64>,
+    ticks: u64,
+    skipped: u64,
+    bad: BTreeMap<String, u64>,
+    last: Option<Timed>,
+    first_broadcast_s: Option<f64>,
+}
+
+/// Faults and touches that are still to come.
+struct Script {
+    touches: Touches,
+    /// The next epoch whose stimuli are to be sent.
+    epoch: u64,
+    /// The next fault.
+    fault: usize,
+}
+
+impl Bench<'_> {
+    /// Runs the loop to its end.
+    pub(super) fn watch(mut self) -> Result<Summary, RunError> {
+        let outcome = self.drive();
+        if outcome.is_err() {
+            self.stop_receivers();
+        }
+        outcome
+    }
+
+    fn drive(&mut self) -> Result<Summary, RunError> {
+        let options = self.options;
+        let (records, inlet) = Self::records();
+        let turn = Turn::new(
+            self.cycle()?,
+            std::mem::take(&mut self.lines),
+            Arc::new(options.scenario.clone()),
+            Arc::clone(&self.shared),
+            records,
+        );
+        let mut script =
+            Script { touches: Touches::new(&options.scenario, &options.skin), epoch: 0, fault: 0 };
+        self.press(&mut script)?;
+
+        let before = self.processor();
+        let started = Instant::now();
+        let control = self.start_loop(turn)?;
+        let mut progress = Progress::new(options.quiet);
+        let mut measured = Measured::new();
+        let mut inlet = inlet;
+        let mut failure = None;
+        let mut interrupted = false;
+        while !control.is_finished() {
+            thread::sleep(LOOK);
+            interrupted = self.signalled.load(Ordering::Relaxed);
+            let step = self.step(&mut script, &mut progress, &mut measured, &mut inlet, started);
+            failure = step.err();
+            if failure.is_some() || interrupted {
+                self.shared.stop_loop.store(true, Ordering::Relaxed);
+            }
+            if failure.is_some() {
+                break;
+            }
+        }
+        let granted = control.join().map_err(|_| RunError::Failed("the control loop panicked".to_owned()))?;
+        let duration_s = started.elapsed().as_secs_f64();
+        progress.clear();
+        if let Some(failure) = failure {
+            // Nobody commands the cells any more.
+            let _ = self.say(&Message::Halt);
+            return Err(failure);
+        }
+        measured.take(&mut inlet, self.began);
+        let processor = self.processor().since(before, duration_s);
+        let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
+        self.last_words(interrupted)?;
+        let received = self.stop_receivers();
+        let lost =
+            self.write_log()? + received.iter().flatten().map(|received| received.unrecorded).sum::<u64>();
+        let recording = self.log.take().map(|log| log.finish(lost)).transpose()?;
+        Ok(Summary {
+            skin: options.skin.name.clone(),
+            cells: options.skin.cells.len(),
+            duration_s,
+            interrupted,
+            halted: measured.halted(),
+            first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
+            control: self.loop_summary(&measured, granted),
+            accuracy: accuracy(&received),
+            buses: self.bus_summaries(&received),
+            processor,
+            cell_private_kib,
+            recording,
+        })
+    }
+
+    /// The loop's state, by the scenario's motion.
+    fn cycle(&self) -> Result<Cycle, RunError> {
+        let (skin, motion) = (&self.options.skin, self.options.scenario.motion);
+        let controller: Box<dyn Controller> = match motion.kind {
+            MotionKind::Hold => Box::new(Hold::new(skin, motion.start_rad)),
+            MotionKind::Sine { amplitude_rad, period_s } => {
+                Box::new(Sine::new(skin, motion.start_rad, amplitude_rad, period_s))
+            }
+            MotionKind::Kinesthetic => match &skin.controller.kind {
+                ControllerKind::External { socket } => Box::new(External::listen(Path::new(socket), skin)?),
+                ControllerKind::Kinesthetic { .. } => {
+                    let missing =
+                        || RunError::Usage("the skin describes no kinesthetic controller".to_owned());
+                    Box::new(Kinesthetic::new(skin).ok_or_else(missing)?)
+                }
+            },
+        };
+        Ok(Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, motion.start_rad))))
+    }
+
+    fn start_loop(&self, mut turn: Turn) -> Result<thread::JoinHandle<Granted>, RunError> {
+        let period_ns = self.options.skin.timing.tick_nanos();
+        let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
+        let shared = Arc::clone(&self.shared);
+        let buses: Vec<Arc<Bus>> = self.lanes.iter().map(|lane| Arc::clone(&lane.bus)).collect();
+        let control = move || {
+            let granted = realtime::prepare();
+            let send =
+                |bus: usize, frames: &[Frame]| buses.get(bus).is_some_and(|bus| bus.send(frames).is_ok());
+            realtime::run(&mut turn, &shared, period_ns, ticks, send);
+            granted
+        };
+        let thread = thread::Builder::new().name("control".to_owned()).spawn(control);
+        thread.map_err(|error| RunError::Failed(format!("cannot start the control loop: {error}")))
+    }
+
+    /// One look around.
+    fn step(
+        &mut self,
+        script: &mut Script,
+        progress: &mut Progress,
+        measured: &mut Measured,
+        records: &mut rtrb::Consumer<Timed>,
+        started: Instant,
+    ) -> Result<(), RunError> {
+        self.press(script)?;
+        self.break_things(script, progress, started)?;
+        self.hear(script, progress)?;
+        measured.take(records, self.began);
+        self.write_log()?;
+        let shared = Arc::clone(&self.shared);
+        progress.show(|| {
+            let cells = self.options.skin.cells.len();
+            measured.line(
+                started,
+                self.options.scenario.duration.0,
+                cells,
+                shared.comparing.load(Ordering::Relaxed),
+            )
+        });
+        Ok(())
+    }
+
+    /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
+    fn press(&self, script: &mut Script) -> Result<(), RunError> {
+        let until = self.shared.broadcasts.load(Ordering::Acquire) + LEAD;
+        while script.epoch < until {
+            let (epoch, from) = (script.epoch, From::Epoch(epoch_of(script.epoch)));
+            for stimulus in script.touches.stimuli_for(epoch) {
+                self.stimulate(&stimulus, from)?;
+            }
+            script.epoch += 1;
+        }
+        Ok(())
+    }
+
+    fn stimulate(&self, stimulus: &Stimulus, from: From) -> Result<(), RunError> {
+        let Some((lane, described)) = self.lanes.iter().zip(&self.options.skin.buses).nth(stimulus.bus)
+        else {
+            return Ok(());
+        };
+        let message = Message::Stimulus {
+            to: Node::Cell(stimulus.node),
+            from,
+            page: SensorPage::Skin(stimulus.sensors),
+        };
+        let frames: Vec<Frame> = message.encode().frames(described.format).collect();
+        match lane.bus.send(&frames) {
+            // Counted; what the cells then feel is what the bus carried.
+            Err(error) if error.cause.may_pass() => {
+                self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+                Ok(())
+            }
+            sent => Ok(sent.map_err(protocol::bus::BusError::from)?),
+        }
+    }
+
+    /// Does to processes what the scenario says, when it is time.
+    fn break_things(
+        &mut self,
+        script: &mut Script,
+        progress: &mut Progress,
+        started: Instant,
+    ) -> Result<(), RunError> {
+        let options = self.options;
+        while let Some(fault) = options.scenario.faults.get(script.fault) {
+            if u128::from(fault.at.0) > started.elapsed().as_micros() {
+                break;
+            }
+            script.fault += 1;
+            let FaultKind::Process { action, cells } = &fault.kind else { continue };
+            for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
+                let done = self.processes.act(cell.bus, cell.node.get(), *action)?;
+                let bus = options.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+                let failed = if done { "" } else { " (no process of ours)" };
+                progress.note(&format!("scenario: {action:?} cell {} on {bus}{failed}", cell.node));
+            }
+        }
+        Ok(())
+    }
+
+    /// What the receivers and the processes have to say.
+    fn hear(&mut self, script: &Script, progress: &mut Progress) -> Result<(), RunError> {
+        let options = self.options;
+        let name = |bus: usize| options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
+        let news: Vec<_> = self.news.try_iter().collect();
+        for (bus, news) in news {
+            match news {
+                News::Notice(Notice::Rival) => return Err(rival(name(bus))),
+                News::Notice(Notice::Dead(cell)) => {
+                    progress.note(&format!("cell {cell} on {} has fallen silent", name(bus)));
+                }
+                News::Notice(Notice::Back(cell)) => {
+                    progress.note(&format!("cell {cell} on {} speaks again", name(bus)));
+                }
+                News::Notice(Notice::Restarted(cell)) => {
+                    progress.note(&format!("cell {cell} on {} started anew", name(bus)));
+                    // It has forgotten what it felt.
+                    let place = options.skin.cells.iter().position(|it| it.bus == bus && it.node == cell);
+                    if let Some(place) = place {
+                        let sensors = script.touches.sensors(place, script.epoch.saturating_sub(1));
+                        self.stimulate(&Stimulus { cell: place, bus, node: cell, sensors }, From::Next)?;
+                    }
+                }
+                News::Notice(Notice::Duplicate(cell)) => {
+                    progress.note(&format!(
+                        "cell {cell} on {} hears another cell under its number: stop one of the two",
+                        name(bus)
+                    ));
+                }
+                News::Down(why) => progress.note(&why),
+                News::Up => progress.note(&format!("{} works again", name(bus))),
+                News::Lost(why) => return Err(RunError::Failed(why)),
+            }
+        }
+        for ended in self.processes.ended() {
+            let (first, last) = ended.nodes;
+            let cells =
+                if first == last { format!("cell {first}") } else { format!("cells {first} to {last}") };
+            progress.note(&format!("the process of {cells} on {} ended ({})", name(ended.bus), ended.status));
+        }
+        Ok(())
+    }
+
+    /// Writes what the receivers captured; returns how many frames could not be written.
+    fn write_log(&mut self) -> Result<u64, RunError> {
+        let Some(log) = &mut self.log else { return Ok(0) };
+        for lane in &mut self.lanes {
+            let Some(captured) = &mut lane.captured else { continue };
+            while let Ok(frame) = captured.pop() {
+                log.write(lane.bus.name(), &frame)?;
+            }
+        }
+        Ok(0)
+    }
+
+    /// Lets late replies come in, and asks all cells for a heartbeat and their counters.
+    fn last_words(&mut self, interrupted: bool) -> Result<(), RunError> {
+        thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
+        let alive = self.alive();
+        for lane in &self.lanes {
+            if let Ok(mut view) = lane.view.lock() {
+                view.reports = 0;
+            }
+        }
+        self.say(&Message::Report)?;
+        let give_up = Instant::now() + LAST_WORDS;
+        while self.reports() < alive && Instant::now() < give_up {
+            thread::sleep(LOOK);
+            self.write_log()?;
+        }
+        if interrupted {
+            self.say(&Message::Halt)?;
+        }
+        // Last of all, so that each cell's own count covers everything else that it has sent.
+        self.say(&Message::Sync)?;
+        thread::sleep(Duration::from_millis(150));
+        self.write_log()?;
+        Ok(())
+    }
+
+    fn alive(&self) -> usize {
+        let ready = |lane: &super::start::Lane| {
+            lane.view.lock().map_or(0, |view| view.cells.iter().filter(|(_, ready, _)| *ready).count())
+        };
+        self.lanes.iter().map(ready).sum()
+    }
+
+    fn reports(&self) -> usize {
+        self.lanes.iter().map(|lane| lane.view.lock().map_or(0, |view| view.reports)).sum()
+    }
+
+    fn processor(&self) -> Processor {
+        Processor {
+            gateway: usage::processor_seconds(std::process::id()),
+            cells: self.processes.pids().map(usage::processor_seconds).sum(),
+            buses: self.served.iter().map(|served| usage::processor_seconds(served.pid())).sum(),
+        }
+    }
+
+    fn loop_summary(&self, measured: &Measured, granted: Granted) -> Loop {
+        let count = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
+        Loop {
+            ticks: measured.ticks,
+            ticks_skipped: measured.skipped,
+            broadcasts: count(&self.shared.broadcasts),
+            broadcasts_skipped: count(&self.shared.broadcasts_skipped),
+            bad_cycles: measured.bad.clone(),
+            late_us: Quantiles::of(&measured.late, 1e-3),
+            idle_late_us: Quantiles::of(&self.idle, 1e-3),
+            took_us: Quantiles::of(&measured.took, 1e-3),
+            central_us: Quantiles::of(&measured.central, 1e-3),
+            took_distributed_us: Quantiles::of(&measured.took_distributed, 1e-3),
+            fifo: granted.fifo,
+            memory_locked: granted.locked,
+            records_lost: count(&self.shared.records_lost),
+            unsent: count(&self.shared.unsent),
+        }
+    }
+
+    fn bus_summaries(&self, received: &[Option<Received>]) -> Vec<BusSummary> {
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
+        let pairs = self.lanes.iter().zip(received);
+        let summary = |(lane, received): (&super::start::Lane, &Option<Received>)| {
+            let received = received.as_ref()?;
+            let (bus, kind) = (&lane.bus, lane.bus.kind().to_string());
+            Some(BusSummary::new(
+                bus.name(),
+                &kind,
+                bus.receive_buffer(),
+                &received.table,
+                received.dropped,
+                now,
+            ))
+        };
+        pairs.filter_map(summary).collect()
+    }
+}
+
+fn accuracy(received: &[Option<Received>]) -> AccuracySummary {
+    let all = received.iter().flatten().map(|received| *received.table.accuracy());
+    all.fold(Accuracy::default(), Accuracy::with).into()
+}
+
+/// A histogram that is made without a bound grows by itself; it cannot refuse.
+fn record(histogram: &mut Histogram<u64>, value: u64) {
+    let _ = histogram.record(value);
+}
+
+/// The epoch of the n-th broadcast.
+fn epoch_of(number: u64) -> Epoch {
+    Epoch(number.to_le_bytes()[0])
+}
+
+impl Processor {
+    fn since(self, before: Self, seconds: f64) -> Self {
+        Self {
+            gateway: (self.gateway - before.gateway) / seconds,
+            cells: (self.cells - before.cells) / seconds,
+            buses: (self.buses - before.buses) / seconds,
+        }
+    }
+}
+
+impl Measured {
+    fn new() -> Self {
+        let histogram = || Histogram::new(3).expect("three digits are a valid precision");
+        Self {
+            late: histogram(),
+            took: histogram(),
+            took_distributed: histogram(),
+            central: histogram(),
+            ticks: 0,
+            skipped: 0,
+            bad: BTreeMap::new(),
+            last: None,
+            first_broadcast_s: None,
+        }
+    }
+
+    fn take(&mut self, records: &mut rtrb::Consumer<Timed>, began: Instant) {
+        while let Ok(timed) = records.pop() {
+            if self.first_broadcast_s.is_none() {
+                self.first_broadcast_s = Some(began.elapsed().as_secs_f64());
+            }
+            self.ticks += 1;
+            self.skipped += timed.record.skipped;
+            record(&mut self.late, timed.late_ns);
+            record(&mut self.took, timed.took_ns);
+            match timed.central {
+                Some((nanos, _)) => record(&mut self.central, nanos),
+                None => record(&mut self.took_distributed, timed.took_ns),
+            }
+            if let Some(bad) = timed.record.bad {
+                *self.bad.entry(bad.to_string()).or_default() += 1;
+            }
+            self.last = Some(timed);
+        }
+    }
+
+    fn halted(&self) -> Option<String> {
+        self.last?.record.halted.map(|halt| match halt {
+            Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
+            Halt::Frame => "somebody sent a halt frame".to_owned(),
+        })
+    }
+
+    fn line(&self, started: Instant, duration_us: u64, cells: usize, comparing: bool) -> String {
+        let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
+        let seconds = started.elapsed().as_secs_f64();
+        let of = Duration::from_micros(duration_us).as_secs_f64();
+        let mode = if comparing { "compare" } else { "distributed" };
+        let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
+        let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
+        format!(
+            "{seconds:5.1} of {of:.1} s  {mode:11}  {:3} of {cells} in contact, {} stale, {} dead  torque {} Nm  \
+             late p99 {:.0} us{halted}",
+            record.contributing,
+            record.stale,
+            record.dead,
+            torque.join(" "),
+            Quantiles::of(&self.late, 1e-3).p99,
+        )
+    }
+}

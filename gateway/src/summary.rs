@@ -1,0 +1,329 @@
+//! What a run came to: the figures of the table at its end, and of `--summary`.
+//!
+//! The keys of the JSON are the names of the fields here; `docs/summary.md` says what they mean.
+
+use std::collections::BTreeMap;
+
+use hdrhistogram::Histogram;
+use protocol::id::Kind;
+use protocol::time::Micros;
+use serde::Serialize;
+
+use crate::table::{Accuracy, Errors, Event, Replies, Status, Table, Uplink};
+
+/// A whole run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// The skin's name.
+    pub skin: String,
+    /// Cells in it.
+    pub cells: usize,
+    /// How long the loop ran, in s.
+    pub duration_s: f64,
+    /// Whether it was ended by a signal.
+    pub interrupted: bool,
+    /// Why the robot was halted at the end, if it was.
+    pub halted: Option<String>,
+    /// From the start of the program to the first broadcast, in s.
+    pub first_broadcast_s: f64,
+    /// The control loop.
+    #[serde(rename = "loop")]
+    pub control: Loop,
+    /// Distributed against central torques.
+    pub accuracy: AccuracySummary,
+    /// Each bus.
+    pub buses: Vec<BusSummary>,
+    /// Processor time while the loop ran, in cores.
+    pub processor: Processor,
+    /// Private memory of the largest cell process in KiB, if cells were started.
+    pub cell_private_kib: Option<u64>,
+    /// Where frames were recorded, and how many did not make it there.
+    pub recording: Option<Recording>,
+}
+
+/// The control loop.
+#[derive(Clone, Debug, Serialize)]
+pub struct Loop {
+    /// Ticks that happened.
+    pub ticks: u64,
+    /// Ticks that were skipped because the machine was not there in time.
+    pub ticks_skipped: u64,
+    /// Broadcasts sent.
+    pub broadcasts: u64,
+    /// Broadcasts skipped with their ticks.
+    pub broadcasts_skipped: u64,
+    /// Bad cycles, by reason.
+    pub bad_cycles: BTreeMap<String, u64>,
+    /// How late ticks began.
+    pub late_us: Quantiles,
+    /// How late the same machine wakes a thread when nothing else runs.
+    pub idle_late_us: Quantiles,
+    /// How long a tick took.
+    pub took_us: Quantiles,
+    /// How long the central computation took of that, in ticks that compared.
+    pub central_us: Quantiles,
+    /// How long a tick took in ticks that did not compare.
+    pub took_distributed_us: Quantiles,
+    /// Whether the machine granted SCHED_FIFO.
+    pub fifo: bool,
+    /// Whether it locked the memory.
+    pub memory_locked: bool,
+    /// Records of ticks that did not fit into their queue.
+    pub records_lost: u64,
+    /// Frames that a bus did not take.
+    pub unsent: u64,
+}
+
+/// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Quantiles {
+    /// Median.
+    pub p50: f64,
+    /// 90th percentile.
+    pub p90: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Maximum.
+    pub max: f64,
+    /// How many.
+    pub count: u64,
+}
+
+impl Quantiles {
+    /// Of a histogram that counts in units of `unit_us`.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+    pub fn of(histogram: &Histogram<u64>, unit_us: f64) -> Self {
+        let at = |quantile| histogram.value_at_quantile(quantile) as f64 * unit_us;
+        Self {
+            p50: at(0.5),
+            p90: at(0.9),
+            p99: at(0.99),
+            max: histogram.max() as f64 * unit_us,
+            count: histogram.len(),
+        }
+    }
+}
+
+/// Some errors, in Nm.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ErrorsSummary {
+    /// Mean absolute error; none when nothing was compared.
+    pub mean_nm: Option<f64>,
+    /// Greatest absolute error.
+    pub max_nm: f64,
+    /// Torques compared.
+    pub count: u64,
+}
+
+impl From<Errors> for ErrorsSummary {
+    fn from(errors: Errors) -> Self {
+        Self { mean_nm: errors.mean(), max_nm: errors.max(), count: errors.count() }
+    }
+}
+
+/// Distributed against central torques.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct AccuracySummary {
+    /// Single cells over loaded joints, on the same words.
+    pub single: ErrorsSummary,
+    /// Single cells over loaded joints, against unrounded angles, lengths and poses.
+    pub unquantised: ErrorsSummary,
+    /// The whole skin's torque, in epochs that all answered in time.
+    pub whole: ErrorsSummary,
+    /// Words left out because they were saturated.
+    pub saturated: u64,
+}
+
+impl From<Accuracy> for AccuracySummary {
+    fn from(accuracy: Accuracy) -> Self {
+        let Accuracy { single, unquantised, whole, saturated } = accuracy;
+        Self { single: single.into(), unquantised: unquantised.into(), whole: whole.into(), saturated }
+    }
+}
+
+/// Processor time while the loop ran, in cores.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Processor {
+    /// This program.
+    pub gateway: f64,
+    /// All cells together.
+    pub cells: f64,
+    /// Embedded buses.
+    pub buses: f64,
+}
+
+/// Where frames were recorded.
+#[derive(Clone, Debug, Serialize)]
+pub struct Recording {
+    /// The file.
+    pub path: String,
+    /// Frames in it.
+    pub frames: u64,
+    /// Frames that did not make it there.
+    pub lost: u64,
+}
+
+/// Packets from the cells: sent = delivered + rejected + lost, and lost = dropped + unknown.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct UplinkSummary {
+    /// Sent, by the cells' own count, as of their last heartbeats.
+    pub sent: u64,
+    /// Arrived and understood.
+    pub delivered: u64,
+    /// Arrived and refused.
+    pub rejected: u64,
+    /// Sent and not arrived, because the bus dropped frames that we did not take in time.
+    pub dropped: u64,
+    /// Sent and not arrived, and nobody knows why.
+    pub unknown: u64,
+    /// Arrived more often than sent.
+    pub surplus: u64,
+    /// Arrived after a cell's last heartbeat, which nothing can be compared with.
+    pub unsettled: u64,
+    /// Cells that started anew.
+    pub restarts: u32,
+}
+
+/// Replies: due = in time + late + missing; missing = skipped + not heard + lost + in doubt + unknown.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct RepliesSummary {
+    /// Epochs that cells had to answer.
+    pub due: u64,
+    /// Answered before the next broadcast.
+    pub in_time: u64,
+    /// Answered after it.
+    pub late: u64,
+    /// Skipped by the cell, because the joints were older than a period when it got to them.
+    pub skipped: u64,
+    /// Not heard by the cell.
+    pub not_heard: u64,
+    /// Sent by the cell and lost on the way.
+    pub lost: u64,
+    /// Of cells that were dead or started anew.
+    pub in_doubt: u64,
+    /// Missing, and nobody knows why.
+    pub unknown: u64,
+    /// Torques that nobody waited for: ends of contacts, and cells whose sensors are unknown.
+    pub unasked: u64,
+}
+
+/// One bus.
+#[derive(Clone, Debug, Serialize)]
+pub struct BusSummary {
+    /// Its name.
+    pub name: String,
+    /// socketcan or embedded.
+    pub kind: String,
+    /// Bytes that the socket may hold.
+    pub receive_buffer: usize,
+    /// Cells by status at the end.
+    pub cells: BTreeMap<&'static str, usize>,
+    /// Cells that were dead or never heard at the end.
+    pub silent_cells: Vec<u8>,
+    /// Packets from the cells.
+    pub uplink: UplinkSummary,
+    /// Replies.
+    pub replies: RepliesSummary,
+    /// Epochs that somebody had to answer, and those that everybody answered in time.
+    pub epochs_due: u64,
+    /// See above.
+    pub epochs_complete: u64,
+    /// Packets by kind, received from others.
+    pub received: BTreeMap<&'static str, u64>,
+    /// Packets by kind, sent by this gateway as read back from the bus.
+    pub sent: BTreeMap<&'static str, u64>,
+    /// What was odd, by reason; zeros are left out.
+    pub events: BTreeMap<&'static str, u64>,
+    /// Frames that the bus dropped because we did not take them in time.
+    pub dropped_by_bus: u64,
+    /// From a broadcast to its last reply in time, by the kernel's time stamps.
+    pub last_reply_us: Quantiles,
+}
+
+impl BusSummary {
+    /// The figures of a bus whose run is over.
+    #[must_use]
+    pub fn new(
+        name: &str,
+        kind: &str,
+        receive_buffer: usize,
+        table: &Table,
+        dropped: u64,
+        now: Micros,
+    ) -> Self {
+        let mut cells = BTreeMap::new();
+        let mut silent_cells = Vec::new();
+        for (cell, status) in table.statuses(now) {
+            *cells.entry(status.name()).or_default() += 1;
+            if matches!(status, Status::Dead | Status::Unknown) {
+                silent_cells.push(cell.node.get());
+            }
+        }
+        let counters = table.counters();
+        let kinds = |count: &dyn Fn(Kind) -> u64| {
+            Kind::ALL
+                .into_iter()
+                .map(|kind| (kind.name(), count(kind)))
+                .filter(|(_, count)| *count > 0)
+                .collect()
+        };
+        let events = Event::ALL.into_iter().map(|event| (event.name(), counters.events(event)));
+        Self {
+            name: name.to_owned(),
+            kind: kind.to_owned(),
+            receive_buffer,
+            cells,
+            silent_cells,
+            uplink: uplink(table, dropped),
+            replies: replies(table),
+            epochs_due: counters.epochs_due,
+            epochs_complete: counters.epochs_complete,
+            received: kinds(&|kind| counters.received(kind)),
+            sent: kinds(&|kind| counters.sent(kind)),
+            events: events.filter(|(_, count)| *count > 0).collect(),
+            dropped_by_bus: dropped,
+            last_reply_us: Quantiles::of(table.last_reply(), 1.0),
+        }
+    }
+}
+
+fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
+    let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink));
+    let dropped = total.lost.min(dropped_by_bus);
+    UplinkSummary {
+        sent: total.sent,
+        delivered: total.delivered,
+        rejected: total.rejected,
+        dropped,
+        unknown: total.lost - dropped,
+        surplus: total.surplus,
+        unsettled: total.unsettled(),
+        restarts: total.restarts,
+    }
+}
+
+/// Finds for each cell's missing replies what is known to have become of them.
+fn replies(table: &Table) -> RepliesSummary {
+    let mut summary = RepliesSummary::default();
+    for cell in table.cells() {
+        let Replies { due, in_time, late, missing, in_doubt, unasked } = cell.replies;
+        let mut rest = missing - in_doubt;
+        let mut explain = |count: u64| {
+            let explained = rest.min(count);
+            rest -= explained;
+            explained
+        };
+        let (skipped, not_heard) = cell.unanswered().unwrap_or((0, 0));
+        summary.due += due;
+        summary.in_time += in_time;
+        summary.late += late;
+        summary.skipped += explain(skipped);
+        summary.not_heard += explain(not_heard);
+        summary.lost += explain(cell.uplink.lost);
+        summary.in_doubt += in_doubt;
+        summary.unknown += rest;
+        summary.unasked += unasked;
+    }
+    summary
+}
