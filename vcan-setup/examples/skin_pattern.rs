@@ -1,7 +1,11 @@
 //! What the embedded bus costs under a whole skin: 253 clients, each with one exact filter, hear a broadcast
 //! at 62.5 Hz and each answers it to one client.
 //!
-//! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS]`
+//! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS] [CELLS_PER_CLIENT]`
+//!
+//! Almost all of the cost is the system's: waking 253 readers. A program that only sends 253 datagrams, reads
+//! 253 and passes those on, with no filters and no queues, costs 1 to 2 % of a core less. Cells that share a
+//! client cost a fraction.
 #![allow(clippy::print_stdout, reason = "an example that prints")]
 
 use std::error::Error;
@@ -19,6 +23,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
     let cells: u32 = arguments.next().map_or(Ok(253), |word| word.parse())?;
     let seconds: u32 = arguments.next().map_or(Ok(10), |word| word.parse())?;
+    let share: usize = arguments.next().map_or(Ok(1), |word| word.parse())?;
     let directory = std::env::temp_dir().join(format!("skin-pattern-{}", std::process::id()));
     let server = Server::bind_in(&directory, "vcan0")?;
     let (stop, stopped) = std::os::unix::net::UnixStream::pair()?;
@@ -32,10 +37,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         let options = Options { filters, directory: Some(directory.clone()), ..Options::default() };
         Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options)
     };
-    for cell in 1..=cells {
-        let bus = open(exact(0x001))?;
+    let ids: Vec<_> = (1..=cells).map(|cell| 0x200 + cell).collect();
+    for ids in ids.chunks(share.max(1)) {
+        let (bus, ids) = (open(exact(0x001))?, ids.to_vec());
         // They end with the process.
-        Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, 0x200 + cell))?;
+        Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, &ids))?;
     }
     let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }])?;
 
@@ -72,13 +78,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     let cpu = Duration::try_from(cpu)?;
     last_reply.sort_unstable();
     let at = |percent: usize| {
-        last_reply.get((last_reply.len().saturating_sub(1)).saturating_mul(percent).div_ceil(100))
+        let place = last_reply.len().saturating_sub(1).saturating_mul(percent).div_ceil(100);
+        last_reply.get(place).copied().unwrap_or_default()
     };
     println!(
         "{cells} cells, {cycles} cycles in {:.2} s: {complete} complete, {replies} replies",
         took.as_secs_f64()
     );
-    println!("last reply after the broadcast: p50 {:?}, p99 {:?}, max {:?}", at(50), at(99), at(100));
+    println!("last reply after the broadcast: p50 {:.2?}, p99 {:.2?}, max {:.2?}", at(50), at(99), at(100));
     println!("dropped {}, garbage {}", inbox.dropped(), totals.garbage);
     println!(
         "the bus: {:.2} ms of CPU per cycle, {:.1} % of one core",
@@ -88,13 +95,16 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// A cell: answers every broadcast with its first bytes, until the bus is closed.
-fn answer(bus: &Bus, id: u32) {
+/// Some cells: answer every broadcast with its first bytes, until the bus is closed.
+fn answer(bus: &Bus, ids: &[u32]) {
     let mut inbox = Inbox::new();
+    let mut replies = Vec::new();
     while bus.wait(None).is_ok() && bus.receive(&mut inbox).is_ok() {
         for heard in inbox.frames() {
-            let reply = Frame::fd(id, BIT_RATE_SWITCH, heard.frame.data()).expect("16 bytes fit");
-            if bus.send(&[reply]).is_err() {
+            let reply = |&id| Frame::fd(id, BIT_RATE_SWITCH, heard.frame.data()).expect("16 bytes fit");
+            replies.clear();
+            replies.extend(ids.iter().map(reply));
+            if bus.send(&replies).is_err() {
                 return;
             }
         }

@@ -63,6 +63,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
     }
     if until_eof {
+        // The system counts the thread that started this process as its parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot follow the parent process")?;
         std::thread::spawn(move || {

@@ -346,7 +346,7 @@ fn a_bus_that_ends_is_read_to_its_end_and_then_closed() {
 }
 
 #[test]
-fn a_stopped_server_makes_senders_wait_and_then_say_how_many_went_out() {
+fn a_server_that_lets_nobody_in_is_given_up_on() {
     let parent = TempDir::new().unwrap();
     // Bound and never run, as a process that is stopped: clients are let in by nobody.
     let server = vcan_setup::embedded::Server::bind_in(&parent.path().join("skinbus"), BUS).unwrap();

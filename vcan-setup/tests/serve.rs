@@ -4,8 +4,9 @@
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Inbox, Options};
 use protocol::can::Frame;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
@@ -49,7 +50,7 @@ fn frames_pass_once_the_line_is_printed_and_a_signal_ends_it_well() {
         let frame = Frame::fd(0x123, 1, &[1; 16]).unwrap();
         a.send(&[frame]).unwrap();
         let mut inbox = Inbox::new();
-        assert!(b.wait(Some(std::time::Duration::from_secs(5))).unwrap());
+        assert!(b.wait(Some(Duration::from_secs(5))).unwrap());
         assert_eq!(b.receive(&mut inbox).unwrap(), 1);
         assert_eq!(inbox.frames().next().unwrap().frame, frame);
         signal(&child, end);
@@ -67,7 +68,7 @@ fn the_end_of_standard_input_ends_it_only_when_asked_to() {
 
     let mut child = serve(&directory, &[]);
     drop(child.stdin.take());
-    std::thread::sleep(std::time::Duration::from_millis(50));
+    std::thread::sleep(Duration::from_millis(50));
     assert_eq!(child.try_wait().unwrap(), None);
     signal(&child, Signal::TERM);
     assert_eq!(ended(child, &parent).code(), Some(0));
@@ -98,6 +99,37 @@ fn a_parent_that_is_killed_takes_it_along_even_while_standard_input_stays_open()
     output.read_to_string(&mut line).unwrap();
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0);
     drop(input);
+}
+
+#[test]
+fn while_the_server_is_stopped_a_sender_waits_and_then_says_how_many_went_out() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let child = serve(&directory, &[]);
+    let send_patience = Duration::from_millis(50);
+    let options = Options { directory: Some(directory), send_patience, ..Options::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let frames: Vec<_> = (0..5000_u32).map(|n| Frame::classic(1, &n.to_le_bytes()).unwrap()).collect();
+
+    signal(&child, Signal::STOP);
+    let before = Instant::now();
+    let error = a.send(&frames).unwrap_err();
+    assert!(before.elapsed() >= send_patience);
+    assert!(matches!(error.cause, BusError::Full { .. }) && error.cause.may_pass(), "{error}");
+    let sent = &frames[..error.sent];
+    assert!(sent.len() >= 253, "{error}");
+
+    signal(&child, Signal::CONT);
+    let (mut inbox, mut heard) = (Inbox::new(), Vec::new());
+    while heard.len() < sent.len() {
+        assert!(b.wait(Some(Duration::from_secs(5))).unwrap(), "{} of {} heard", heard.len(), sent.len());
+        b.receive(&mut inbox).unwrap();
+        heard.extend(inbox.frames().map(|received| received.frame));
+    }
+    assert_eq!(heard, sent);
+    a.send(&frames[..1]).unwrap();
+    signal(&child, Signal::TERM);
+    ended(child, &parent);
 }
 
 #[test]
