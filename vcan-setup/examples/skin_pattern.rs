@@ -3,9 +3,8 @@
 //!
 //! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS] [CELLS_PER_CLIENT]`
 //!
-//! Almost all of the cost is the system's: waking 253 readers. A program that only sends 253 datagrams, reads
-//! 253 and passes those on, with no filters and no queues, costs 1 to 2 % of a core less. Cells that share a
-//! client cost a fraction.
+//! Almost all of the cost is the system's, which wakes one reader per delivery; cells that share a client are
+//! woken together and cost a fraction.
 #![allow(clippy::print_stdout, reason = "an example that prints")]
 
 use std::error::Error;
