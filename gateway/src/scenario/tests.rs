@@ -275,9 +275,9 @@ fn sensors_get_stuck_and_drift() {
 proptest! {
     #[test]
     fn three_words_add_up_exactly_to_the_rounded_force(force_n in -96.0_f64..96.0) {
-        let words = contact_words(force_n).map(|word| i64::from(word.to_bits()));
-        let wanted = (force_n * 1_024.0).round() as i64;
-        prop_assert_eq!(words.iter().sum::<i64>(), wanted.clamp(3 * -32_768, 3 * 32_767));
+        let words = contact_words(force_n).map(|word| i32::from(word.to_bits()));
+        let wanted = (force_n * 1_024.0).round().clamp(3.0 * -32_768.0, 3.0 * 32_767.0);
+        prop_assert_eq!(f64::from(words.iter().sum::<i32>()), wanted);
         prop_assert!(words.iter().max().unwrap() - words.iter().min().unwrap() <= 1);
     }
 
