@@ -340,6 +340,14 @@ pub enum MessageError {
         /// The node field.
         node: u8,
     },
+    /// An addressee that cannot be.
+    #[error("{kind} to node {node}, which is no cell", kind = .kind.name())]
+    Addressee {
+        /// The kind.
+        kind: Kind,
+        /// The node field.
+        node: u8,
+    },
     /// A page that does not exist.
     #[error("{kind} page {page} does not exist", kind = .kind.name())]
     Page {
@@ -490,7 +498,7 @@ impl Message {
 
 fn addressee(kind: Kind, node: u8) -> Result<Node, MessageError> {
     match Node::from_byte(node) {
-        Node::Gateway => Err(MessageError::Sender { kind, node }),
+        Node::Gateway => Err(MessageError::Addressee { kind, node }),
         to @ (Node::Cell(_) | Node::Everyone) => Ok(to),
     }
 }
@@ -604,7 +612,7 @@ mod tests {
         assert_eq!(says(0x201, 2), "torque with count 2; 1 is allowed");
         assert_eq!(says(0x301, 2), "sensors page 2 does not exist");
         assert_eq!(says(0x401, 9), "network page 9 does not exist");
-        assert_eq!(says(0x500, 0), "configure from node 0, which is no cell");
+        assert_eq!(says(0x500, 0), "configure to node 0, which is no cell");
     }
 
     #[test]

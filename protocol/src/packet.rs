@@ -160,10 +160,11 @@ impl Packet {
     /// # Errors
     /// When it is not an FD data frame with an 11-bit identifier, or not a packet.
     pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
+        let id = data_id(frame)?;
         if frame.format() != Format::Fd {
             return Err(PacketError::Length { expected: BYTES, got: frame.data().len() });
         }
-        Self::decode(data_id(frame)?, frame.data())
+        Self::decode(id, frame.data())
     }
 }
 

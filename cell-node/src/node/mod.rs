@@ -35,8 +35,11 @@ pub use stimuli::PENDING;
 
 /// From one heartbeat to the next.
 pub const HEARTBEAT: Span = Span::from_millis(250);
-/// How long a new cell listens for another one under its number.
+/// How long a new cell listens at least for another one under its number.
 pub const CLAIM: Span = Span::from_millis(250);
+/// First words are spread over this time by serial number: two cells under one number that are switched
+/// on together would else send different data under one identifier in the same bit time.
+const FIRST_WORD: Span = Span::from_millis(64);
 /// The shortest time between two answers to another cell under our number.
 const DEFEND: Span = Span::from_millis(10);
 
@@ -76,6 +79,17 @@ impl Identity {
     }
 }
 
+/// How far a cell is with claiming its number.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Claim {
+    /// It has not said anything yet.
+    Unsaid,
+    /// It has claimed the number and listens whether somebody else has it.
+    Said,
+    /// The number is its own.
+    Settled,
+}
+
 /// One cell.
 #[derive(Debug)]
 pub struct Node {
@@ -94,19 +108,19 @@ pub struct Node {
     halves: [Half; HEARD],
     outbox: Deque<Message, OUTBOX>,
     storing: Option<(Parameters, u8)>,
-    claiming_until: Option<Micros>,
+    claim: Claim,
+    settles: Micros,
     next_heartbeat: Micros,
     defended: Option<Micros>,
     taken: Option<u32>,
 }
 
 impl Node {
-    /// A cell that starts now: it claims its number with a first heartbeat, and obeys stimuli if
+    /// A cell that starts now: it will claim its number with a first heartbeat, and obeys stimuli if
     /// `test_mode` says so.
     #[must_use]
     pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
-        let claimed = now + CLAIM;
-        let mut node = Self {
+        Self {
             identity,
             format,
             configuration: Configuration::new(flash),
@@ -122,13 +136,12 @@ impl Node {
             halves: [Half::NONE; HEARD],
             outbox: Deque::new(),
             storing: None,
-            claiming_until: Some(claimed),
-            next_heartbeat: claimed + phase(identity.cell),
+            claim: Claim::Unsaid,
+            settles: now + CLAIM + phase(identity.cell),
+            next_heartbeat: now + Span(u64::from(identity.serial) * 1_000 % FIRST_WORD.0),
             defended: None,
             taken: None,
-        };
-        node.push_heartbeat();
-        node
+        }
     }
 
     /// Who it is.
@@ -156,8 +169,8 @@ impl Node {
 
     /// When [`Node::handle_timeout`] has something to do; calling it earlier does no harm.
     #[must_use]
-    pub fn poll_timeout(&self) -> Micros {
-        self.claiming_until.map_or(self.next_heartbeat, |until| until.min(self.next_heartbeat))
+    pub const fn poll_timeout(&self) -> Micros {
+        self.next_heartbeat
     }
 
     /// Parameters that have to go into flash; then comes [`Node::handle_stored`].
@@ -178,16 +191,19 @@ impl Node {
 
     /// Takes in that time has passed. Harmless when called early.
     pub fn handle_timeout(&mut self, now: Micros) {
-        if self.claiming_until.is_some_and(|until| now >= until) {
-            self.claiming_until = None;
-            self.push_heartbeat();
+        if now < self.next_heartbeat {
+            return;
         }
-        if now >= self.next_heartbeat {
-            self.push_heartbeat();
-            // After a hang the missed ones are skipped, and the phase is kept.
-            let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
-            self.next_heartbeat = self.next_heartbeat + Span((missed + 1) * HEARTBEAT.0);
+        if self.claim == Claim::Unsaid {
+            self.claim = Claim::Said;
+            self.next_heartbeat = self.settles;
+            return self.push_heartbeat();
         }
+        self.claim = Claim::Settled;
+        self.push_heartbeat();
+        // After a hang the missed ones are skipped, and the phase is kept.
+        let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
+        self.next_heartbeat = self.next_heartbeat + Span((missed + 1) * HEARTBEAT.0);
     }
 
     /// Takes a frame that came `age` ago. What this cell does not hear is ignored.
@@ -247,6 +263,10 @@ impl Node {
                 self.active = false;
             }
             Message::Resume => self.flags = self.flags.with(State::HALTED, false),
+            Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
+            Message::Network { page, .. } => self.hear_own_number(now, &page),
+            // Whose number is in doubt answers nothing.
+            Message::Sync | Message::Report | Message::Configure { .. } if self.claim != Claim::Settled => {}
             Message::Sync => self.push_heartbeat(),
             Message::Report => {
                 self.push_network(NetworkPage::Heard(self.heard));
@@ -254,9 +274,7 @@ impl Node {
                 self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
                 self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
             }
-            Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
             Message::Configure { tag, request, .. } => self.configure(tag, request),
-            Message::Network { page, .. } => self.hear_own_number(now, &page),
             // None of these is heard, see `Identity::hears`.
             Message::Sum { .. }
             | Message::Torque { .. }
@@ -283,7 +301,7 @@ impl Node {
         self.epoch = Some(epoch);
         count(&mut self.heard.joints);
         self.stimuli.latch(epoch);
-        if self.claiming_until.is_some() || self.flags.has(State::HALTED) {
+        if self.claim != Claim::Settled || self.flags.has(State::HALTED) {
             return;
         }
         let Some(in_use) = in_use else { return };
@@ -377,18 +395,19 @@ impl Node {
     }
 
     /// Somebody else spoke under our number. While we claim it we give way, unless the other claims it
-    /// too and has the greater serial number; afterwards we say that it is ours.
+    /// too and has the greater serial number; once it is ours we tell those who claim it, and only those:
+    /// two settled cells would go on telling each other for ever.
     fn hear_own_number(&mut self, now: Micros, page: &NetworkPage) {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = match page {
             NetworkPage::Heartbeat(other) => Some(other),
             NetworkPage::Heard(_) | NetworkPage::Refused(_) => None,
         };
-        let stays = other
-            .is_some_and(|other| other.state.has(State::CLAIMING) && other.serial > self.identity.serial);
-        if self.claiming_until.is_some() && !stays {
+        let claims = other.is_some_and(|other| other.state.has(State::CLAIMING));
+        let stays = claims && other.is_some_and(|other| other.serial > self.identity.serial);
+        if self.claim != Claim::Settled && !stays {
             self.taken = Some(other.map_or(0, |other| other.serial));
-        } else if self.defended.is_none_or(|at| now.since(at) >= DEFEND) {
+        } else if claims && self.defended.is_none_or(|at| now.since(at) >= DEFEND) {
             self.defended = Some(now);
             self.push_heartbeat();
         }
@@ -399,7 +418,7 @@ impl Node {
         self.flags
             .with(State::CONFIGURED, self.configuration.in_use().is_some())
             .with(State::ACTIVE, self.active)
-            .with(State::CLAIMING, self.claiming_until.is_some())
+            .with(State::CLAIMING, self.claim != Claim::Settled)
             .with_joint(joint)
     }
 

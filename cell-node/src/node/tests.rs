@@ -28,10 +28,23 @@ fn identity() -> Identity {
 
 /// A cell that has claimed its number and said so.
 fn settled(flash: Flash) -> Node {
-    let mut node = Node::new(identity(), Format::Fd, &flash, true, Micros(0));
-    node.handle_timeout(Micros(CLAIM.0));
-    drain(&mut node);
+    settle(Node::new(identity(), Format::Fd, &flash, true, Micros(0)))
+}
+
+fn settle(mut node: Node) -> Node {
+    for _ in 0..2 {
+        node.handle_timeout(node.poll_timeout());
+        drain(&mut node);
+    }
     node
+}
+
+/// A cell that has just claimed its number, and its claim.
+fn claiming(identity: Identity) -> (Node, Message) {
+    let mut node = Node::new(identity, Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
+    node.handle_timeout(node.poll_timeout());
+    let claim = drain(&mut node)[0];
+    (node, claim)
 }
 
 fn drain(node: &mut Node) -> Vec<Message> {
@@ -131,17 +144,18 @@ fn a_halted_cell_is_silent_until_a_resume() {
 #[test]
 fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
     let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
-    let first = heartbeat(&drain(&mut node));
-    assert!(first.state.has(State::CLAIMING) && first.sent == 0 && first.serial == 100_012);
+    assert_eq!(drain(&mut node), [], "nothing yet");
     let mut times = vec![];
     while times.len() < 4 {
         let at = node.poll_timeout();
         node.handle_timeout(at - Span(1));
         assert_eq!(drain(&mut node), [], "early is harmless");
         node.handle_timeout(at);
-        times.push((at.0, heartbeat(&drain(&mut node)).sent));
+        let heartbeat = heartbeat(&drain(&mut node));
+        assert_eq!(heartbeat.state.has(State::CLAIMING), times.is_empty());
+        times.push((at.0, heartbeat.sent));
     }
-    assert_eq!(times, [(250_000, 1), (261_764, 2), (511_764, 3), (761_764, 4)]);
+    assert_eq!(times, [(44_000, 0), (261_764, 1), (511_764, 2), (761_764, 3)]);
     // A hang of a second costs its heartbeats and keeps the phase.
     node.handle_timeout(Micros(2_000_000));
     assert_eq!(node.poll_timeout(), Micros(2_011_764));
@@ -149,29 +163,40 @@ fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
 
 #[test]
 fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
-    let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
-    drain(&mut node);
     let mut other = settled(Flash::Sound(wheel()));
     // The newcomer's claim reaches the one that is there, which says that the number is its own.
-    let mut newcomer = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
-    let claim = drain(&mut newcomer);
-    let defence = tell(&mut other, &claim[0]);
+    let (mut newcomer, claim) = claiming(Identity { serial: 7, ..identity() });
+    let defence = tell(&mut other, &claim);
     assert!(heartbeat(&defence).state.has(State::DUPLICATE));
     assert_eq!(newcomer.taken(), None);
     tell(&mut newcomer, &defence[0]);
     assert_eq!(newcomer.taken(), Some(100_012));
     assert_eq!(other.taken(), None);
+    // Two that are settled notice each other and do not talk about it for ever.
+    assert_eq!(tell(&mut other, &defence[0]), []);
+    assert!(heartbeat(&tell(&mut other, &Message::Sync)).state.has(State::DUPLICATE));
 }
 
 #[test]
 fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
-    let start =
-        |serial| Node::new(Identity { serial, ..identity() }, Format::Fd, &Flash::Empty, true, Micros(0));
-    let (mut low, mut high) = (start(1), start(2));
-    let (from_low, from_high) = (drain(&mut low), drain(&mut high));
-    tell(&mut low, &from_high[0]);
-    tell(&mut high, &from_low[0]);
+    let (mut low, from_low) = claiming(Identity { serial: 1, ..identity() });
+    let (mut high, from_high) = claiming(Identity { serial: 2, ..identity() });
+    tell(&mut low, &from_high);
+    tell(&mut high, &from_low);
     assert_eq!((low.taken(), high.taken()), (None, Some(1)));
+}
+
+#[test]
+fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
+    let (mut node, _) = claiming(identity());
+    let to = Address::Everyone;
+    let ask = Message::Configure { to, tag: 0, request: Request::Read { number: 0 } };
+    for message in [Message::Sync, Message::Report, ask, press(4.0, From::Next), joints(0)] {
+        assert_eq!(tell(&mut node, &message), []);
+    }
+    node.handle_timeout(node.poll_timeout());
+    assert_eq!(drain(&mut node).len(), 1);
+    assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)], "it has felt all the while");
 }
 
 #[test]
@@ -286,9 +311,7 @@ fn a_torque_that_does_not_fit_is_marked_as_saturated() {
 #[test]
 fn the_classic_format_works_in_halves() {
     let flash = Flash::Sound(wheel());
-    let mut node = Node::new(identity(), Format::Classic, &flash, true, Micros(0));
-    node.handle_timeout(Micros(CLAIM.0));
-    drain(&mut node);
+    let mut node = settle(Node::new(identity(), Format::Classic, &flash, true, Micros(0)));
     let hear = |node: &mut Node, message: &Message| {
         for frame in message.encode().frames(Format::Classic) {
             node.handle_frame(NOW, Span(0), &frame);

@@ -4,6 +4,8 @@
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use protocol::bus::Choice;
@@ -38,6 +40,9 @@ pub enum LaunchError {
         /// Why.
         source: std::io::Error,
     },
+    /// The ends of processes cannot be noticed.
+    #[error("cannot catch SIGCHLD: {0}")]
+    Signal(std::io::Error),
     /// An embedded bus is not served.
     #[error("{path} does not serve {bus}; see its own message above")]
     Serve {
@@ -133,6 +138,8 @@ pub struct Ended {
 #[derive(Debug, Default)]
 pub struct Processes {
     all: Vec<Process>,
+    /// Set by SIGCHLD, so that hundreds of processes are asked how they are only when one has changed.
+    changed: Arc<AtomicBool>,
 }
 
 /// How cells are started.
@@ -159,6 +166,8 @@ impl Processes {
     /// When a process does not start; those before it are ended again.
     pub fn start(plan: &Plan<'_>) -> Result<Self, LaunchError> {
         let mut processes = Self::default();
+        let changed = Arc::clone(&processes.changed);
+        signal_hook::flag::register(signal_hook::consts::SIGCHLD, changed).map_err(LaunchError::Signal)?;
         for (bus, described) in plan.skin.buses.iter().enumerate() {
             let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
             nodes.sort_unstable();
@@ -179,6 +188,9 @@ impl Processes {
     /// Processes that have ended since the last call.
     pub fn ended(&mut self) -> Vec<Ended> {
         let mut ended = Vec::new();
+        if !self.changed.swap(false, Ordering::Relaxed) {
+            return ended;
+        }
         for process in self.all.iter_mut().filter(|process| !process.ended) {
             if let Ok(Some(status)) = process.child.try_wait() {
                 process.ended = true;

@@ -14,7 +14,7 @@ use super::turn::Shared;
 use crate::table::{Notice, Snapshot, Table};
 
 /// Frames are left to gather for so long, so that one wake-up takes many.
-const GATHER: Duration = Duration::from_micros(300);
+const GATHER: Duration = Duration::from_millis(1);
 /// How often time is let pass when nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.

@@ -2,7 +2,6 @@
 //! progress for people, frames into the log, and at the end the summary.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -14,7 +13,6 @@ use protocol::can::Frame;
 use protocol::id::Node;
 use protocol::message::{From, Message, SensorPage};
 use protocol::packet::Epoch;
-use protocol::skin::ControllerKind;
 use protocol::time::Micros;
 
 use super::progress::Progress;
@@ -23,11 +21,10 @@ use super::receiver::{News, Received};
 use super::start::{Bench, rival};
 use super::turn::{Timed, Turn};
 use super::{RunError, usage};
-use crate::controller::{Controller, Hold, Kinesthetic, Sine};
+use crate::controller;
 use crate::cycle::{Cycle, Halt};
-use crate::external::External;
 use crate::robot::SimulatedArm;
-use crate::scenario::{FaultKind, MotionKind, Stimulus, Touches};
+use crate::scenario::{FaultKind, Stimulus, Touches};
 use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary};
 use crate::table::{Accuracy, Notice};
 
@@ -140,20 +137,7 @@ impl Bench<'_> {
     /// The loop's state, by the scenario's motion.
     fn cycle(&self) -> Result<Cycle, RunError> {
         let (skin, motion) = (&self.options.skin, self.options.scenario.motion);
-        let controller: Box<dyn Controller> = match motion.kind {
-            MotionKind::Hold => Box::new(Hold::new(skin, motion.start_rad)),
-            MotionKind::Sine { amplitude_rad, period_s } => {
-                Box::new(Sine::new(skin, motion.start_rad, amplitude_rad, period_s))
-            }
-            MotionKind::Kinesthetic => match &skin.controller.kind {
-                ControllerKind::External { socket } => Box::new(External::listen(Path::new(socket), skin)?),
-                ControllerKind::Kinesthetic { .. } => {
-                    let missing =
-                        || RunError::Usage("the skin describes no kinesthetic controller".to_owned());
-                    Box::new(Kinesthetic::new(skin).ok_or_else(missing)?)
-                }
-            },
-        };
+        let controller = controller::of_motion(skin, &motion)?;
         Ok(Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, motion.start_rad))))
     }
 

@@ -170,6 +170,12 @@ impl Cell {
             })
     }
 
+    /// The cell said what it feels.
+    pub(super) fn feels(&mut self, skin: SkinSensors) {
+        let obeys = self.heartbeat.is_some_and(|heartbeat| heartbeat.state.has(State::TEST_MODE));
+        self.felt.said(skin, obeys);
+    }
+
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         self.felt.latch(epoch)
     }

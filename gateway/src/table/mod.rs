@@ -33,8 +33,9 @@ pub use cell::{Cell, Status};
 pub use counters::{Counters, Event};
 pub use ledger::{Replies, Uplink};
 
-/// A cell that has said nothing for so long is dead.
-pub const DEAD_AFTER: Span = Span::from_millis(500);
+/// A cell that has said nothing for so long is dead: two heartbeats, and the jitter of a busy machine,
+/// so that one lost frame kills nobody.
+pub const DEAD_AFTER: Span = Span::from_millis(600);
 
 /// What a tick needs to know of a bus.
 #[derive(Clone, Debug)]
@@ -336,7 +337,7 @@ impl Table {
             }
             Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refused = Some(refused),
-            Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.felt.measured(skin),
+            Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
             Message::Sum { .. } => self.counters.count(Event::Stranger),
             _ => {}
