@@ -290,6 +290,10 @@ impl<'a> Meaning<'a> {
                 kind: kind(&mut meaning),
                 node: meaning.number("node"),
             }),
+            "addressee" => Error::Message(MessageError::Addressee {
+                kind: kind(&mut meaning),
+                node: meaning.number("node"),
+            }),
             "page" => {
                 Error::Message(MessageError::Page { kind: kind(&mut meaning), page: meaning.number("page") })
             }

@@ -8,6 +8,9 @@ use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
 /// The paper's mean absolute error of single torques, in Nm.
 const PAPER_SINGLE_NM: f64 = 0.0054;
 
+/// Columns of a table that is not on a narrower terminal.
+const WIDTH: u16 = 110;
+
 /// Prints the whole run on standard output.
 #[expect(clippy::print_stdout, reason = "this is the command's output")]
 pub(crate) fn summary(summary: &Summary) {
@@ -30,6 +33,9 @@ impl Rows {
 fn table(summary: &Summary) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    if table.width().is_none_or(|width| width > WIDTH) {
+        table.set_width(WIDTH);
+    }
     let ended = if summary.interrupted { "interrupted" } else { "done" };
     let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
     table.set_header([summary.skin.clone(), cells, String::new()]);

@@ -7,11 +7,12 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::bus::{Bus, Inbox};
 use protocol::can::Frame;
+use protocol::id::Kind;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
 use super::turn::Shared;
-use crate::table::{Notice, Snapshot, Table};
+use crate::table::{Notice, Said, Snapshot, Table};
 
 /// Frames are left to gather for so long, so that one wake-up takes many.
 const GATHER: Duration = Duration::from_millis(1);
@@ -45,13 +46,23 @@ pub enum News {
 /// The state of a bus' cells, renewed every [`LOOK`].
 #[derive(Clone, Debug, Default)]
 pub struct View {
-    /// For each cell, in the bus' order: its number, whether it can be expected to answer, and whether
-    /// its configuration is not the skin's.
-    pub cells: Vec<(u8, bool, bool)>,
-    /// Cells in contact.
-    pub active: usize,
-    /// Cells that reported their counters since somebody cleared this.
-    pub reports: usize,
+    /// Each cell, in the bus' order.
+    pub cells: Vec<CellView>,
+    /// Commands of our own that were read back from the bus.
+    pub commands: u64,
+}
+
+/// The state of one cell.
+#[derive(Clone, Copy, Debug)]
+pub struct CellView {
+    /// Its number.
+    pub node: u8,
+    /// Whether it can be expected to answer.
+    pub ready: bool,
+    /// Whether its configuration is not the skin's.
+    pub other: bool,
+    /// What it has said since it was asked.
+    pub said: Said,
 }
 
 /// One bus, as its receiver sees it.
@@ -165,15 +176,15 @@ impl Receiver {
         for notice in notices {
             self.tell(News::Notice(notice));
         }
-        let cells = self.table.cells().iter().map(|cell| {
-            let other = cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration);
-            (cell.node.get(), cell.is_ready(), other)
+        let cells = self.table.cells().iter().map(|cell| CellView {
+            node: cell.node.get(),
+            ready: cell.is_ready(),
+            other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+            said: cell.said(),
         });
-        let cells = cells.collect();
-        let active = usize::try_from(self.table.snapshot().contributing).unwrap_or(usize::MAX);
-        let reports = self.table.cells().iter().filter(|cell| cell.refused.is_some()).count();
+        let (cells, commands) = (cells.collect(), self.table.counters().sent(Kind::Command));
         if let Ok(mut view) = self.view.lock() {
-            *view = View { cells, active, reports };
+            *view = View { cells, commands };
         }
     }
 

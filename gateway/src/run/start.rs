@@ -15,7 +15,7 @@ use protocol::skin::Reply;
 
 use super::launch::{Plan, Processes, ServedBus, program};
 use super::log::Log;
-use super::receiver::{Captured, News, Received, Receiver, View};
+use super::receiver::{Captured, CellView, News, Received, Receiver, View};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, realtime};
 use crate::scenario::FaultKind;
@@ -211,7 +211,7 @@ impl Bench<'_> {
         loop {
             thread::sleep(Duration::from_millis(5));
             self.hear_while_starting()?;
-            let now_ready = self.count(|&(_, ready, _)| ready);
+            let now_ready = self.count(|cell| cell.ready);
             if now_ready > ready {
                 (ready, progress) = (now_ready, Instant::now());
             }
@@ -228,7 +228,7 @@ impl Bench<'_> {
     }
 
     fn judge_start(&self, ready: usize) -> Result<(), RunError> {
-        let silent = self.names(|&(_, ready, _)| !ready);
+        let silent = self.names(|cell| !cell.ready);
         if ready == 0 || (self.options.spawn && !silent.is_empty()) {
             let remedy = if self.options.spawn {
                 "see their own messages above"
@@ -237,7 +237,7 @@ impl Bench<'_> {
             };
             return Err(RunError::Failed(format!("cells that are not ready: {silent}; {remedy}")));
         }
-        let other = self.names(|&(_, ready, other)| ready && other);
+        let other = self.names(|cell| cell.ready && cell.other);
         if !other.is_empty() {
             let remedy = "configure them for it, or delete their flash files";
             return Err(RunError::Failed(format!(
@@ -277,14 +277,14 @@ impl Bench<'_> {
         Ok(())
     }
 
-    fn count(&self, wanted: impl Fn(&(u8, bool, bool)) -> bool) -> usize {
+    pub(super) fn count(&self, wanted: impl Fn(&CellView) -> bool) -> usize {
         self.each_view(|_, view| view.cells.iter().filter(|cell| wanted(cell)).count()).into_iter().sum()
     }
 
     /// The names of some cells, for people: `1, 2, 5 on vcan0`.
-    fn names(&self, wanted: impl Fn(&(u8, bool, bool)) -> bool) -> String {
+    fn names(&self, wanted: impl Fn(&CellView) -> bool) -> String {
         let names = self.each_view(|bus, view| {
-            let nodes = view.cells.iter().filter(|cell| wanted(cell)).map(|(node, ..)| node.to_string());
+            let nodes = view.cells.iter().filter(|cell| wanted(cell)).map(|cell| cell.node.to_string());
             let nodes: Vec<_> = nodes.collect();
             match nodes.len() {
                 0 => String::new(),
@@ -297,16 +297,17 @@ impl Bench<'_> {
         names.into_iter().filter(|names| !names.is_empty()).collect::<Vec<_>>().join("; ")
     }
 
-    fn each_view<T>(&self, look: impl Fn(&str, &View) -> T) -> Vec<T> {
+    pub(super) fn each_view<T>(&self, look: impl Fn(&str, &View) -> T) -> Vec<T> {
         let look = |lane: &Lane| lane.view.lock().ok().map(|view| look(lane.bus.name(), &view));
         self.lanes.iter().filter_map(look).collect()
     }
 
-    /// Sends a message on every bus.
+    /// Sends a command on every bus.
     pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
         for (lane, described) in self.lanes.iter().zip(&self.options.skin.buses) {
             let frames: Vec<Frame> = message.encode().frames(described.format).collect();
             lane.bus.send(&frames).map_err(BusError::from)?;
+            self.shared.commands.fetch_add(1, Ordering::Relaxed);
         }
         Ok(())
     }

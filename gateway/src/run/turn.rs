@@ -24,6 +24,8 @@ pub struct Shared {
     pub comparing: AtomicBool,
     /// Broadcasts sent so far.
     pub broadcasts: AtomicU64,
+    /// Commands that buses took, joints among them.
+    pub commands: AtomicU64,
     /// Records that did not fit into their queue.
     pub records_lost: AtomicU64,
     /// Broadcasts that were skipped with their ticks.
@@ -128,13 +130,15 @@ impl Turn {
         }
     }
 
-    /// Sends a message on every bus.
+    /// Sends a command on every bus.
     fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         let packet = message.encode();
         for (bus, line) in self.lines.iter().enumerate() {
             let (frames, count) = frames(&packet, line.format);
             let frames = frames.get(..count).unwrap_or_default();
-            if !send(bus, frames) {
+            if send(bus, frames) {
+                self.shared.commands.fetch_add(1, Ordering::Relaxed);
+            } else {
                 self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
             }
         }

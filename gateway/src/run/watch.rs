@@ -32,8 +32,8 @@ use crate::table::{Accuracy, Notice};
 const LEAD: u64 = 5;
 /// The main thread's rhythm.
 const LOOK: Duration = Duration::from_millis(4);
-/// How long the cells may take to say their last words.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// How long the cells may take to say their last words; a machine that is overloaded needs it.
+const LAST_WORDS: Duration = Duration::from_secs(3);
 
 /// What the loop's records add up to.
 #[derive(Debug)]
@@ -114,9 +114,10 @@ impl Bench<'_> {
         let processor = self.processor().since(before, duration_s);
         let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
         self.last_words(interrupted)?;
+        self.write_log()?;
         let received = self.stop_receivers();
-        let lost =
-            self.write_log()? + received.iter().flatten().map(|received| received.unrecorded).sum::<u64>();
+        self.write_log()?;
+        let lost = received.iter().flatten().map(|received| received.unrecorded).sum();
         let recording = self.log.take().map(|log| log.finish(lost)).transpose()?;
         Ok(Summary {
             skin: options.skin.name.clone(),
@@ -285,57 +286,51 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Writes what the receivers captured; returns how many frames could not be written.
-    fn write_log(&mut self) -> Result<u64, RunError> {
-        let Some(log) = &mut self.log else { return Ok(0) };
+    /// Writes what the receivers captured.
+    fn write_log(&mut self) -> Result<(), RunError> {
+        let Some(log) = &mut self.log else { return Ok(()) };
         for lane in &mut self.lanes {
             let Some(captured) = &mut lane.captured else { continue };
             while let Ok(frame) = captured.pop() {
                 log.write(lane.bus.name(), &frame)?;
             }
         }
-        Ok(0)
+        Ok(())
     }
 
-    /// Lets late replies come in, and asks all cells for a heartbeat and their counters.
+    /// Lets late replies come in, and asks all cells for their counters and a last heartbeat.
     fn last_words(&mut self, interrupted: bool) -> Result<(), RunError> {
         thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
-        let alive = self.alive();
-        for lane in &self.lanes {
-            if let Ok(mut view) = lane.view.lock() {
-                view.reports = 0;
-            }
-        }
+        self.wait_until(|bench| bench.has_caught_up())?;
+        let alive = self.count(|cell| cell.ready);
         self.say(&Message::Report)?;
-        let give_up = Instant::now() + LAST_WORDS;
-        while self.reports() < alive && Instant::now() < give_up {
-            thread::sleep(LOOK);
-            self.write_log()?;
-        }
+        self.wait_until(|bench| bench.has_caught_up() && bench.count(|cell| cell.said.counters) >= alive)?;
         if interrupted {
             self.say(&Message::Halt)?;
         }
         // Last of all, so that each cell's own count covers everything else that it has sent.
         self.say(&Message::Sync)?;
-        thread::sleep(Duration::from_millis(150));
-        self.write_log()?;
+        self.wait_until(|bench| bench.has_caught_up() && bench.count(|cell| cell.said.heartbeat) >= alive)
+    }
+
+    /// Whether the receivers have read everything that was sent; what came before it they have read too.
+    fn has_caught_up(&self) -> bool {
+        self.each_view(|_, view| view.commands).into_iter().sum::<u64>() >= self.shared.commands.load(Ordering::Relaxed)
+    }
+
+    /// Waits for something, but not for ever; what is missing then shows in the accounts.
+    fn wait_until(&mut self, done: impl Fn(&Self) -> bool) -> Result<(), RunError> {
+        let give_up = Instant::now() + LAST_WORDS;
+        while !done(self) && Instant::now() < give_up {
+            thread::sleep(LOOK);
+            self.write_log()?;
+        }
         Ok(())
-    }
-
-    fn alive(&self) -> usize {
-        let ready = |lane: &super::start::Lane| {
-            lane.view.lock().map_or(0, |view| view.cells.iter().filter(|(_, ready, _)| *ready).count())
-        };
-        self.lanes.iter().map(ready).sum()
-    }
-
-    fn reports(&self) -> usize {
-        self.lanes.iter().map(|lane| lane.view.lock().map_or(0, |view| view.reports)).sum()
     }
 
     fn processor(&self) -> Processor {
         Processor {
-            gateway: usage::processor_seconds(std::process::id()),
+            gateway: usage::own_seconds(),
             cells: self.processes.pids().map(usage::processor_seconds).sum(),
             buses: self.served.iter().map(|served| usage::processor_seconds(served.pid())).sum(),
         }

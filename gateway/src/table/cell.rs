@@ -43,6 +43,15 @@ impl Status {
     }
 }
 
+/// What a cell has said since it was asked.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Said {
+    /// A heartbeat since the last sync.
+    pub heartbeat: bool,
+    /// Its counters since the last report.
+    pub counters: bool,
+}
+
 /// What changed in the running sum.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Change {
@@ -77,6 +86,8 @@ pub struct Cell {
     pub uplink: Uplink,
     /// Replies due and come.
     pub replies: Replies,
+    /// Whether it has said a heartbeat since the last sync, and its counters since the last report.
+    pub(super) said: Said,
     pub(super) felt: Felt,
     last_word: Option<Micros>,
     dead: bool,
@@ -104,6 +115,7 @@ impl Cell {
             refused: None,
             uplink: Uplink::default(),
             replies: Replies::default(),
+            said: Said::default(),
             felt: Felt::default(),
             last_word: None,
             dead: false,
@@ -147,8 +159,21 @@ impl Cell {
             self.heard = Some(<(Heard, Heard)>::default());
             self.told = 0;
         }
+        self.said.heartbeat = true;
         self.heartbeat = Some(*heartbeat);
         if heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
+    }
+
+    /// What it has said since it was asked.
+    #[must_use]
+    pub const fn said(&self) -> Said {
+        self.said
+    }
+
+    /// What the cell refused, the last page of its counters.
+    pub(super) const fn refuses(&mut self, refused: Refused) {
+        self.refused = Some(refused);
+        self.said.counters = true;
     }
 
     /// Counters that the cell reports; the first ones since a start are what later ones are compared to.

@@ -35,9 +35,9 @@ impl Uplink {
         self.rejected_since += 1;
     }
 
-    /// A heartbeat says that the cell had sent `said` packets, modulo 2^16. Call it before the heartbeat
-    /// itself arrives.
+    /// A heartbeat, which has arrived, says that the cell had sent `said` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, said: u16, restarted: bool) {
+        let said = said.wrapping_add(1);
         let before = self.said.replace(said);
         if restarted && before.is_some() {
             self.restarts += 1;
@@ -120,10 +120,10 @@ mod tests {
     fn what_did_not_arrive_by_the_next_heartbeat_is_lost() {
         let mut uplink = Uplink::default();
         uplink.settle(65_534, false);
-        uplink.arrive(); // the heartbeat itself
         uplink.arrive();
         uplink.reject();
-        uplink.settle(3, false); // five were sent
+        uplink.arrive(); // the heartbeat itself
+        uplink.settle(3, false); // four were sent in between, and this one
         assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (5, 2, 1, 2));
         uplink.arrive();
         uplink.settle(0, true);

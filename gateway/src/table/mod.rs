@@ -29,7 +29,7 @@ use protocol::time::{Micros, Span};
 use crate::central::Central;
 
 pub use accuracy::{Accuracy, Errors};
-pub use cell::{Cell, Status};
+pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
 pub use ledger::{Replies, Uplink};
 
@@ -283,9 +283,9 @@ impl Table {
             Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, positions(epoch)),
             Message::Stimulus { to, from, page } => self.expect_feeling(to, from, page),
             Message::Halt => self.each_cell(Cell::let_go),
+            Message::Sync => self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false),
+            Message::Report => self.cells.iter_mut().for_each(|cell| cell.said.counters = false),
             Message::Resume
-            | Message::Sync
-            | Message::Report
             | Message::Sum { .. }
             | Message::Torque { .. }
             | Message::Sensors { .. }
@@ -331,19 +331,17 @@ impl Table {
             self.snapshot.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
+        cell.uplink.arrive();
         match *message {
             Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 self.take_heartbeat(place, &heartbeat)
             }
             Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
-            Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refused = Some(refused),
+            Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refuses(refused),
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
             Message::Sum { .. } => self.counters.count(Event::Stranger),
             _ => {}
-        }
-        if let Some(cell) = self.cells.get_mut(place) {
-            cell.uplink.arrive();
         }
     }
 

@@ -572,8 +572,8 @@ def bad():
         for number_of_node in (0, 255):
             meaningless(f"sender kind={name} node={number_of_node}", kind, number_of_node, count)
     meaningless("sender kind=network node=255", 4, 255, 0)
-    meaningless("sender kind=configure node=0", 5, 0, 0)
-    meaningless("sender kind=stimulus node=0", 7, 0, 0)
+    meaningless("addressee kind=configure node=0", 5, 0, 0)
+    meaningless("addressee kind=stimulus node=0", 7, 0, 0)
     log.title("pages that do not exist")
     for page in (2, 127, 128, 129, 255):
         meaningless(f"page kind=sensors page={page}", 3, 12, page)
