@@ -3,6 +3,7 @@
 pub mod central;
 pub mod controller;
 pub mod cycle;
+pub mod decode;
 pub mod external;
 pub mod generate;
 pub mod robot;

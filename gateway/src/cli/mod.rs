@@ -1,11 +1,17 @@
 //! The commands. Each is a thin layer over the library; errors are one line, exit codes are 0 (done),
 //! 1 (the run failed) and 2 (wrong use or configuration).
 
+mod ack;
+mod dump;
+mod frame;
+mod output;
 mod print;
 mod run;
+mod skin;
 
 use std::process::ExitCode;
 
+use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 
 /// Bridges a robot skin's bus to a control loop.
@@ -20,6 +26,10 @@ struct Arguments {
 enum Command {
     Demo(run::Demo),
     Run(run::Run),
+    Dump(dump::Dump),
+    Frame(frame::Frame),
+    Ack(ack::Ack),
+    Skin(skin::Skin),
 }
 
 /// An error for people, and the exit code that goes with it.
@@ -43,9 +53,23 @@ impl Failure {
 
 /// Reads the command line and does it.
 pub(crate) fn main() -> ExitCode {
-    let done = match Arguments::parse().command {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        // Help and version, which are asked for, are printed as they are.
+        Err(asked) if !asked.use_stderr() => asked.exit(),
+        Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
+        Err(wrong) => {
+            eprintln!("gateway: {}", one_line(&wrong.render().to_string()));
+            return ExitCode::from(2);
+        }
+    };
+    let done = match arguments.command {
         Command::Demo(command) => command.run(),
         Command::Run(command) => command.run(),
+        Command::Dump(command) => command.run(),
+        Command::Frame(command) => command.run(),
+        Command::Ack(command) => command.run(),
+        Command::Skin(command) => command.run(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -54,4 +78,13 @@ pub(crate) fn main() -> ExitCode {
             ExitCode::from(code)
         }
     }
+}
+
+/// What clap says in several lines: what is wrong and its tip, without the usage.
+fn one_line(text: &str) -> String {
+    let text = text.strip_prefix("error: ").unwrap_or(text);
+    let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
+    let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
+    let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
+    format!("{lines}; try '--help'")
 }

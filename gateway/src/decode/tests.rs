@@ -1,0 +1,287 @@
+//! The text of every kind of frame, against lines made by hand from the document and the golden logs'
+//! comments.
+
+use super::*;
+use proptest::prelude::*;
+use protocol::candump::{self, Line};
+
+const DOCUMENT: &str = include_str!("../../../protocol/tests/golden/document.log");
+const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
+const BAD: &str = include_str!("../../../protocol/tests/golden/bad.log");
+const CLASSIC: &str = include_str!("../../../protocol/tests/golden/classic.log");
+
+/// Each frame's comment in the log and its text here.
+fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
+    let mut decoder = Decoder::new(format);
+    let (mut comment, mut all) = ("", Vec::new());
+    for line in log.lines() {
+        match candump::parse(line).unwrap() {
+            Line::Frame(record) => {
+                let at = Micros(record.time.nanos / 1_000);
+                let text = decoder.decode(at, record.interface, &record.frame).to_string();
+                all.push((comment.to_owned(), text));
+            }
+            Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.trim_start_matches("# "),
+        }
+    }
+    all
+}
+
+/// The text of a frame as cansend takes it.
+fn text(frame: &str) -> String {
+    let frame = candump::parse_frame(frame).unwrap();
+    Decoder::new(None).decode(Micros(0), "vcan0", &frame).to_string()
+}
+
+/// Holds the text of the only frame with each comment against what is expected.
+fn check(log: &str, expected: &[(&str, &str)]) {
+    let all = decoded(log, None);
+    for (comment, text) in expected {
+        let found: Vec<_> = all.iter().filter(|(of, _)| of == comment).map(|(_, text)| text).collect();
+        assert_eq!(found, [text], "{comment}");
+    }
+}
+
+#[test]
+fn the_frames_of_the_document() {
+    let texts: Vec<_> = decoded(DOCUMENT, None).into_iter().map(|(_, text)| text).collect();
+    let skin = "proximity 0.0000, temperature 0.00 0.00 °C";
+    let expected = [
+        "ok      torque 12 epoch 7: 1.0000 -0.5000 0.0002 0.0000 0.0000 0.0000 Nm".to_owned(),
+        "ok      halt".to_owned(),
+        "ok      sync".to_owned(),
+        "ok      resume".to_owned(),
+        "ok      joints epoch 7: 0.0000 -1.2000 1.0000 -1.4000 -1.5700 0.0000 rad".to_owned(),
+        "ok      configure 12 tag 1: write mount: joint 2 of 6".to_owned(),
+        "ok      configure 12 tag 2: write pose: position 0.1000 0.0500 0.0600 m, normal 0.0000 0.8000 0.6000"
+            .to_owned(),
+        "ok      configure 12 tag 3: write contact: alpha_c 1.0000, alpha_p 0.000 N, contact threshold 0.101 N, \
+         proximity threshold 0.0500, force threshold 0.101 N"
+            .to_owned(),
+        "ok      configure 12 tag 4: write timing: period 16000 us".to_owned(),
+        row(5, "row1: a 0.0000 m, d 0.0892 m, alpha 1.5708 rad"),
+        row(6, "row2: a -0.4250 m, d 0.0000 m, alpha 0.0000 rad"),
+        row(7, "row3: a -0.3923 m, d 0.0000 m, alpha 0.0000 rad"),
+        row(8, "row4: a 0.0000 m, d 0.1091 m, alpha 1.5708 rad"),
+        row(9, "row5: a 0.0000 m, d 0.0947 m, alpha -1.5708 rad"),
+        row(10, "row6: a 0.0000 m, d 0.0823 m, alpha 0.0000 rad"),
+        "ok      configure 12 tag 11: write commit: hash 266D".to_owned(),
+        "ok      configure 12 tag 12: write mode: 1, obey stimuli".to_owned(),
+        format!("ok      stimulus 12 from the next joints on: force 3.000 N (1.000 1.000 1.000), {skin}"),
+        format!("ok      stimulus 12 from the next joints on: force 0.000 N (0.000 0.000 0.000), {skin}"),
+        "ok      torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm".to_owned(),
+        "ok      torque 12 epoch 8: 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 Nm".to_owned(),
+    ];
+    assert_eq!(texts, expected);
+}
+
+fn row(tag: u8, text: &str) -> String {
+    format!("ok      configure 12 tag {tag}: write {text}, theta offset 0.0000 rad")
+}
+
+#[test]
+fn every_other_kind_has_its_text() {
+    check(
+        FD,
+        &[
+            ("report", "ok      report"),
+            (
+                "joints epoch=2 in_use=3 positions=0.5,-0.5,0.006103515625,0,0,0",
+                "ok      joints epoch 2: 0.7854 -0.7854 0.0096 rad",
+            ),
+            (
+                "sum from=254 epoch=255 count=255 torque=127.99609375,-128,127.9921875,-127.99609375,0,0",
+                "ok      sum 254 epoch 255: +saturated -saturated 127.992 -127.996 0.000 0.000 Nm, cells 255",
+            ),
+            (
+                "torque from=254 epoch=255 torque=7.999755859375,-8,7.99951171875,-7.999755859375,0,-0.000244140625",
+                "ok      torque 254 epoch 255: +saturated -saturated 7.9995 -7.9998 0.0000 -0.0002 Nm",
+            ),
+            (
+                "sensors from=12 epoch=9 contact=1,0.9990234375,-0.0009765625 proximity=1 temperature=25,-40",
+                "ok      sensors 12 epoch 9: force 1.998 N (1.000 0.999 -0.001), proximity 1.0000, \
+                 temperature 25.00 -40.00 °C",
+            ),
+            (
+                "sensors from=7 epoch=4 acceleration=7.999755859375,-8,-0.000244140625",
+                "ok      sensors 7 epoch 4: acceleration 7.9998 -8.0000 -0.0002 g",
+            ),
+            (
+                "heartbeat from=12 epoch=7 serial=100001 configuration=BEEF sent=4711 rejected=3 \
+                 state=configured+active joint=2 version=1",
+                "ok      network 12 epoch 7 heartbeat: serial 100001, hash BEEF, sent 4711, refused 3, \
+                 configured+active, joint 2, version 1",
+            ),
+            (
+                "heartbeat from=254 epoch=255 serial=4294967295 configuration=FFFF sent=65535 rejected=65535 \
+                 state=configured+active+halted+flash-damaged+duplicate+test-mode+saturated+claiming joint=15 \
+                 version=15",
+                "ok      network 254 epoch 255 heartbeat: serial 4294967295, hash FFFF, sent 65535, refused 65535, \
+                 configured+active+halted+flash-damaged+duplicate+test-mode+saturated+claiming, joint 15, version 15",
+            ),
+            (
+                "heartbeat from=gateway epoch=200 serial=1 configuration=0000 sent=1 rejected=0 state=none joint=0 \
+                 version=1",
+                "ok      network gateway epoch 200 heartbeat: serial 1, hash 0000, sent 1, refused 0, none, joint 0, \
+                 version 1",
+            ),
+            (
+                "heard from=12 epoch=7 joints=1000 joints_late=2 joints_repeated=3 stimuli=40 stimuli_late=5 \
+                 torques=600",
+                "ok      network 12 epoch 7 heard: joints 1000, skipped 2, repeated 3, stimuli 40, late 5, torques 600",
+            ),
+            (
+                "refused from=12 epoch=7 length=1 crc=20 foreign=300 meaning=4000 incomplete=50000 stimuli=6",
+                "ok      network 12 epoch 7 refused: length 1, CRC 20, foreign 300, meaning 4000, incomplete 50000, \
+                 stimuli 6",
+            ),
+            ("read to=12 tag=2 parameter=2", "ok      configure 12 tag 2: read pose"),
+            ("read to=254 tag=0 parameter=99", "ok      configure 254 tag 0: read parameter 99"),
+            ("write to=12 tag=9 parameter=5 on=0", "ok      configure 12 tag 9: write mode: 0, measure"),
+            (
+                "write to=everyone tag=255 parameter=127 hash=0000",
+                "ok      configure everyone tag 255: write commit: hash 0000",
+            ),
+            (
+                "write to=254 tag=0 parameter=99 words=1,-1,32767,-32768,0,256",
+                "ok      configure 254 tag 0: write parameter 99: words 1 -1 32767 -32768 0 256",
+            ),
+            (
+                "value from=12 tag=0 parameter=0 words=-31071,1,1,-16657,4611,0",
+                "ok      configured 12 tag 0: has identity: serial 100001, version 1, hash BEEF, \
+                 configured+active, joint 2, version 1",
+            ),
+            (
+                "written from=12 tag=1 parameter=1 joint=2 joints=6",
+                "ok      configured 12 tag 1: wrote mount: joint 2 of 6",
+            ),
+            (
+                "refusal from=12 tag=200 parameter=1 reason=3",
+                "ok      configured 12 tag 200: refuses mount: joint k is not 1 to the robot's joints (reason 3)",
+            ),
+            (
+                "refusal from=254 tag=255 parameter=127 reason=16",
+                "ok      configured 254 tag 255: refuses commit: the hash is not that of the staged copy (reason 16)",
+            ),
+            (
+                "stimulus to=12 from=7 contact=1,1,1 proximity=0 temperature=0,0",
+                "ok      stimulus 12 from epoch 7 on: force 3.000 N (1.000 1.000 1.000), proximity 0.0000, \
+                 temperature 0.00 0.00 °C",
+            ),
+            (
+                "stimulus to=everyone from=next acceleration=0,0,-8",
+                "ok      stimulus everyone from the next joints on: acceleration 0.0000 0.0000 -8.0000 g",
+            ),
+        ],
+    );
+}
+
+#[test]
+fn everything_that_can_be_said_is_ok() {
+    let texts = decoded(FD, None);
+    assert!(texts.len() > 80, "the log is there");
+    for (comment, text) in texts {
+        assert!(text.starts_with("ok      "), "{comment}: {text}");
+    }
+}
+
+#[test]
+fn what_is_refused_says_why() {
+    for (comment, text) in decoded(BAD, Some(Format::Fd)) {
+        let words: Vec<_> = comment.split(' ').collect();
+        let field = |name: &str| words.iter().find_map(|word| word.strip_prefix(name)).unwrap().to_owned();
+        match words[1] {
+            "crc" => {
+                let (expected, got) = (field("expected="), field("got="));
+                assert!(text.starts_with("CRC     "), "{comment}: {text}");
+                assert!(text.ends_with(&format!(": CRC {got}, not {expected}")), "{comment}: {text}");
+            }
+            "length" => {
+                assert_eq!(text, format!("length  torque 12: {} data bytes, not 16", field("got=")));
+            }
+            "foreign" => assert_eq!(text, "foreign 29-bit identifier"),
+            _ => assert!(text.starts_with("meaning "), "{comment}: {text}"),
+        }
+    }
+    let odd = "command 9: command 9 does not exist: 0 halt, 1 joints, 2 sync, 3 resume, 4 report do";
+    assert_eq!(decoded(CLASSIC, None).last().unwrap().1, format!("meaning {odd}"));
+}
+
+#[test]
+fn halves_meet_by_bus_and_identifier() {
+    for (comment, text) in decoded(CLASSIC, None) {
+        let expected = match comment.split(' ').next().unwrap() {
+            "waiting" => "half    ",
+            "incomplete" => {
+                assert!(text.ends_with(", the half before it dropped: incomplete"), "{comment}: {text}");
+                "half    "
+            }
+            "whole" if comment.contains(" bad ") => "meaning ",
+            "whole" => "ok      ",
+            _ if comment.starts_with("bad length") => "length  ",
+            _ => "foreign ",
+        };
+        assert!(text.starts_with(expected), "{comment}: {text}");
+    }
+    let mut decoder = Decoder::new(None);
+    let [first, second] =
+        ["20C#001000F801000000", "20C#00000000070175D6"].map(|text| candump::parse_frame(text).unwrap());
+    let mut verdict = |bus: &str, frame| decoder.decode(Micros(0), bus, frame).verdict();
+    assert_eq!(
+        [verdict("a", &first), verdict("b", &second), verdict("a", &second), verdict("b", &first)],
+        ["half", "half", "ok", "half"]
+    );
+}
+
+#[test]
+fn on_a_bus_of_one_format_the_other_is_refused() {
+    let fd = candump::parse_frame("20C##1001000F80100000000000000070175D6").unwrap();
+    let classic = candump::parse_frame("20C#001000F801000000").unwrap();
+    let text = |format, frame| Decoder::new(Some(format)).decode(Micros(0), "vcan0", frame).to_string();
+    assert_eq!(text(Format::Fd, &classic), "length  torque 12: 8 data bytes, not 16");
+    assert_eq!(text(Format::Classic, &fd), "length  torque 12: 16 data bytes, not 8");
+}
+
+#[test]
+fn foreign_frames_say_what_they_are() {
+    assert_eq!(text("1F334455#11"), "foreign 29-bit identifier");
+    assert_eq!(text("20C#R8"), "foreign remote frame");
+    assert_eq!(text("20000004#0001000000000000"), "foreign error frame of the driver");
+}
+
+#[test]
+fn saturation_is_noticed() {
+    let mut decoder = Decoder::new(None);
+    for line in FD.lines() {
+        if let Line::Frame(record) = candump::parse(line).unwrap() {
+            let decoded = decoder.decode(Micros(0), record.interface, &record.frame);
+            // `+saturated` is also how a heartbeat lists that bit.
+            let said =
+                decoded.to_string().contains(" +saturated") || decoded.to_string().contains(" -saturated");
+            assert_eq!(decoded.is_saturated(), said, "{decoded}");
+        }
+    }
+}
+
+#[test]
+fn memory_is_bounded_whatever_buses_a_log_names() {
+    let mut decoder = Decoder::new(None);
+    let frame = candump::parse_frame("20C#001000F801000000").unwrap();
+    for bus in 0..1_000 {
+        decoder.decode(Micros(0), &format!("can{bus}"), &frame);
+    }
+    assert_eq!(decoder.lanes.len(), LANES);
+}
+
+proptest! {
+    #[test]
+    fn every_packet_is_one_line(id in 0_u16..0x800, words: [i16; 6], epoch: u8, count: u8) {
+        let epoch = protocol::packet::Epoch(epoch);
+        let packet = Packet { id: Id::from_bits(id), words, epoch, count };
+        for frame in packet.frames(Format::Fd) {
+            let text = Decoder::new(None).decode(Micros(0), "vcan0", &frame).to_string();
+            prop_assert!(text.len() > 8 && !text.contains(['\n', '\t']), "{}", text);
+            prop_assert!(!text.starts_with("CRC") && !text.contains("-0.0000 "), "{}", text);
+        }
+    }
+}
