@@ -12,7 +12,7 @@ use super::felt::Felt;
 use super::ledger::{Replies, Uplink};
 
 /// A torque may answer the newest epoch, or one of so many before it.
-pub(super) const LATEST: i8 = 3;
+pub(super) const LATEST: usize = 3;
 
 /// How a cell is.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
@@ -101,7 +101,7 @@ pub struct Cell {
     told: u64,
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
     due: u8,
-    expected: [Option<Expected>; LATEST as usize + 1],
+    expected: [Option<Expected>; LATEST + 1],
 }
 
 impl Cell {
@@ -124,7 +124,7 @@ impl Cell {
             contribution: [0; WORDS],
             told: 0,
             due: 0,
-            expected: [None; LATEST as usize + 1],
+            expected: [None; LATEST + 1],
         }
     }
 
@@ -229,12 +229,17 @@ impl Cell {
         (self.contribute(held.map(|word| word * keep / whole)), missed)
     }
 
+    /// The last broadcast came again: the cell hears and drops it, and owes nothing for it.
+    pub(super) const fn hear_again(&mut self) {
+        self.told += 1;
+    }
+
     pub(super) const fn is_due(&self) -> bool {
         self.due & 1 != 0
     }
 
     /// A torque answers the broadcast `number`, `lag` before the newest. Returns whether it was due.
-    pub(super) fn answer(&mut self, number: u64, lag: i8) -> bool {
+    pub(super) fn answer(&mut self, number: u64, lag: usize) -> bool {
         self.answered = Some(number);
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;

@@ -95,6 +95,8 @@ pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; WORDS]> + 'a;
 #[derive(Clone, Copy, Debug)]
 struct Broadcast {
     epoch: Epoch,
+    /// The epochs that may still be answered, in the order in which the bus carried them, newest first.
+    recent: [Option<Epoch>; cell::LATEST + 1],
     /// Broadcasts before this one.
     number: u64,
     at: Micros,
@@ -363,11 +365,11 @@ impl Table {
             return self.counters.count(Event::StaleTorque);
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let lag = broadcast.epoch.since(epoch);
-        let number = u64::try_from(lag).ok().and_then(|lag| broadcast.number.checked_sub(lag));
-        let Some(number) = number.filter(|_| lag <= cell::LATEST) else {
+        // Not by the epochs' difference: broadcasts may be lost on the way back, or change places.
+        let Some(lag) = broadcast.recent.iter().position(|&recent| recent == Some(epoch)) else {
             return self.counters.count(Event::StaleTorque);
         };
+        let number = broadcast.number - lag as u64;
         if cell.answered.is_some_and(|last| number <= last) {
             let repeated = cell.answered == Some(number);
             return self.counters.count(if repeated { Event::RepeatedTorque } else { Event::StaleTorque });
@@ -394,7 +396,16 @@ impl Table {
 
     /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
     fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
+        if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
+            // Repeated on the way: cells drop it.
+            return self.cells.iter_mut().for_each(Cell::hear_again);
+        }
         let number = self.broadcast.map_or(0, |before| before.number + 1);
+        let mut recent = self.broadcast.map_or([None; cell::LATEST + 1], |before| before.recent);
+        recent.rotate_right(1);
+        if let Some(newest) = recent.first_mut() {
+            *newest = Some(epoch);
+        }
         self.close_epoch();
         let frames = self.comparing.then(|| self.central.frames(&joints.positions));
         let exact = frames.map(|_| {
@@ -421,7 +432,7 @@ impl Table {
         }
         (self.snapshot.stale, self.snapshot.age) = (stale, age);
         let error = [0.0; WORDS];
-        self.broadcast = Some(Broadcast { epoch, number, at, due, in_time: 0, last_reply: None, error });
+        self.broadcast = Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
     }
 
     fn close_epoch(&mut self) {
