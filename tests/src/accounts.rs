@@ -1,0 +1,83 @@
+//! What must be true of every run, whatever was broken.
+
+use gateway::table::{Event, Replies, Uplink};
+use protocol::can::Format;
+use protocol::id::Kind;
+
+use crate::bench::Bench;
+
+/// Asserts that every account of a finished run adds up.
+///
+/// # Panics
+/// When one does not; the text says which, of which cell.
+pub fn check(bench: &Bench) {
+    cells(bench);
+    torques(bench);
+    frames(bench);
+    let table = &bench.gateway.table;
+    let counters = table.counters();
+    let dead = bench.gateway.table.snapshot().dead;
+    let silent = table.statuses(bench.now()).filter(|(_, status)| status.name() == "dead").count();
+    assert_eq!(dead as usize, silent, "the dead are counted");
+    assert!(counters.epochs_complete <= counters.epochs_due, "{counters:?}");
+    assert!(counters.epochs_due <= counters.epochs, "{counters:?}");
+    assert_eq!(counters.epochs, bench.witness.tally.broadcasts, "every broadcast is an epoch that ends");
+}
+
+/// Each cell's two accounts.
+fn cells(bench: &Bench) {
+    for (place, cell) in bench.gateway.table.cells().iter().enumerate() {
+        let (uplink, replies, node) = (cell.uplink, cell.replies, cell.node);
+        let Uplink { sent, delivered, rejected, lost, surplus, .. } = uplink;
+        assert_eq!(sent + surplus, delivered + rejected + lost, "packets of cell {node}: {uplink:?}");
+        let Replies { due, in_time, late, missing, in_doubt, unasked: _ } = replies;
+        assert_eq!(due, in_time + late + missing, "replies of cell {node}: {replies:?}");
+        assert!(in_doubt <= missing, "replies of cell {node}: {replies:?}");
+        let arrived = bench.witness.arrived(place);
+        assert!(delivered <= arrived, "cell {node} delivered {arrived}: {uplink:?}");
+    }
+}
+
+/// Every torque that came is used, or counted by the reason why not.
+fn torques(bench: &Bench) {
+    let (table, tally) = (&bench.gateway.table, bench.witness.tally);
+    let replies = Replies::total(table.cells().iter().map(|cell| cell.replies));
+    let used = replies.in_time + replies.late + replies.unasked;
+    let dropped = |event| table.counters().events(event);
+    let (stale, repeated) = (dropped(Event::StaleTorque), dropped(Event::RepeatedTorque));
+    if bench.witness.compares {
+        assert_eq!((used, stale, repeated), (tally.used, tally.stale, tally.repeated), "torques");
+    } else {
+        assert_eq!(used + stale + repeated, tally.used + tally.stale + tally.repeated, "torques");
+    }
+}
+
+/// Every frame that came is somewhere.
+fn frames(bench: &Bench) {
+    let (table, tally) = (&bench.gateway.table, bench.witness.tally);
+    let counters = table.counters();
+    let count = |event| counters.events(event);
+    let by_kind: u64 = Kind::ALL.into_iter().map(|kind| counters.received(kind) + counters.sent(kind)).sum();
+    let elsewhere = count(Event::Foreign) + count(Event::ErrorFrame);
+    if tally.babbled == 0 {
+        assert_eq!(count(Event::Length), tally.cut, "cut frames");
+    }
+    match bench.skin.buses.first().map(|bus| bus.format) {
+        Some(Format::Fd) => {
+            assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
+            if tally.babbled == 0 {
+                assert_eq!(count(Event::Crc), tally.flipped, "frames with turned bits");
+            }
+            assert_eq!(count(Event::Incomplete), 0);
+        }
+        // Two halves are a packet; an incomplete one is one half, and each identifier may have one waiting.
+        Some(Format::Classic) => {
+            let packets = by_kind - count(Event::Length) - count(Event::Incomplete);
+            let halves = 2 * packets + count(Event::Incomplete) + count(Event::Length);
+            let waiting = tally.frames - elsewhere - halves;
+            assert!(waiting <= 1 << 11, "{waiting} halves wait");
+            assert_eq!(count(Event::Crc), 0);
+        }
+        None => {}
+    }
+}

@@ -1,0 +1,498 @@
+//! The bench: events in the order of time, on one clock.
+//!
+//! ```text
+//!   Send ─> wire faults ─> a place in the order ─┬─> faults of receiver 1 ─> Deliver ─> Send ...
+//!                                                └─> faults of receiver 2 ─> Deliver
+//!   Wake (a cell's timer), Tick and Look (the gateway's), Act (what a test does at a time)
+//! ```
+//!
+//! A receiver's frames come in the wire's order, however long each takes, unless a fault delays or
+//! reorders them. Frames that nobody's filters let through are not delivered.
+
+use std::collections::{BTreeMap, HashMap};
+
+use cell_node::node::{Flash, Identity};
+use gateway::scenario::{Scenario, contact_words};
+use protocol::can::{Format, Frame};
+use protocol::fixed::Q5_10;
+use protocol::message::{From, Message, SkinSensors};
+use protocol::packet::Packet;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use crate::fault::{Fault, Faults, Party};
+use crate::gateway::Gateway;
+use crate::seat::Seat;
+use crate::witness::{Truth, Witness};
+
+/// How often the gateway lets time pass, and its script is looked at.
+const LOOK: Span = Span::from_millis(4);
+/// From one frame on the wire to the next: about what vcan needs.
+const FRAME: Span = Span(5);
+/// From the wire to a receiver, at least and at most, without faults.
+const LATENCY: (u64, u64) = (10, 60);
+
+/// What a test does at a time.
+#[derive(Clone, Copy, Debug)]
+pub enum Act {
+    /// A cell loses its power.
+    Kill(usize),
+    /// A cell is switched on, or off and on.
+    Start(usize),
+    /// A cell hangs.
+    Hang(usize),
+    /// A cell that hung goes on.
+    GoOn(usize),
+    /// The gateway sends this.
+    Say(Message),
+    /// Somebody at a shell sends this.
+    Inject(Message),
+    /// Somebody sends this frame, whatever it is.
+    Babble(Frame),
+}
+
+/// A frame as it was sent, and what is true of it.
+#[derive(Clone, Copy, Debug)]
+struct Sent {
+    frame: Frame,
+    truth: Truth,
+}
+
+/// A frame on its way to a receiver.
+#[derive(Clone, Copy, Debug)]
+struct Delivery {
+    to: Party,
+    stood: Micros,
+    sent: Sent,
+    after_next: bool,
+}
+
+#[derive(Debug)]
+enum Event {
+    Send(Sent, bool),
+    Deliver(Delivery),
+    Wake(usize),
+    Tick,
+    Look,
+    Act(Box<Act>),
+}
+
+/// A frame that stood on the wire.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct OnTheWire {
+    /// When.
+    pub at: Micros,
+    /// Whose it was.
+    pub from: Party,
+    /// What everybody could hear, but for what happened at receivers.
+    pub frame: Frame,
+}
+
+/// What a receiver has, beside itself.
+#[derive(Debug, Default)]
+struct Inlet {
+    /// When its newest frame comes in, so that a later one does not overtake it.
+    newest: Micros,
+    /// A frame that comes after the next one.
+    held: Option<Delivery>,
+}
+
+/// A whole bench.
+#[derive(Debug)]
+pub struct Bench {
+    /// The skin's description.
+    pub skin: Skin,
+    /// The gateway.
+    pub gateway: Gateway,
+    /// The cells: first the skin's, in its order, then those of [`Bench::add`].
+    pub seats: Vec<Seat>,
+    /// What goes wrong.
+    pub faults: Faults,
+    /// What a second, simpler gateway makes of what the first one was handed.
+    pub witness: Witness,
+    /// All that stood on the wire.
+    pub wire: Vec<OnTheWire>,
+    now: Micros,
+    format: Format,
+    events: BTreeMap<(Micros, u64), Event>,
+    scheduled: u64,
+    packets: u64,
+    free: Micros,
+    held: Option<Sent>,
+    /// Which seats hear an identifier.
+    hearers: HashMap<u32, Vec<usize>>,
+    inlets: Vec<Inlet>,
+    gateway_inlet: Inlet,
+    dice: Pcg64Mcg,
+    ticking: bool,
+}
+
+impl Bench {
+    /// A skin that nobody touches; its cells are switched on at time 0.
+    #[must_use]
+    pub fn new(skin: &Skin, seed: u64) -> Self {
+        Self::with(skin, &Scenario::idle(Span::from_millis(0)), seed, |_| Micros(0))
+    }
+
+    /// A skin, what happens to it, and when each cell is switched on.
+    ///
+    /// # Panics
+    /// When the skin has no bus, or an external controller.
+    #[must_use]
+    pub fn with(skin: &Skin, scenario: &Scenario, seed: u64, start: impl Fn(usize) -> Micros) -> Self {
+        let mut gateway = Gateway::new(skin, scenario);
+        gateway.table.set_comparing(true);
+        let mut bench = Self {
+            skin: skin.clone(),
+            gateway,
+            seats: Vec::new(),
+            faults: Faults::new(seed),
+            witness: Witness::new(skin),
+            wire: Vec::new(),
+            now: Micros(0),
+            format: skin.buses.first().expect("a skin has a bus").format,
+            events: BTreeMap::new(),
+            scheduled: 0,
+            packets: 0,
+            free: Micros(0),
+            held: None,
+            hearers: HashMap::new(),
+            inlets: Vec::new(),
+            gateway_inlet: Inlet::default(),
+            dice: Pcg64Mcg::seed_from_u64(seed ^ 0x5EED),
+            ticking: false,
+        };
+        for (place, cell) in skin.cells.iter().enumerate() {
+            let identity = Identity { cell: cell.node, serial: cell.serial };
+            let seat = bench.add(identity, Flash::Sound(skin.parameters(cell)));
+            bench.at(start(place), Act::Start(seat));
+        }
+        bench.schedule(Micros(0), Event::Look);
+        bench
+    }
+
+    /// One more cell, switched off; returns its seat.
+    pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
+        let seat = self.seats.len();
+        for id in identity.hears() {
+            self.hearers.entry(u32::from(id.to_bits())).or_default().push(seat);
+        }
+        self.seats.push(Seat::new(identity, flash, self.format));
+        self.inlets.push(Inlet::default());
+        seat
+    }
+
+    /// What time it is.
+    #[must_use]
+    pub const fn now(&self) -> Micros {
+        self.now
+    }
+
+    /// From one broadcast to the next.
+    #[must_use]
+    pub fn epoch(&self) -> Span {
+        Span(self.gateway.period().0 * u64::from(self.skin.timing.ticks_per_broadcast))
+    }
+
+    /// From now on this goes wrong.
+    pub fn fault(&mut self, fault: Fault) {
+        self.faults.add(fault);
+    }
+
+    /// Something is done at a time.
+    pub fn at(&mut self, at: Micros, act: Act) {
+        self.schedule(at, Event::Act(Box::new(act)));
+    }
+
+    /// Something is done now.
+    pub fn act(&mut self, act: Act) {
+        self.at(self.now, act);
+        self.run(Span(0));
+    }
+
+    /// The gateway presses a cell, by its place in the skin, from the next joints on.
+    ///
+    /// # Panics
+    /// When the skin has no such cell.
+    pub fn press(&mut self, place: usize, newtons: f64) {
+        self.press_from(place, newtons, From::Next);
+    }
+
+    /// The gateway presses a cell from some joints on.
+    ///
+    /// # Panics
+    /// When the skin has no such cell.
+    pub fn press_from(&mut self, place: usize, newtons: f64, from: From) {
+        let message = self.gateway.stimulus(place, from, touch(newtons)).expect("a cell of the skin");
+        self.act(Act::Say(message));
+    }
+
+    /// Runs until every running cell of the skin can be expected to answer.
+    ///
+    /// # Panics
+    /// When that takes more than two seconds.
+    pub fn settle(&mut self) {
+        let give_up = self.now + Span::from_millis(2_000);
+        while !self.is_settled() {
+            assert!(self.now < give_up, "cells that never settle: {:?}", self.gateway.table.cells());
+            self.run(LOOK);
+        }
+    }
+
+    fn is_settled(&self) -> bool {
+        let mut cells = self.seats.iter().zip(self.gateway.table.cells());
+        let started = self.seats.iter().any(|seat| seat.lives > 0);
+        started && cells.all(|(seat, cell)| !seat.runs() || cell.is_ready())
+    }
+
+    /// The loop begins to tick now.
+    pub fn begin(&mut self) {
+        if !self.ticking {
+            self.ticking = true;
+            self.schedule(self.now, Event::Tick);
+        }
+    }
+
+    /// Settles, begins, and runs for one epoch.
+    pub fn started(mut self) -> Self {
+        self.settle();
+        self.begin();
+        self.run(self.epoch());
+        self
+    }
+
+    /// Runs for so many epochs.
+    pub fn run_epochs(&mut self, epochs: u64) {
+        self.run(Span(self.epoch().0 * epochs));
+    }
+
+    /// Runs for some time.
+    pub fn run(&mut self, span: Span) {
+        let until = self.now + span;
+        while let Some(entry) = self.events.first_entry() {
+            if entry.key().0 > until {
+                break;
+            }
+            let ((at, _), event) = entry.remove_entry();
+            self.now = at;
+            self.handle(event);
+        }
+        self.now = until;
+    }
+
+    /// The loop ends; the cells say their last words, as at the end of every run.
+    pub fn finish(&mut self) {
+        self.ticking = false;
+        self.run(Span(2 * self.epoch().0));
+        self.act(Act::Say(Message::Report));
+        self.run(Span::from_millis(100));
+        self.act(Act::Say(Message::Sync));
+        self.run(Span::from_millis(150));
+        self.gateway.table.handle_time(self.now);
+        self.gateway.table.finish();
+    }
+
+    fn schedule(&mut self, at: Micros, event: Event) {
+        self.scheduled += 1;
+        self.events.insert((at.max(self.now), self.scheduled), event);
+    }
+
+    fn handle(&mut self, event: Event) {
+        match event {
+            Event::Send(sent, may_be_hit) => self.send(sent, may_be_hit),
+            Event::Deliver(delivery) => self.deliver(delivery),
+            Event::Wake(seat) => self.wake(seat),
+            Event::Tick if self.ticking => {
+                let messages = self.gateway.turn(self.now);
+                self.witness.check_sum(self.now, self.gateway.table.snapshot());
+                self.say(&messages);
+                self.schedule(self.now + self.gateway.period(), Event::Tick);
+            }
+            Event::Tick => {}
+            Event::Look => {
+                let known = self.gateway.notices.len();
+                let messages = self.gateway.look(self.now);
+                for (_, notice) in self.gateway.notices.iter().skip(known) {
+                    self.witness.notice(*notice);
+                }
+                self.say(&messages);
+                self.schedule(self.now + LOOK, Event::Look);
+            }
+            Event::Act(act) => self.perform(*act),
+        }
+    }
+
+    fn perform(&mut self, act: Act) {
+        let of = |bench: &mut Self, seat: usize, packets: Vec<Packet>| bench.sends(seat, &packets);
+        match act {
+            Act::Say(message) => self.say(&[message]),
+            Act::Inject(message) => self.packets(Party::Stranger, 0, self.now, &[message.encode()]),
+            Act::Babble(frame) => {
+                let from = Party::Stranger;
+                let truth = Truth { from, life: 0, packet: None, number: 0, half: 0, damage: None };
+                self.schedule(self.now, Event::Send(Sent { frame, truth }, true));
+            }
+            Act::Kill(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::kill),
+            Act::Hang(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::hang),
+            Act::Start(seat) => {
+                let now = self.now;
+                self.seats.get_mut(seat).into_iter().for_each(|seat| seat.start(now));
+                of(self, seat, Vec::new());
+            }
+            Act::GoOn(seat) => {
+                let now = self.now;
+                let packets = self.seats.get_mut(seat).map(|seat| seat.go_on(now)).unwrap_or_default();
+                of(self, seat, packets);
+            }
+        }
+    }
+
+    fn wake(&mut self, seat: usize) {
+        let now = self.now;
+        let Some(there) = self.seats.get_mut(seat) else { return };
+        there.wake = None;
+        let packets = there.time(now);
+        self.sends(seat, &packets);
+    }
+
+    /// A cell's packets go out when it has thought, and its next timer is set.
+    fn sends(&mut self, seat: usize, packets: &[Packet]) {
+        let Some(there) = self.seats.get_mut(seat) else { return };
+        let (life, at) = (there.lives, self.now + there.thinks);
+        let timeout = there.node().filter(|_| there.runs()).map(|node| node.poll_timeout().max(self.now));
+        if let Some(timeout) = timeout
+            && there.wake != Some(timeout)
+        {
+            there.wake = Some(timeout);
+            self.schedule(timeout, Event::Wake(seat));
+        }
+        self.packets(Party::Seat(seat), life, at, packets);
+    }
+
+    fn say(&mut self, messages: &[Message]) {
+        let packets: Vec<_> = messages.iter().map(Message::encode).collect();
+        self.packets(Party::Gateway, 0, self.now, &packets);
+    }
+
+    fn packets(&mut self, from: Party, life: u32, at: Micros, packets: &[Packet]) {
+        for packet in packets {
+            self.packets += 1;
+            for (half, frame) in packet.frames(self.format).enumerate() {
+                let truth =
+                    Truth { from, life, packet: Some(*packet), number: self.packets, half, damage: None };
+                self.schedule(at, Event::Send(Sent { frame, truth }, true));
+            }
+        }
+    }
+
+    /// A frame wants a place on the wire.
+    fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
+        if may_be_hit {
+            let fate = self.faults.fate(self.now, sent.truth.from, None, sent.frame);
+            sent.frame = fate.frame;
+            sent.truth = sent.truth.and(fate.damage);
+            if fate.after_next && fate.times > 0 && self.held.is_none() {
+                self.held = Some(sent);
+                return;
+            }
+            for _ in 0..fate.times {
+                self.schedule(self.now + fate.delay, Event::Send(sent, false));
+            }
+            return;
+        }
+        self.stand(&sent);
+        if let Some(held) = self.held.take() {
+            self.stand(&held);
+        }
+    }
+
+    /// A frame has its place in the order, and goes to whoever hears it.
+    fn stand(&mut self, sent: &Sent) {
+        let stood = self.now.max(self.free);
+        self.free = stood + FRAME;
+        let from = sent.truth.from;
+        self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
+        self.pass(Party::Gateway, stood, sent);
+        let hearers = self.hearers.get(&sent.frame.raw_id()).cloned().unwrap_or_default();
+        for seat in hearers {
+            if from != Party::Seat(seat) {
+                self.pass(Party::Seat(seat), stood, sent);
+            }
+        }
+    }
+
+    /// From the wire to one receiver.
+    fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
+        let fate = self.faults.fate(self.now, sent.truth.from, Some(to), sent.frame);
+        let latency = Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        let mut at = stood + latency;
+        if let Some(inlet) = self.inlet(to) {
+            at = at.max(inlet.newest);
+            if fate.delay == Span(0) {
+                inlet.newest = at;
+            }
+        }
+        let sent = Sent { frame: fate.frame, truth: sent.truth.and(fate.damage) };
+        for _ in 0..fate.times {
+            let delivery = Delivery { to, stood, sent, after_next: fate.after_next };
+            self.schedule(at + fate.delay, Event::Deliver(delivery));
+        }
+    }
+
+    fn inlet(&mut self, party: Party) -> Option<&mut Inlet> {
+        match party {
+            Party::Gateway => Some(&mut self.gateway_inlet),
+            Party::Seat(seat) => self.inlets.get_mut(seat),
+            Party::Stranger => None,
+        }
+    }
+
+    fn deliver(&mut self, delivery: Delivery) {
+        let Some(inlet) = self.inlet(delivery.to) else { return };
+        if delivery.after_next && inlet.held.is_none() {
+            inlet.held = Some(delivery);
+            return;
+        }
+        let held = inlet.held.take();
+        for delivery in core::iter::once(delivery).chain(held) {
+            let Delivery { to, stood, sent: Sent { frame, truth }, .. } = delivery;
+            match to {
+                Party::Gateway => {
+                    let own = truth.from == Party::Gateway;
+                    self.gateway.hear(stood, own, &frame);
+                    self.witness.hear(stood, &truth, &frame);
+                }
+                Party::Seat(seat) => {
+                    let now = self.now;
+                    let Some(there) = self.seats.get_mut(seat) else { return };
+                    let packets = there.hear(now, stood, frame);
+                    self.sends(seat, &packets);
+                }
+                Party::Stranger => {}
+            }
+        }
+    }
+
+    /// Everything that this run was, as text: two runs are the same if these are.
+    #[must_use]
+    pub fn transcript(&self) -> String {
+        let lines = self.wire.iter().map(|it| format!("{} {:?} {:?}\n", it.at.0, it.from, it.frame));
+        let end = format!("{:?}\n{:?}\n{:?}", self.gateway, self.seats, self.now);
+        lines.chain([end]).collect()
+    }
+
+    /// The torques that stood on the wire whole: epoch and words, in their order, of one cell.
+    #[must_use]
+    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; 6])> {
+        self.witness.torques(place)
+    }
+}
+
+/// What a cell feels when it is pressed with so many newtons.
+#[must_use]
+pub fn touch(newtons: f64) -> SkinSensors {
+    let contact: [Q5_10; 3] = contact_words(newtons);
+    SkinSensors { contact, ..SkinSensors::default() }
+}

@@ -1,0 +1,186 @@
+//! The gateway of a bench: the real table and the real loop, with what threads and sockets do around them.
+
+use std::collections::VecDeque;
+
+use gateway::controller;
+use gateway::cycle::{Cycle, Record, Tick};
+use gateway::robot::SimulatedArm;
+use gateway::scenario::{Scenario, Touches};
+use gateway::table::{Notice, Snapshot, Table};
+use protocol::can::Frame;
+use protocol::id::{CellId, Node};
+use protocol::message::{From, Message, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+
+/// Stimuli are sent so many epochs before the one from which they hold.
+const LEAD: u64 = 5;
+
+/// Table, loop and script.
+#[derive(Debug)]
+pub struct Gateway {
+    /// What it knows of its bus.
+    pub table: Table,
+    /// What every tick was like.
+    pub records: Vec<Record>,
+    /// What people were told, and when.
+    pub notices: Vec<(Micros, Notice)>,
+    /// Whether the bus works, as the loop is told.
+    pub works: bool,
+    /// Whether it tells a cell that started anew what it feels.
+    pub reminds: bool,
+    /// Broadcasts skipped with their ticks.
+    pub broadcasts_skipped: u64,
+    cycle: Cycle,
+    snapshot: Snapshot,
+    positions: VecDeque<(Epoch, [f64; WORDS])>,
+    touches: Touches,
+    script_epoch: u64,
+    /// What each cell was last told to feel from a test.
+    pressed: Vec<SkinSensors>,
+    nodes: Vec<CellId>,
+    began: Option<Micros>,
+    tick: u64,
+    skip: u64,
+    period: Span,
+}
+
+impl Gateway {
+    /// One that listens only. The scenario says how the robot moves and what touches it.
+    ///
+    /// # Panics
+    /// When the skin's controller is another program.
+    #[must_use]
+    pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
+        let table = Table::new(skin, 0);
+        let controller = controller::of_motion(skin, &scenario.motion).expect("a controller of our own");
+        let robot = SimulatedArm::new(skin, scenario.motion.start_rad);
+        Self {
+            snapshot: table.snapshot().clone(),
+            table,
+            records: Vec::new(),
+            notices: Vec::new(),
+            works: true,
+            reminds: true,
+            broadcasts_skipped: 0,
+            cycle: Cycle::new(skin, controller, Box::new(robot)),
+            positions: VecDeque::new(),
+            touches: Touches::new(scenario, skin),
+            script_epoch: 0,
+            pressed: vec![SkinSensors::default(); skin.cells.len()],
+            nodes: skin.cells.iter().map(|cell| cell.node).collect(),
+            began: None,
+            tick: 0,
+            skip: 0,
+            period: Span(skin.timing.tick_nanos().div_ceil(1_000)),
+        }
+    }
+
+    /// From one tick to the next.
+    #[must_use]
+    pub const fn period(&self) -> Span {
+        self.period
+    }
+
+    /// Broadcasts so far.
+    #[must_use]
+    pub const fn broadcasts(&self) -> u64 {
+        self.cycle.broadcasts()
+    }
+
+    /// The last tick's record.
+    #[must_use]
+    pub fn last(&self) -> Option<&Record> {
+        self.records.last()
+    }
+
+    /// The next `ticks` do not happen.
+    pub const fn skip_ticks(&mut self, ticks: u64) {
+        self.skip += ticks;
+    }
+
+    /// The stimulus that makes a cell, by its place in the skin, feel this.
+    #[must_use]
+    pub fn stimulus(&mut self, place: usize, from: From, sensors: SkinSensors) -> Option<Message> {
+        *self.pressed.get_mut(place)? = sensors;
+        let to = Node::Cell(*self.nodes.get(place)?);
+        Some(Message::Stimulus { to, from, page: SensorPage::Skin(sensors) })
+    }
+
+    /// A frame comes in; `stood` is the kernel's time stamp.
+    pub(crate) fn hear(&mut self, stood: Micros, own: bool, frame: &Frame) {
+        let queue = &mut self.positions;
+        let mut positions = |epoch| {
+            while let Some((of, q)) = queue.pop_front() {
+                if of == epoch {
+                    return Some(q);
+                }
+            }
+            None
+        };
+        self.table.handle_frame(stood, own, frame, &mut positions);
+    }
+
+    /// One tick; returns what it sends.
+    pub(crate) fn turn(&mut self, now: Micros) -> Vec<Message> {
+        if self.skip > 0 {
+            self.skip -= 1;
+            self.tick += 1;
+            return Vec::new();
+        }
+        let began = *self.began.get_or_insert(now);
+        let time = Micros(now.since(began).0);
+        let skipped = self.records.last().map_or(0, |last| self.tick - last.tick.number - 1);
+        self.snapshot.take(self.table.snapshot(), true);
+        let tick = Tick { number: self.tick, time };
+        let outcome = self.cycle.tick(tick, skipped, [&self.snapshot], self.works);
+        self.tick += 1;
+        self.records.push(outcome.record);
+        self.broadcasts_skipped += outcome.broadcasts_skipped;
+        let mut messages = Vec::new();
+        if let Some((epoch, joints)) = outcome.joints {
+            self.positions.push_back((epoch, outcome.record.q));
+            messages.push(Message::Joints { epoch, joints });
+        }
+        if outcome.halt {
+            messages.push(Message::Halt);
+        }
+        messages
+    }
+
+    /// Lets time pass for the table, takes its notices; returns what the script and restarts make it send.
+    pub(crate) fn look(&mut self, now: Micros) -> Vec<Message> {
+        self.table.handle_time(now);
+        let mut messages = Vec::new();
+        let until = self.cycle.broadcasts() + LEAD;
+        while self.script_epoch < until {
+            let from = From::Epoch(epoch_of(self.script_epoch));
+            for stimulus in self.touches.stimuli_for(self.script_epoch) {
+                let page = SensorPage::Skin(stimulus.sensors);
+                messages.push(Message::Stimulus { to: Node::Cell(stimulus.node), from, page });
+                if let Some(pressed) = self.pressed.get_mut(stimulus.cell) {
+                    *pressed = stimulus.sensors;
+                }
+            }
+            self.script_epoch += 1;
+        }
+        let notices: Vec<_> = self.table.notices().collect();
+        for notice in notices {
+            self.notices.push((now, notice));
+            let Notice::Restarted(node) = notice else { continue };
+            let place = self.nodes.iter().position(|&it| it == node).filter(|_| self.reminds);
+            let sensors = place.and_then(|place| self.pressed.get(place).copied());
+            if let (Some(place), Some(sensors)) = (place, sensors) {
+                messages.extend(self.stimulus(place, From::Next, sensors));
+            }
+        }
+        messages
+    }
+}
+
+/// The epoch of the n-th broadcast.
+#[must_use]
+pub fn epoch_of(number: u64) -> Epoch {
+    Epoch(number.to_le_bytes()[0])
+}

@@ -1,0 +1,294 @@
+//! A second, simpler gateway that is told the truth about every frame: it knows which were damaged, by
+//! whom they were sent and when each cell was switched on. What the real one makes of the same frames
+//! must agree with it, whatever was broken.
+
+use gateway::table::{Notice, Snapshot};
+use protocol::can::{Format, Frame};
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, State};
+use protocol::packet::{Epoch, Half, Packet, WORDS};
+use protocol::skin::{Safety, Skin};
+use protocol::time::Micros;
+
+use crate::fault::{Harm, Party};
+
+/// A torque may answer the newest broadcast or one of the three before it.
+const LATEST: usize = 4;
+
+/// What is true of a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Truth {
+    /// Who sent it.
+    pub from: Party,
+    /// Which life of a cell it comes from.
+    pub life: u32,
+    /// The packet that it carries, or is a half of; none in what somebody babbles.
+    pub packet: Option<Packet>,
+    /// That packet's number on this bench; 0 for what is no packet.
+    pub number: u64,
+    /// Which half of it; 0 for a whole one.
+    pub half: usize,
+    /// What was done to it.
+    pub damage: Option<Harm>,
+}
+
+impl Truth {
+    /// The same after more damage; what is cut is cut, whatever else was done to it.
+    #[must_use]
+    pub(crate) fn and(self, damage: Option<Harm>) -> Self {
+        let cut = [self.damage, damage].contains(&Some(Harm::Cut));
+        Self { damage: if cut { Some(Harm::Cut) } else { self.damage.or(damage) }, ..self }
+    }
+
+    /// The same, knowing what came: bits that were turned twice are right again.
+    fn on_arrival(self, frame: &Frame) -> Self {
+        let meant = self.packet.and_then(|packet| packet.frames(frame.format()).nth(self.half));
+        if meant.is_some_and(|meant| meant == *frame) { Self { damage: None, ..self } } else { self }
+    }
+}
+
+/// What was delivered to the gateway, by what ought to become of it.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Tally {
+    /// Frames.
+    pub frames: u64,
+    /// Whole packets of others.
+    pub packets: u64,
+    /// Of these, torques that count.
+    pub used: u64,
+    /// Torques for an epoch that was answered already, by the same cell.
+    pub repeated: u64,
+    /// Torques of an epoch that is over, or not begun.
+    pub stale: u64,
+    /// Frames with turned bits.
+    pub flipped: u64,
+    /// Frames that were cut.
+    pub cut: u64,
+    /// Frames that somebody babbled.
+    pub babbled: u64,
+    /// Own broadcasts.
+    pub broadcasts: u64,
+}
+
+/// A cell as the witness sees it.
+#[derive(Clone, Debug, Default)]
+struct Mirror {
+    /// The broadcast that its newest torque answered.
+    answered: Option<usize>,
+    held: Option<[i32; WORDS]>,
+    /// What of it is in the sum.
+    value: [i32; WORDS],
+    torques: Vec<(u8, [i16; 6])>,
+    arrived: u64,
+}
+
+/// The witness of one bus.
+#[derive(Debug)]
+pub struct Witness {
+    /// What came.
+    pub tally: Tally,
+    /// Whether the sum is compared; several cells under one number are beyond it.
+    pub compares: bool,
+    format: Format,
+    safety: Safety,
+    mirrors: Vec<Mirror>,
+    /// Where a node stands.
+    places: [Option<usize>; 256],
+    broadcasts: Vec<Epoch>,
+    /// The last frame of each identifier, and when it stood.
+    halves: Vec<Option<(Frame, Micros)>>,
+}
+
+impl Witness {
+    /// Nothing seen yet.
+    #[must_use]
+    pub fn new(skin: &Skin) -> Self {
+        let mut places = [None; 256];
+        for (place, cell) in skin.cells.iter().enumerate() {
+            if let Some(it) = places.get_mut(usize::from(cell.node.get())) {
+                *it = Some(place);
+            }
+        }
+        Self {
+            tally: Tally::default(),
+            compares: true,
+            format: skin.buses.first().map_or(Format::Fd, |bus| bus.format),
+            safety: skin.safety,
+            mirrors: vec![Mirror::default(); skin.cells.len()],
+            places,
+            broadcasts: Vec::new(),
+            halves: vec![None; 1 << 11],
+        }
+    }
+
+    /// The torques that came whole from a cell.
+    #[must_use]
+    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; 6])> {
+        self.mirrors.get(place).map(|mirror| mirror.torques.clone()).unwrap_or_default()
+    }
+
+    /// Whole packets that came from a cell.
+    #[must_use]
+    pub fn arrived(&self, place: usize) -> u64 {
+        self.mirrors.get(place).map_or(0, |mirror| mirror.arrived)
+    }
+
+    /// A frame was handed to the gateway.
+    pub(crate) fn hear(&mut self, stood: Micros, truth: &Truth, frame: &Frame) {
+        let truth = &truth.on_arrival(frame);
+        self.tally.frames += 1;
+        match truth.damage {
+            Some(Harm::Cut) => self.tally.cut += 1,
+            Some(_) => self.tally.flipped += 1,
+            None => self.tally.babbled += u64::from(truth.packet.is_none()),
+        }
+        let Some(packet) = truth.packet.filter(|_| self.is_whole(stood, truth, frame)) else { return };
+        let Ok(message) = Message::decode(&packet) else { return };
+        if truth.from == Party::Gateway {
+            return self.hear_own(&message);
+        }
+        self.tally.packets += 1;
+        if message == Message::Halt {
+            self.mirrors.iter_mut().for_each(Mirror::let_go);
+        }
+        let node = match Node::from_byte(packet.id.node) {
+            Node::Cell(cell) => cell.get(),
+            Node::Gateway | Node::Everyone => return,
+        };
+        let place = self.places.get(usize::from(node)).copied().flatten();
+        let Some(mirror) = place.and_then(|place| self.mirrors.get_mut(place)) else { return };
+        match message {
+            Message::Torque { epoch, torque, .. } => {
+                mirror.arrived += 1;
+                let words = torque.map(|word| word.to_bits());
+                mirror.torques.push((epoch.0, words));
+                // The newest broadcast of this epoch, if it is not too old.
+                let recent = self.broadcasts.iter().enumerate().rev().take(LATEST);
+                let answers = recent.into_iter().find(|(_, of)| **of == epoch).map(|(number, _)| number);
+                match answers {
+                    Some(number) if mirror.answered.is_none_or(|last| last < number) => {
+                        self.tally.used += 1;
+                        mirror.answered = Some(number);
+                        mirror.value = words.map(i32::from);
+                        mirror.held = words.iter().any(|&word| word != 0).then_some(mirror.value);
+                    }
+                    Some(number) if mirror.answered == Some(number) => self.tally.repeated += 1,
+                    Some(_) | None => self.tally.stale += 1,
+                }
+            }
+            Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                mirror.arrived += 1;
+                if !heartbeat.state.has(State::ACTIVE) {
+                    mirror.let_go();
+                }
+            }
+            Message::Network { .. } | Message::Sensors { .. } | Message::Configured { .. } => {
+                mirror.arrived += 1;
+            }
+            Message::Sum { .. }
+            | Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Configure { .. }
+            | Message::Stimulus { .. } => {}
+        }
+    }
+
+    fn hear_own(&mut self, message: &Message) {
+        match *message {
+            // Repeated on the way: cells drop it, and it is no epoch.
+            Message::Joints { epoch, .. } if self.broadcasts.last() == Some(&epoch) => {}
+            Message::Joints { epoch, .. } => {
+                self.tally.broadcasts += 1;
+                self.broadcasts.push(epoch);
+                let newest = self.broadcasts.len() - 1;
+                for mirror in &mut self.mirrors {
+                    mirror.grow_old(newest, &self.safety);
+                }
+            }
+            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::let_go),
+            _ => {}
+        }
+    }
+
+    /// Whether this frame is a packet, or completes one.
+    fn is_whole(&mut self, stood: Micros, truth: &Truth, frame: &Frame) -> bool {
+        if self.format == Format::Fd {
+            return truth.damage.is_none();
+        }
+        if truth.damage == Some(Harm::Cut) {
+            return false;
+        }
+        let Some(last) = self.halves.get_mut(usize::try_from(frame.id()).unwrap_or(usize::MAX)) else {
+            return false;
+        };
+        if truth.damage.is_some() {
+            *last = None;
+            return false;
+        }
+        // An equal first half is as good as the packet's own.
+        let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
+        let whole = truth.half == 1
+            && last.is_some_and(|(waits, since)| Some(waits) == first && stood.since(since) <= Half::WITHIN);
+        *last = if whole { None } else { Some((*frame, stood)) };
+        whole
+    }
+
+    /// What people were told: of a cell that fell silent nothing is held.
+    pub(crate) fn notice(&mut self, notice: Notice) {
+        let (Notice::Dead(cell) | Notice::Restarted(cell)) = notice else { return };
+        let place = self.places.get(usize::from(cell.get())).copied().flatten();
+        if let Some(mirror) = place.and_then(|place| self.mirrors.get_mut(place)) {
+            mirror.let_go();
+        }
+    }
+
+    /// The sum that a tick takes must be this one's, to the last bit.
+    pub(crate) fn check_sum(&self, now: Micros, snapshot: &Snapshot) {
+        if !self.compares {
+            return;
+        }
+        let mut sum = [0_i32; WORDS];
+        let mut contributing = 0;
+        for mirror in &self.mirrors {
+            for (sum, value) in sum.iter_mut().zip(mirror.value) {
+                *sum += value;
+            }
+            contributing += u32::from(mirror.value != [0; WORDS]);
+        }
+        let sum = sum.map(|steps| f64::from(steps) / 4_096.0);
+        assert!(
+            sum == snapshot.torque && contributing == snapshot.contributing,
+            "at {} us the sum is {:?} of {} cells, and should be {sum:?} of {contributing}",
+            now.0,
+            snapshot.torque,
+            snapshot.contributing
+        );
+    }
+}
+
+impl Mirror {
+    fn let_go(&mut self) {
+        self.held = None;
+        self.value = [0; WORDS];
+    }
+
+    /// Held, then let go in equal steps, then nothing.
+    fn grow_old(&mut self, newest: usize, safety: &Safety) {
+        let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
+        let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);
+        // The newest broadcast has had no time to be answered.
+        let missed = (newest - answered).saturating_sub(1);
+        let left = (hold + decay).saturating_sub(missed);
+        self.value = match missed {
+            missed if missed <= hold => held,
+            _ if left == 0 => [0; WORDS],
+            _ => held.map(|word| {
+                let part = f64::from(word) * left as f64 / decay as f64;
+                part as i32
+            }),
+        };
+    }
+}
