@@ -9,7 +9,7 @@ use protocol::can;
 use protocol::message::Message;
 use protocol::skin::Skin;
 
-use super::Failure;
+use super::{Failure, output};
 
 /// Leave the halted state: send resume to a bus, or to all buses of a skin
 ///
@@ -68,8 +68,10 @@ pub(crate) fn open(name: &str, kind: Choice, format: can::Format) -> Result<Bus,
     Bus::open(name, kind, &options)
 }
 
-/// Sends one packet.
+/// Sends one packet, and says on which kind of bus.
 pub(crate) fn send(bus: &Bus, message: &Message, format: can::Format) -> Result<(), Failure> {
     let frames: Vec<_> = message.encode().frames(format).collect();
-    bus.send(&frames).map_err(|error| Failure::run(error.cause))
+    bus.send(&frames).map_err(|error| Failure::run(error.cause))?;
+    output::note(format_args!("sent on {} ({})", bus.name(), bus.kind()));
+    Ok(())
 }

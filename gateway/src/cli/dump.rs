@@ -191,7 +191,7 @@ fn log(
         output::note(format_args!("{name}: {bad} of {seen} lines could not be read"));
     }
     if xl > 0 {
-        output::note(format_args!("{name}: {xl} CAN XL frames are not shown"));
+        output::note(format_args!("{name}: CAN XL frames are not shown: {xl}"));
     }
     if frames == 0 && seen > 0 && !stopped.load(Ordering::Relaxed) {
         let like = "its lines are like `(1700000000.123456) vcan0 123#00`";
@@ -209,6 +209,7 @@ fn live(
     to: Option<u64>,
     stopped: &AtomicBool,
 ) -> Result<(), Failure> {
+    output::note(format_args!("{} is {}", bus.name(), bus.kind()));
     let mut inbox = Inbox::new();
     let (mut down, mut end) = (false, None);
     let done = loop {

@@ -133,7 +133,7 @@ impl Decoder {
     /// Takes the next frame. Bounded memory, whatever comes. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
         let Ok(id) = data_id(frame) else { return Decoded::Foreign(Foreign::of(frame)) };
-        let packet = match self.format.unwrap_or(frame.format()) {
+        let packet = match self.format.unwrap_or_else(|| frame.format()) {
             Format::Fd => Packet::from_fd(frame),
             Format::Classic => match self.pair(at, bus, id, frame) {
                 Ok(Paired::Waiting) => return Decoded::Half { id, incomplete: false },
