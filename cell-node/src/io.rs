@@ -134,15 +134,23 @@ impl Cells {
     /// Lets time pass, sends, waits, and takes what came.
     fn turn(&mut self, bus: &Bus, inbox: &mut Inbox) -> Result<(), Stopped> {
         let now = self.now();
+        let mut next = Micros(u64::MAX);
         for (node, _) in &mut self.cells {
             if node.poll_timeout() <= now {
                 node.handle_timeout(now);
             }
+            next = next.min(node.poll_timeout());
         }
         self.flush(bus)?;
-        let timeout = self.cells.iter().map(|(node, _)| node.poll_timeout()).min();
-        let wait = timeout.map(|at| Duration::from_micros(at.since(self.now()).0));
-        if !bus.wait(wait)? || bus.receive(inbox)? == 0 {
+        let wait = Duration::from_micros(next.since(now).0);
+        let count = if wait >= Bus::PATIENCE {
+            bus.receive_patiently(inbox)?
+        } else if bus.wait(Some(wait))? {
+            bus.receive(inbox)?
+        } else {
+            0
+        };
+        if count == 0 {
             return Ok(());
         }
         let (now, wall) = (self.now(), wall_nanos());

@@ -28,10 +28,12 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
+use rustix::net::sockopt::{self, Timeout};
 use socketcan::{CanFdSocket, SocketOptions};
 use thiserror::Error;
 
 use crate::can::{Format, Frame};
+use batch::Batch;
 use inbox::Taken;
 
 pub mod batch;
@@ -171,6 +173,9 @@ pub struct Bus {
 }
 
 impl Bus {
+    /// How long [`Bus::receive_patiently`] waits.
+    pub const PATIENCE: Duration = Duration::from_millis(100);
+
     /// Opens a bus. When this returns, the filters are in force.
     ///
     /// # Errors
@@ -189,6 +194,9 @@ impl Bus {
             }
         };
         let Options { fd, send_patience, .. } = *options;
+        sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::PATIENCE)).map_err(|errno| {
+            BusError::Io { name: name.to_owned(), doing: "set the patience of", source: errno.into() }
+        })?;
         Ok(Self { name: name.to_owned(), kind, socket, receive_buffer, fd, send_patience })
     }
 
@@ -227,9 +235,26 @@ impl Bus {
     /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] for an embedded bus
     /// whose server ended; frames that came before are received first.
     pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
+        self.take(inbox, |batch, socket| batch.receive(socket))
+    }
+
+    /// The same, but waits up to [`Bus::PATIENCE`] for the first frame: one system call instead of two for
+    /// whoever has nothing else to do.
+    ///
+    /// # Errors
+    /// As [`Bus::receive`].
+    pub fn receive_patiently(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
+        self.take(inbox, |batch, socket| batch.receive_patiently(socket))
+    }
+
+    fn take(
+        &self,
+        inbox: &mut Inbox,
+        receive: impl Fn(&mut Batch, &CanFdSocket) -> std::io::Result<usize>,
+    ) -> Result<usize, BusError> {
         inbox.clear();
         loop {
-            match inbox.batch.receive(&self.socket) {
+            match receive(&mut inbox.batch, &self.socket) {
                 Ok(_) => break,
                 // The server ended with frames of ours unread: what it had sent can still be read.
                 Err(error) if is(&error, Errno::CONNRESET) => {}

@@ -12,6 +12,9 @@ use crate::can::FD_BYTES;
 
 /// How many datagrams one call moves at most.
 pub const BATCH: usize = 64;
+/// So many are asked for first: most reads find one or two, and room for 64 costs more to lay out than a
+/// datagram to read.
+const FEW: usize = 4;
 
 /// Room for one datagram and what the kernel says of it.
 pub(super) struct Slot {
@@ -42,8 +45,23 @@ impl Batch {
     /// # Errors
     /// What `recvmmsg` says; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
+        self.take(fd, false)
+    }
+
+    /// The same, but waits for the first one as long as the socket's `SO_RCVTIMEO` says.
+    pub(super) fn receive_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
+        self.take(fd, true)
+    }
+
+    fn take(&mut self, fd: impl AsFd, wait: bool) -> io::Result<usize> {
         self.count = 0;
-        self.count = calls::receive(fd.as_fd(), &mut self.slots)?;
+        let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
+        let Some((few, rest)) = slots.split_first_chunk_mut::<FEW>() else { return Ok(0) };
+        self.count = calls::receive(fd, few, wait)?;
+        if let (FEW, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FEW }>()) {
+            // Nothing more, or an error that the next call will meet again.
+            self.count += calls::receive(fd, many, false).unwrap_or(0);
+        }
         Ok(self.count)
     }
 

@@ -7,11 +7,16 @@ use std::os::fd::{AsRawFd, BorrowedFd};
 
 use super::batch::{BATCH, Slot};
 
-/// `recvmmsg`, without waiting: how many slots were filled.
-pub(super) fn receive(fd: BorrowedFd<'_>, slots: &mut [Slot; BATCH]) -> io::Result<usize> {
-    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; BATCH];
+/// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's
+/// `SO_RCVTIMEO` says, or not at all.
+pub(super) fn receive<const N: usize>(
+    fd: BorrowedFd<'_>,
+    slots: &mut [Slot; N],
+    wait: bool,
+) -> io::Result<usize> {
+    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; N];
     // SAFETY: an `mmsghdr` of zeros is a valid one: null pointers with zero lengths.
-    let mut headers: [libc::mmsghdr; BATCH] = unsafe { mem::zeroed() };
+    let mut headers: [libc::mmsghdr; N] = unsafe { mem::zeroed() };
     for ((slot, vector), header) in slots.iter_mut().zip(&mut vectors).zip(&mut headers) {
         vector.iov_base = slot.bytes.as_mut_ptr().cast();
         vector.iov_len = slot.bytes.len();
@@ -20,14 +25,14 @@ pub(super) fn receive(fd: BorrowedFd<'_>, slots: &mut [Slot; BATCH]) -> io::Resu
         header.msg_hdr.msg_control = slot.control.as_mut_ptr().cast();
         header.msg_hdr.msg_controllen = size_of_val(&slot.control);
     }
-    // SAFETY: `headers` has BATCH entries, which point to buffers of the lengths given that outlive the
+    // SAFETY: `headers` has N entries, which point to buffers of the lengths given that outlive the
     // call and that nothing else refers to; the timeout may be null.
     let count = unsafe {
         libc::recvmmsg(
             fd.as_raw_fd(),
             headers.as_mut_ptr(),
-            libc::c_uint::try_from(BATCH).unwrap_or(0),
-            libc::MSG_DONTWAIT,
+            libc::c_uint::try_from(N).unwrap_or(0),
+            if wait { libc::MSG_WAITFORONE } else { libc::MSG_DONTWAIT },
             std::ptr::null_mut(),
         )
     };
