@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   Tick, Snapshots ─> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
-//!                                   ├─> Outcome::halt ───> a halt frame
+//!                                   ├─> Outcome::command > a halt or a resume for every bus
 //!                                   └─> Record ──────────> what this tick was like
 //! ```
 //!
@@ -11,6 +11,7 @@
 //! unless it computes centrally beside them ([`Cycle::central`]).
 
 use protocol::fixed::Q1_14;
+use protocol::id::Command;
 use protocol::message::Joints;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
@@ -75,8 +76,9 @@ pub struct Outcome {
     pub joints: Option<(Epoch, Joints)>,
     /// Broadcasts that should have been before this one and were skipped with their ticks.
     pub broadcasts_skipped: u64,
-    /// Whether a halt frame has to be sent.
-    pub halt: bool,
+    /// A halt or a resume that has to be sent on every bus: because this loop halts itself, or because
+    /// somebody said it on one bus and the others have not heard it.
+    pub command: Option<Command>,
     /// For whoever records.
     pub record: Record,
 }
@@ -171,7 +173,7 @@ impl Cycle {
             (stale, dead) = (stale + bus.stale, dead + bus.dead);
             (halts, resumes) = (halts + bus.halts, resumes + bus.resumes);
         }
-        self.obey(halts, resumes);
+        let heard = self.obey(halts, resumes);
         input.halted = self.halted.is_some();
 
         let step = self.controller.step(&input);
@@ -179,7 +181,7 @@ impl Cycle {
             Step::Move(_) => None,
             Step::Bad(why) => Some(why),
         };
-        let halt = self.judge(bad);
+        let command = if self.judge(bad) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             Step::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer the robot goes on as it was for a while; halted, it stands.
@@ -203,7 +205,7 @@ impl Cycle {
             halted: self.halted,
             moved,
         };
-        Outcome { joints, broadcasts_skipped, halt, record }
+        Outcome { joints, broadcasts_skipped, command, record }
     }
 
     /// What the central computation makes of the last broadcast's words and what the cells then felt:
@@ -221,17 +223,22 @@ impl Cycle {
         felt
     }
 
-    /// Halts and resumes that others sent.
-    fn obey(&mut self, halts: u32, resumes: u32) {
+    /// Halts and resumes that others sent; a halt outdoes a resume. Returns what the other buses have to
+    /// be told.
+    fn obey(&mut self, halts: u32, resumes: u32) -> Option<Command> {
+        let mut heard = None;
         if resumes != self.resumes {
             self.resumes = resumes;
             self.halted = None;
             self.bad_in_a_row = 0;
+            heard = Some(Command::Resume);
         }
         if halts != self.halts {
             self.halts = halts;
             self.halted = Some(Halt::Frame);
+            heard = Some(Command::Halt);
         }
+        heard
     }
 
     /// Counts bad cycles; returns whether this one was one too many.
@@ -310,15 +317,17 @@ mod tests {
     fn bad_cycles_in_a_row_halt_once_and_a_resume_lets_go() {
         let (mut cycle, mut bus) = cycle(Box::new(Dead));
         let limit = u64::from(testing::skin().safety.bad_cycles);
-        let halts: Vec<u64> =
-            (0..limit + 10).filter(|&number| cycle.tick(tick(number), 0, [&bus], true).halt).collect();
+        let halts: Vec<u64> = (0..limit + 10)
+            .filter(|&number| cycle.tick(tick(number), 0, [&bus], true).command.is_some())
+            .collect();
         assert_eq!(halts, [limit - 1]);
         bus.resumes = 1;
         let after = cycle.tick(tick(99), 0, [&bus], true);
         assert_eq!((after.record.halted, after.record.bad), (None, Some(BadCycle::NoAnswer)));
+        assert_eq!(after.command, Some(Command::Resume), "the other buses have not heard it");
         bus.halts = 1;
         let halted = cycle.tick(tick(100), 0, [&bus], true);
-        assert_eq!((halted.record.halted, halted.halt), (Some(Halt::Frame), false));
+        assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
     }
 
     #[test]

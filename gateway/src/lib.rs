@@ -1,4 +1,4 @@
-//! To be written.
+#![doc = include_str!("../README.md")]
 
 pub mod central;
 pub mod controller;

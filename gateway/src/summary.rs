@@ -74,6 +74,13 @@ pub struct Loop {
     pub unsent: u64,
 }
 
+/// An empty histogram with three digits that grows by itself.
+#[must_use]
+#[expect(clippy::missing_panics_doc, reason = "three digits are a valid precision")]
+pub fn histogram() -> Histogram<u64> {
+    Histogram::new(3).expect("three digits are a valid precision")
+}
+
 /// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Quantiles {

@@ -8,7 +8,7 @@ use gateway::robot::SimulatedArm;
 use gateway::scenario::{Scenario, Touches};
 use gateway::table::{Notice, Snapshot, Table};
 use protocol::can::Frame;
-use protocol::id::{CellId, Node};
+use protocol::id::{CellId, Command, Node};
 use protocol::message::{From, Message, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
@@ -143,8 +143,10 @@ impl Gateway {
             self.positions.push_back((epoch, outcome.record.q));
             messages.push(Message::Joints { epoch, joints });
         }
-        if outcome.halt {
-            messages.push(Message::Halt);
+        match outcome.command {
+            Some(Command::Halt) => messages.push(Message::Halt),
+            Some(Command::Resume) => messages.push(Message::Resume),
+            Some(Command::Joints | Command::Sync | Command::Report) | None => {}
         }
         messages
     }

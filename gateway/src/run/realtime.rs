@@ -12,6 +12,7 @@ use rustix::time::{Timespec, clock_gettime};
 
 use super::turn::{Shared, Turn};
 use crate::cycle::Tick;
+use crate::summary::histogram;
 
 /// The priority asked for: above ordinary threads, below the kernel's own.
 const PRIORITY: i32 = 40;
@@ -39,7 +40,7 @@ pub fn prepare() -> Granted {
 /// The monotonic clock in ns.
 #[must_use]
 pub fn now() -> u64 {
-    let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic.into());
+    let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic);
     u64::try_from(tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(tv_nsec).unwrap_or(0)
 }
 
@@ -56,7 +57,7 @@ fn sleep_until(deadline: u64) {
 /// How late this machine wakes a thread that has nothing to do, in ns, `count` times.
 #[must_use]
 pub fn idle_lateness(period_ns: u64, count: u32) -> Histogram<u64> {
-    let mut histogram = Histogram::new(3).expect("three digits are a valid precision");
+    let mut histogram = histogram();
     let mut deadline = now();
     for _ in 0..count {
         deadline += period_ns;

@@ -43,7 +43,7 @@ pub enum News {
     Lost(String),
 }
 
-/// The state of a bus' cells, renewed every [`LOOK`].
+/// The state of a bus' cells, renewed every 20 ms.
 #[derive(Clone, Debug, Default)]
 pub struct View {
     /// Each cell, in the bus' order.

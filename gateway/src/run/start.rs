@@ -19,6 +19,7 @@ use super::receiver::{Captured, CellView, News, Received, Receiver, View};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, realtime};
 use crate::scenario::FaultKind;
+use crate::summary::histogram;
 use crate::table::{Notice, Table};
 
 /// Bytes asked for the gateway's socket: all cells may answer a report at once.
@@ -129,8 +130,7 @@ fn idle_lateness(period_ns: u64) -> Histogram<u64> {
         realtime::prepare();
         realtime::idle_lateness(period_ns, IDLE_WAKEUPS)
     };
-    let empty = || Histogram::new(3).expect("three digits are a valid precision");
-    thread::spawn(measure).join().unwrap_or_else(|_| empty())
+    thread::spawn(measure).join().unwrap_or_else(|_| histogram())
 }
 
 /// Opens a bus; an embedded one that nobody serves is served.

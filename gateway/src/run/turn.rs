@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use protocol::can::{Format, Frame};
+use protocol::id::Command;
 use protocol::message::Message;
 use protocol::packet::{Epoch, Packet, WORDS};
 
@@ -116,8 +117,10 @@ impl Turn {
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
         }
-        if outcome.halt {
-            self.say(&Message::Halt, &mut send);
+        match outcome.command {
+            Some(Command::Halt) => self.say(&Message::Halt, &mut send),
+            Some(Command::Resume) => self.say(&Message::Resume, &mut send),
+            Some(Command::Joints | Command::Sync | Command::Report) | None => {}
         }
         let timed = Timed {
             record: outcome.record,

@@ -25,7 +25,7 @@ use crate::controller;
 use crate::cycle::{Cycle, Halt};
 use crate::robot::SimulatedArm;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary};
+use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary, histogram};
 use crate::table::{Accuracy, Notice};
 
 /// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
@@ -315,7 +315,8 @@ impl Bench<'_> {
 
     /// Whether the receivers have read everything that was sent; what came before it they have read too.
     fn has_caught_up(&self) -> bool {
-        self.each_view(|_, view| view.commands).into_iter().sum::<u64>() >= self.shared.commands.load(Ordering::Relaxed)
+        self.each_view(|_, view| view.commands).into_iter().sum::<u64>()
+            >= self.shared.commands.load(Ordering::Relaxed)
     }
 
     /// Waits for something, but not for ever; what is missing then shows in the accounts.
@@ -403,7 +404,6 @@ impl Processor {
 
 impl Measured {
     fn new() -> Self {
-        let histogram = || Histogram::new(3).expect("three digits are a valid precision");
         Self {
             late: histogram(),
             took: histogram(),

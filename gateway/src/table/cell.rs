@@ -67,6 +67,22 @@ pub(super) struct Expected {
     pub(super) unquantised: [f64; WORDS],
 }
 
+/// Who speaks in a heartbeat, by its serial number and its count of packets.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Speaker {
+    /// The cell that we know, or the first one that we hear.
+    Known,
+    /// The cell that we know; what it says was overtaken by a later word.
+    Overtaken,
+    /// A cell that started anew, whether or not we heard its first word.
+    Anew,
+    /// Another cell that claims the number and does not have it yet.
+    Claimant,
+}
+
+/// A count that falls back by more than this is a cell's that started anew, and no late word.
+const OVERTAKES: u16 = 128;
+
 /// One cell.
 #[derive(Debug)]
 pub struct Cell {
@@ -89,6 +105,8 @@ pub struct Cell {
     /// Whether it has said a heartbeat since the last sync, and its counters since the last report.
     pub(super) said: Said,
     pub(super) felt: Felt,
+    /// By its last heartbeat, or a command that the bus carried since.
+    halted: bool,
     last_word: Option<Micros>,
     dead: bool,
     /// The number of the last broadcast that it answered.
@@ -117,6 +135,7 @@ impl Cell {
             replies: Replies::default(),
             said: Said::default(),
             felt: Felt::default(),
+            halted: false,
             last_word: None,
             dead: false,
             answered: None,
@@ -144,23 +163,43 @@ impl Cell {
         falls
     }
 
-    /// Whether this first word of a cell comes from one that had spoken before.
-    pub(super) const fn has_restarted(&self, heartbeat: &Heartbeat) -> bool {
-        self.heartbeat.is_some() && is_first(heartbeat)
+    /// Who speaks here.
+    pub(super) fn speaker(&self, heartbeat: &Heartbeat) -> Speaker {
+        let Some(last) = &self.heartbeat else { return Speaker::Known };
+        if last.serial != heartbeat.serial {
+            let claims = heartbeat.state.has(State::CLAIMING);
+            return if claims { Speaker::Claimant } else { Speaker::Anew };
+        }
+        let back = last.sent.wrapping_sub(heartbeat.sent);
+        match back.cast_signed() {
+            _ if is_first(heartbeat) => Speaker::Anew,
+            ..=0 => Speaker::Known,
+            // The second word of a life is the one after the claim.
+            _ if heartbeat.sent <= 1 || back > OVERTAKES => Speaker::Anew,
+            _ => Speaker::Overtaken,
+        }
     }
 
-    pub(super) fn take_heartbeat(&mut self, heartbeat: &Heartbeat) -> Change {
-        let restarted = is_first(heartbeat);
-        self.uplink.settle(heartbeat.sent, restarted);
-        if restarted {
+    pub(super) fn take_heartbeat(&mut self, speaker: Speaker, heartbeat: &Heartbeat) -> Change {
+        self.said.heartbeat = true;
+        match speaker {
+            // It is not this number's cell, and may never be.
+            Speaker::Claimant => return Change::default(),
+            Speaker::Overtaken => {}
+            Speaker::Known | Speaker::Anew => {
+                self.uplink.settle(heartbeat.sent, speaker == Speaker::Anew);
+                self.heartbeat = Some(*heartbeat);
+                self.halted = heartbeat.state.has(State::HALTED);
+            }
+        }
+        if speaker == Speaker::Anew || is_first(heartbeat) {
             self.felt.restart();
             self.doubt();
-            // It counts from zero.
-            self.heard = Some(<(Heard, Heard)>::default());
+            // It counts from zero; what we did not hear from the beginning we compare from the next page on.
+            self.heard = is_first(heartbeat).then(Default::default);
             self.told = 0;
+            return self.let_go();
         }
-        self.said.heartbeat = true;
-        self.heartbeat = Some(*heartbeat);
         if heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
     }
 
@@ -189,9 +228,10 @@ impl Cell {
     #[must_use]
     pub fn is_ready(&self) -> bool {
         !self.dead
+            && !self.halted
             && self.heartbeat.is_some_and(|heartbeat| {
                 let state = heartbeat.state;
-                state.has(State::CONFIGURED) && !state.has(State::CLAIMING) && !state.has(State::HALTED)
+                state.has(State::CONFIGURED) && !state.has(State::CLAIMING)
             })
     }
 
@@ -221,7 +261,8 @@ impl Cell {
         let missed = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(missed);
         if left == 0 && missed > 0 {
-            return (self.let_go(), missed);
+            // Nothing of it counts any more; yet the cell has not said that its contact is over.
+            return (self.contribute([0; WORDS]), missed);
         }
         let decay = safety.decay_epochs.max(1);
         let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
@@ -232,6 +273,11 @@ impl Cell {
     /// The last broadcast came again: the cell hears and drops it, and owes nothing for it.
     pub(super) const fn hear_again(&mut self) {
         self.told += 1;
+    }
+
+    /// Whether something of its torque is in the running sum.
+    pub(super) fn contributes(&self) -> bool {
+        self.contribution != [0; WORDS]
     }
 
     pub(super) const fn is_due(&self) -> bool {
@@ -264,6 +310,17 @@ impl Cell {
         self.contribute([0; WORDS])
     }
 
+    /// The bus carried a halt: it stops answering.
+    pub(super) fn halt(&mut self) -> Change {
+        self.halted = true;
+        self.let_go()
+    }
+
+    /// The bus carried a resume: it answers the next broadcast.
+    pub(super) const fn resume(&mut self) {
+        self.halted = false;
+    }
+
     fn contribute(&mut self, words: [i32; WORDS]) -> Change {
         let counts = |words: &[i32; WORDS]| i32::from(*words != [0; WORDS]);
         let before = core::mem::replace(&mut self.contribution, words);
@@ -290,10 +347,14 @@ impl Cell {
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
         let (first, last) = self.heard?;
-        let since = |count: fn(&Heard) -> u16| u64::from(count(&last).wrapping_sub(count(&first)));
+        let since = |count: fn(&Heard) -> u16| count(&last).wrapping_sub(count(&first));
         let skipped = since(|heard| heard.joints_late);
-        let heard = since(|heard| heard.joints) + since(|heard| heard.joints_repeated) + skipped;
-        Some((skipped, self.told.saturating_sub(heard)))
+        let heard = since(|heard| heard.joints).wrapping_add(since(|heard| heard.joints_repeated));
+        // The cell counts modulo 2^16, so no more can be said than that of the difference. A page may have
+        // passed some joints on the way.
+        let [low, high, ..] = self.told.to_le_bytes();
+        let unheard = u16::from_le_bytes([low, high]).wrapping_sub(heard.wrapping_add(skipped));
+        Some((skipped.into(), if unheard > u16::MAX - 64 { 0 } else { unheard.into() }))
     }
 
     /// Nothing more will come: what is still due is missing.

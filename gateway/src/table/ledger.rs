@@ -17,7 +17,10 @@ pub struct Uplink {
     pub lost: u64,
     /// Arrived more often than sent: repeated on the way, or sent by somebody else under this name.
     pub surplus: u64,
-    /// Times that the cell started anew; what it had sent since its last heartbeat is in doubt.
+    /// Arrived with nothing to compare it with: before a cell's first heartbeat, and between its last one
+    /// and a restart. How many more it sent then, nobody knows.
+    pub in_doubt: u64,
+    /// Times that the cell started anew.
     pub restarts: u32,
     said: Option<u16>,
     arrived_since: u64,
@@ -44,8 +47,13 @@ impl Uplink {
         }
         let (arrived, rejected) = (self.arrived_since, self.rejected_since);
         (self.arrived_since, self.rejected_since) = (0, 0);
-        // What came before the first heartbeat, or since a restart, has nothing to be compared with.
-        let Some(before) = before.filter(|_| !restarted) else { return };
+        let Some(before) = before.filter(|_| !restarted) else {
+            // The account begins with this heartbeat.
+            self.sent += 1;
+            self.delivered += 1;
+            self.in_doubt += (arrived + rejected).saturating_sub(1);
+            return;
+        };
         let sent = u64::from(said.wrapping_sub(before));
         self.sent += sent;
         self.delivered += arrived;
@@ -69,6 +77,7 @@ impl Uplink {
             rejected: sum.rejected + one.rejected,
             lost: sum.lost + one.lost,
             surplus: sum.surplus + one.surplus,
+            in_doubt: sum.in_doubt + one.in_doubt,
             restarts: sum.restarts + one.restarts,
             said: None,
             arrived_since: sum.arrived_since + one.arrived_since,
@@ -124,7 +133,7 @@ mod tests {
         uplink.reject();
         uplink.arrive(); // the heartbeat itself
         uplink.settle(3, false); // four were sent in between, and this one
-        assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (5, 2, 1, 2));
+        assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (6, 3, 1, 2));
         uplink.arrive();
         uplink.settle(0, true);
         assert_eq!((uplink.sent, uplink.restarts, uplink.unsettled()), (5, 1, 0));

@@ -27,6 +27,8 @@ use protocol::skin::{Safety, Skin};
 use protocol::time::{Micros, Span};
 
 use crate::central::Central;
+use crate::summary::histogram;
+use cell::Speaker;
 
 pub use accuracy::{Accuracy, Errors};
 pub use cell::{Cell, Said, Status};
@@ -166,7 +168,7 @@ impl Table {
             snapshot,
             counters: Counters::default(),
             accuracy: Accuracy::default(),
-            last_reply: Histogram::new(3).expect("three digits are a valid precision"),
+            last_reply: histogram(),
             notices: VecDeque::new(),
         }
     }
@@ -239,7 +241,7 @@ impl Table {
         let event = |error| match error {
             PacketError::Length { .. } => Event::Length,
             PacketError::Crc { .. } => Event::Crc,
-            _ => Event::Foreign,
+            PacketError::Foreign | _ => Event::Foreign,
         };
         if self.format == Format::Fd {
             return Packet::from_fd(frame).map(Some).map_err(event);
@@ -284,7 +286,7 @@ impl Table {
         match *message {
             Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, positions(epoch)),
             Message::Stimulus { to, from, page } => self.expect_feeling(to, from, page),
-            Message::Halt => self.each_cell(Cell::let_go),
+            Message::Halt => self.each_cell(Cell::halt),
             Message::Sync => self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false),
             Message::Report => self.cells.iter_mut().for_each(|cell| cell.said.counters = false),
             Message::Resume
@@ -309,11 +311,12 @@ impl Table {
             }
             Message::Halt => {
                 self.snapshot.halts += 1;
-                self.each_cell(Cell::let_go);
+                self.each_cell(Cell::halt);
                 return;
             }
             Message::Resume => {
                 self.snapshot.resumes += 1;
+                self.cells.iter_mut().for_each(Cell::resume);
                 return;
             }
             Message::Stimulus { to, from, page } => return self.expect_feeling(to, from, page),
@@ -343,7 +346,15 @@ impl Table {
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
             Message::Sum { .. } => self.counters.count(Event::Stranger),
-            _ => {}
+            Message::Sensors { .. }
+            | Message::Configured { .. }
+            | Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Configure { .. }
+            | Message::Stimulus { .. } => {}
         }
     }
 
@@ -353,10 +364,11 @@ impl Table {
             self.counters.count(Event::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
         }
-        if cell.has_restarted(heartbeat) {
+        let speaker = cell.speaker(heartbeat);
+        if speaker == Speaker::Anew {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
-        let released = cell.take_heartbeat(heartbeat);
+        let released = cell.take_heartbeat(speaker, heartbeat);
         self.apply(released);
     }
 
@@ -419,7 +431,6 @@ impl Table {
                 cell.open_epoch(number, f_z.is_some_and(|(force, _)| force > 0.0), &self.safety);
             due += u32::from(cell.is_due());
             stale += u32::from(missed > 0);
-            age = age.max(missed);
             if let (Some(frames), Some(exact), Some((f_z, skin))) = (&frames, &exact, f_z) {
                 let plain = self.unquantised.force(place, &skin);
                 let expected = self.central.torque(place, frames, f_z);
@@ -428,11 +439,15 @@ impl Table {
                     *felt = skin;
                 }
             }
+            if cell.contributes() {
+                age = age.max(missed);
+            }
             self.apply(change);
         }
         (self.snapshot.stale, self.snapshot.age) = (stale, age);
         let error = [0.0; WORDS];
-        self.broadcast = Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
+        self.broadcast =
+            Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
     }
 
     fn close_epoch(&mut self) {
