@@ -134,9 +134,11 @@ mod tests {
         uplink.arrive(); // the heartbeat itself
         uplink.settle(3, false); // four were sent in between, and this one
         assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (6, 3, 1, 2));
-        uplink.arrive();
+        uplink.arrive(); // a last word
+        uplink.arrive(); // the claim of its next life
         uplink.settle(0, true);
-        assert_eq!((uplink.sent, uplink.restarts, uplink.unsettled()), (5, 1, 0));
+        assert_eq!((uplink.sent, uplink.lost, uplink.in_doubt), (7, 2, 1));
+        assert_eq!((uplink.restarts, uplink.unsettled()), (1, 0));
     }
 
     proptest! {
