@@ -34,8 +34,17 @@ fn cells(bench: &Bench) {
         assert_eq!(due, in_time + late + missing, "replies of cell {node}: {replies:?}");
         assert!(in_doubt <= missing, "replies of cell {node}: {replies:?}");
         let arrived = bench.witness.arrived(place);
+        let tally = bench.witness.tally;
+        if is_fd(bench) && (tally.flipped, tally.cut, tally.babbled) == (0, 0, 0) {
+            let elsewhere = uplink.in_doubt + uplink.unsettled();
+            assert_eq!(delivered + elsewhere, arrived, "arrivals of cell {node}: {uplink:?}");
+        }
         assert!(delivered <= arrived, "cell {node} delivered {arrived}: {uplink:?}");
     }
+}
+
+fn is_fd(bench: &Bench) -> bool {
+    bench.skin.buses.first().is_some_and(|bus| bus.format == Format::Fd)
 }
 
 /// Every torque that came is used, or counted by the reason why not.
@@ -62,22 +71,18 @@ fn frames(bench: &Bench) {
     if tally.babbled == 0 {
         assert_eq!(count(Event::Length), tally.cut, "cut frames");
     }
-    match bench.skin.buses.first().map(|bus| bus.format) {
-        Some(Format::Fd) => {
-            assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
-            if tally.babbled == 0 {
-                assert_eq!(count(Event::Crc), tally.flipped, "frames with turned bits");
-            }
-            assert_eq!(count(Event::Incomplete), 0);
+    if is_fd(bench) {
+        assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
+        if tally.babbled == 0 {
+            assert_eq!(count(Event::Crc), tally.flipped, "frames with turned bits");
         }
-        // Two halves are a packet; an incomplete one is one half, and each identifier may have one waiting.
-        Some(Format::Classic) => {
-            let packets = by_kind - count(Event::Length) - count(Event::Incomplete);
-            let halves = 2 * packets + count(Event::Incomplete) + count(Event::Length);
-            let waiting = tally.frames - elsewhere - halves;
-            assert!(waiting <= 1 << 11, "{waiting} halves wait");
-            assert_eq!(count(Event::Crc), 0);
-        }
-        None => {}
+        assert_eq!(count(Event::Incomplete), 0);
+        return;
     }
+    // Two halves are a packet; an incomplete one is one half, and each identifier may have one waiting.
+    let odd = count(Event::Incomplete) + count(Event::Length);
+    let halves = 2 * (by_kind - odd) + odd;
+    let waiting = tally.frames - elsewhere - halves;
+    assert!(waiting <= 1 << 11, "{waiting} halves wait");
+    assert_eq!(count(Event::Crc), 0);
 }

@@ -80,6 +80,8 @@ struct Mirror {
     value: [i32; WORDS],
     torques: Vec<(u8, [i16; 6])>,
     arrived: u64,
+    /// Who has the number, by the last word that was no claim.
+    holder: Option<Party>,
 }
 
 /// The witness of one bus.
@@ -178,8 +180,14 @@ impl Witness {
             }
             Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 mirror.arrived += 1;
-                if !heartbeat.state.has(State::ACTIVE) {
+                // Who claims a number says nothing of the cell that has it.
+                let claims = heartbeat.state.has(State::CLAIMING);
+                let challenges = claims && mirror.holder.is_some_and(|holder| holder != truth.from);
+                if !heartbeat.state.has(State::ACTIVE) && !challenges {
                     mirror.let_go();
+                }
+                if !claims {
+                    mirror.holder = Some(truth.from);
                 }
             }
             Message::Network { .. } | Message::Sensors { .. } | Message::Configured { .. } => {

@@ -1,0 +1,336 @@
+//! Whole benches on which cells fall silent, hang, start anew, or share a number.
+
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
+
+use cell_node::node::{CLAIM, Flash, HEARTBEAT, Identity, PENDING};
+use gateway::table::{DEAD_AFTER, Event, Notice, Replies, Status};
+use protocol::can::Format;
+use protocol::id::Kind;
+use protocol::message::{Message, State};
+use protocol::time::{Micros, Span};
+use skinbus_tests::accounts;
+use skinbus_tests::bench::{Act, Bench};
+use skinbus_tests::fault::{Fault, Harm, Party};
+use skinbus_tests::skins;
+
+const CELL: usize = 1;
+
+fn bench(seed: u64) -> Bench {
+    Bench::new(&skins::arm(4, Format::Fd), seed).started()
+}
+
+/// Longer than a cell needs from its start to its first torque.
+const START: Span = Span(2 * CLAIM.0 + 2 * HEARTBEAT.0);
+
+fn status(bench: &Bench, place: usize) -> Status {
+    bench.gateway.table.statuses(bench.now()).nth(place).unwrap().1
+}
+
+fn replies(bench: &Bench, place: usize) -> Replies {
+    bench.gateway.table.cells()[place].replies
+}
+
+fn finish(bench: &mut Bench) {
+    bench.finish();
+    accounts::check(bench);
+}
+
+fn magnitude(torque: &[f64; 6]) -> f64 {
+    torque.iter().map(|torque| torque.abs()).sum()
+}
+
+#[test]
+fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
+    let mut bench = bench(1);
+    bench.press(CELL, 3.0);
+    bench.run_epochs(3);
+    let whole = magnitude(&bench.gateway.table.snapshot().torque);
+    assert!(whole > 0.01);
+    // The cell goes on to speak of a contact, but none of its torques arrives.
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::Seat(CELL)));
+    let course: Vec<_> = (0..10)
+        .map(|_| {
+            bench.run_epochs(1);
+            let snapshot = bench.gateway.table.snapshot();
+            let part = (magnitude(&snapshot.torque) / whole * 20.0).round() / 20.0;
+            (part, snapshot.age, snapshot.stale, snapshot.contributing)
+        })
+        .collect();
+    // Nobody can tell whether the newest broadcast is missed; then held for 2 epochs, let go over 4.
+    let expected = [
+        (1.0, 0, 0, 1),
+        (1.0, 1, 1, 1),
+        (1.0, 2, 1, 1),
+        (0.75, 3, 1, 1),
+        (0.5, 4, 1, 1),
+        (0.25, 5, 1, 1),
+        (0.0, 0, 1, 0),
+        (0.0, 0, 1, 0),
+    ];
+    for (got, expected) in course.iter().zip(&expected) {
+        assert_eq!(got, expected, "{course:?}");
+    }
+    assert_eq!(status(&bench, CELL), Status::Stale, "it says that it is in contact, so zero is not known");
+    bench.faults.clear();
+    bench.run_epochs(2);
+    assert_eq!(status(&bench, CELL), Status::Active);
+    finish(&mut bench);
+}
+
+#[test]
+fn a_heartbeat_that_says_quiet_clears_a_held_torque() {
+    let mut skin = skins::arm(4, Format::Fd);
+    skin.safety.hold_epochs = 10_000;
+    let mut bench = Bench::new(&skin, 2).started();
+    bench.press(CELL, 3.0);
+    bench.run_epochs(3);
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque));
+    bench.press(CELL, 0.0);
+    let let_go = bench.now();
+    while bench.gateway.table.snapshot().contributing > 0 {
+        bench.run(Span::from_millis(1));
+        assert!(bench.now().since(let_go) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
+    }
+    assert_eq!(bench.gateway.table.snapshot().torque, [0.0; 6]);
+    assert_eq!(status(&bench, CELL), Status::Quiet);
+    finish(&mut bench);
+}
+
+#[test]
+fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
+    for seed in 0..20 {
+        let mut bench = bench(seed);
+        bench.press(CELL, 2.0);
+        bench.run(Span(100_000 + seed * 7_919));
+        bench.act(Act::Kill(CELL));
+        let killed = bench.now();
+        bench.run(Span(DEAD_AFTER.0 + HEARTBEAT.0));
+        let node = bench.seats[CELL].identity.cell;
+        let [(dead, Notice::Dead(who))] = bench.gateway.notices[..] else {
+            panic!("{:?}", bench.gateway.notices)
+        };
+        assert_eq!(who, node);
+        // It answered every epoch, so its last word is at most an epoch old.
+        let after = dead.since(killed);
+        assert!((DEAD_AFTER.0 - bench.epoch().0..DEAD_AFTER.0 + 5_000).contains(&after.0), "{after:?}");
+        assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().dead), (Status::Dead, 1));
+        assert_eq!(bench.gateway.table.snapshot().contributing, 0);
+
+        bench.act(Act::Start(CELL));
+        bench.run(START);
+        let told: Vec<_> = bench.gateway.notices[1..].iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(told, [Notice::Back(node), Notice::Restarted(node)]);
+        assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
+        assert_eq!(bench.gateway.table.snapshot().dead, 0);
+        let before = replies(&bench, CELL);
+        bench.run_epochs(20);
+        let now = replies(&bench, CELL);
+        assert_eq!((now.due, now.in_time), (before.due + 20, before.in_time + 20), "{now:?}");
+        finish(&mut bench);
+        let uplink = bench.gateway.table.cells()[CELL].uplink;
+        assert_eq!((uplink.restarts, uplink.lost, uplink.surplus), (1, 0, 0), "{uplink:?}");
+    }
+}
+
+#[test]
+fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
+    for seed in 0..20 {
+        let mut bench = bench(seed);
+        bench.press(CELL, 2.0);
+        bench.run(Span(600_000 + seed * 7_919));
+        bench.act(Act::Kill(CELL));
+        bench.act(Act::Start(CELL));
+        // Its claim is lost; the first word that is heard comes when the number is its own.
+        let claim = bench.now()..bench.now() + CLAIM;
+        bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::Seat(CELL)).during(claim));
+        bench.run(START);
+        let node = bench.seats[CELL].identity.cell;
+        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(told, [Notice::Restarted(node)]);
+        assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
+        finish(&mut bench);
+        let uplink = bench.gateway.table.cells()[CELL].uplink;
+        assert!(uplink.restarts == 1 && uplink.lost <= 1 && uplink.sent < 1_000, "{uplink:?}");
+    }
+}
+
+#[test]
+fn a_restarted_cell_feels_nothing_until_it_is_told_again() {
+    let mut bench = bench(3);
+    bench.gateway.reminds = false;
+    bench.press(CELL, 2.0);
+    bench.run_epochs(10);
+    bench.act(Act::Kill(CELL));
+    bench.act(Act::Start(CELL));
+    bench.run(START);
+    assert_eq!(status(&bench, CELL), Status::Quiet);
+    let (due, sent) = (replies(&bench, CELL).due, bench.torques(CELL).len());
+    bench.run_epochs(20);
+    assert_eq!((replies(&bench, CELL).due, bench.torques(CELL).len()), (due, sent), "nothing is due");
+    bench.press(CELL, 1.0);
+    bench.run_epochs(3);
+    assert_eq!(status(&bench, CELL), Status::Active);
+    finish(&mut bench);
+}
+
+#[test]
+fn joints_older_than_a_period_are_skipped_and_explain_what_is_missing() {
+    for seed in 0..20 {
+        let mut bench = bench(seed);
+        bench.press(CELL, 2.0);
+        bench.run_epochs(10);
+        bench.act(Act::Say(Message::Report));
+        bench.run(Span(2_000));
+        bench.act(Act::Hang(CELL));
+        bench.run(Span(100_000 + seed * 3_137));
+        bench.act(Act::GoOn(CELL));
+        bench.run_epochs(20);
+        finish(&mut bench);
+        assert_eq!(bench.gateway.notices, [], "too short to be dead");
+        let cell = &bench.gateway.table.cells()[CELL];
+        let (skipped, unheard) = cell.unanswered().unwrap();
+        let replies = replies(&bench, CELL);
+        assert!(skipped >= 5 && unheard == 0, "{skipped} {unheard}");
+        // The last broadcast of the hang may be young enough to be answered, after its time.
+        assert_eq!(replies.missing, skipped, "{replies:?}");
+        assert!(replies.late <= 1, "{replies:?}");
+    }
+}
+
+#[test]
+fn joints_that_a_cell_never_heard_are_told_apart_from_those_it_skipped() {
+    let mut bench = bench(4);
+    bench.press(CELL, 2.0);
+    bench.run_epochs(5);
+    bench.act(Act::Say(Message::Report));
+    bench.run(Span(2_000));
+    bench.fault(Fault::new(Harm::Lose, 0.3).at(Party::Seat(CELL)).of(Kind::Command));
+    bench.run_epochs(100);
+    bench.faults.clear();
+    finish(&mut bench);
+    let (skipped, unheard) = bench.gateway.table.cells()[CELL].unanswered().unwrap();
+    assert_eq!((skipped, unheard), (0, replies(&bench, CELL).missing));
+    assert!(unheard > 10, "{unheard}");
+    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)));
+}
+
+#[test]
+fn a_long_run_does_not_confuse_the_count_of_joints() {
+    // One tick a broadcast, and more of them than a counter of 16 bits holds.
+    let mut skin = skins::arm(1, Format::Fd);
+    (skin.timing.control_hz, skin.timing.ticks_per_broadcast) = (62.5, 1);
+    let mut bench = Bench::new(&skin, 5).started();
+    bench.act(Act::Say(Message::Report));
+    bench.run_epochs(65_536 + 1_000);
+    finish(&mut bench);
+    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)));
+}
+
+#[test]
+fn stimuli_that_found_no_room_after_a_hang_are_counted_and_a_new_one_puts_it_right() {
+    let mut bench = bench(6);
+    bench.run_epochs(5);
+    bench.act(Act::Hang(CELL));
+    for step in 0..2 * PENDING {
+        bench.press(CELL, 1.0 + 0.1 * step as f64);
+        bench.run_epochs(1);
+    }
+    bench.press(CELL, 0.0);
+    bench.run_epochs(2);
+    bench.act(Act::GoOn(CELL));
+    bench.run_epochs(5);
+    bench.press(CELL, 0.0);
+    bench.run_epochs(5);
+    assert_eq!(status(&bench, CELL), Status::Quiet);
+    finish(&mut bench);
+    let refused = bench.gateway.table.cells()[CELL].refused.unwrap();
+    assert_eq!(usize::from(refused.stimuli), 2 * PENDING + 1 - PENDING, "{refused:?}");
+}
+
+#[test]
+fn of_two_cells_with_one_number_exactly_one_stays_whenever_they_start() {
+    for apart in (0..900_000).step_by(17_000) {
+        for (serial, seed) in [(1, 1), (900_000, 2)] {
+            let skin = skins::arm(2, Format::Fd);
+            let mut bench = Bench::new(&skin, seed);
+            bench.witness.compares = false;
+            let first = bench.seats[0].identity;
+            let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+            let second = bench.add(Identity { serial, ..first }, flash);
+            bench.at(Micros(apart), Act::Start(second));
+            bench.run(Span::from_millis(2_000));
+            let gave_up = [0, second].map(|seat| bench.seats[seat].gave_up().is_some());
+            assert_ne!(gave_up[0], gave_up[1], "{apart} us apart, serial {serial}");
+            assert!(bench.gateway.table.cells()[0].is_ready());
+        }
+    }
+}
+
+#[test]
+fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_it_claims() {
+    let mut claims = [0, 0];
+    for start in 0..12 {
+        let serial = [1, 1_023][start % 2];
+        let skin = skins::arm(2, Format::Fd);
+        let mut bench = Bench::new(&skin, 7).started();
+        bench.press(0, 2.0);
+        bench.run_epochs(60);
+        bench.run(Span(21_000 * start as u64));
+        let before = replies(&bench, 0);
+        let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+        let newcomer = bench.add(Identity { serial, ..bench.seats[0].identity }, flash);
+        bench.act(Act::Start(newcomer));
+        for _ in 0..60 {
+            bench.run_epochs(1);
+            assert_eq!(bench.gateway.table.snapshot().contributing, 1, "the torque is held throughout");
+        }
+        assert_eq!(bench.seats[newcomer].gave_up(), Some(bench.seats[0].identity.serial));
+        let now = replies(&bench, 0);
+        assert_eq!((now.due, now.in_time), (before.due + 60, before.in_time + 60), "{now:?}");
+        // It may hear a heartbeat before its first word, and then says none.
+        let claimed = bench.wire.iter().any(|it| it.from == Party::Seat(newcomer));
+        claims[usize::from(claimed)] += 1;
+        let node = bench.seats[0].identity.cell;
+        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(told, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
+        assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
+        finish(&mut bench);
+        let uplink = bench.gateway.table.cells()[0].uplink;
+        let got = (uplink.restarts, uplink.lost, uplink.surplus);
+        assert_eq!(got, (0, 0, u64::from(claimed)), "{uplink:?}");
+    }
+    assert!(claims[0] > 0 && claims[1] > 0, "{claims:?}");
+}
+
+#[test]
+fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
+    let skin = skins::arm(2, Format::Fd);
+    let mut bench = Bench::new(&skin, 8).started();
+    bench.press(0, 2.0);
+    bench.run_epochs(60);
+    bench.act(Act::Kill(0));
+    let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+    let other = bench.add(Identity { serial: 77, ..bench.seats[0].identity }, flash);
+    bench.act(Act::Start(other));
+    bench.run(START);
+    assert_eq!(status(&bench, 0), Status::Active, "it was told what touches it");
+    assert_eq!(bench.gateway.table.cells()[0].heartbeat.unwrap().serial, 77);
+    finish(&mut bench);
+    let uplink = bench.gateway.table.cells()[0].uplink;
+    assert_eq!((uplink.restarts, uplink.lost), (1, 0), "{uplink:?}");
+}
+
+#[test]
+fn a_damaged_flash_is_said_and_nothing_is_due() {
+    let skin = skins::arm(2, Format::Fd);
+    let mut bench = Bench::with(&skin, &gateway::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
+    bench.seats[0].flash = Flash::Damaged;
+    bench.run(Span::from_millis(1_000));
+    bench.begin();
+    bench.press(0, 2.0);
+    bench.run_epochs(20);
+    let heartbeat = bench.gateway.table.cells()[0].heartbeat.unwrap();
+    assert!(heartbeat.state.has(State::FLASH_DAMAGED) && !heartbeat.state.has(State::CONFIGURED));
+    finish(&mut bench);
+    assert_eq!((replies(&bench, 0), bench.torques(0).len()), (Replies::default(), 0));
+}
