@@ -1,0 +1,296 @@
+//! Whole benches on which frames come twice, late, in the wrong order, in halves, or from somebody else.
+
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
+
+use gateway::table::{Event, Notice, Replies, Uplink};
+use protocol::can::Format;
+use protocol::fixed::Q1_14;
+use protocol::id::{Kind, Node};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage};
+use protocol::packet::Epoch;
+use protocol::time::{Micros, Span};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skinbus_tests::accounts;
+use skinbus_tests::bench::{Act, Bench};
+use skinbus_tests::fault::{Fault, Harm, Party};
+use skinbus_tests::gateway::epoch_of;
+use skinbus_tests::skins;
+
+const CELLS: usize = 4;
+
+/// All cells pressed, for some epochs.
+fn pressed(format: Format, seed: u64) -> Bench {
+    let mut bench = Bench::new(&skins::arm(4, format), seed).started();
+    (0..CELLS).for_each(|place| bench.press(place, 1.0 + 0.2 * place as f64));
+    bench.run_epochs(3);
+    bench
+}
+
+fn replies(bench: &Bench) -> Replies {
+    Replies::total(bench.gateway.table.cells().iter().map(|cell| cell.replies))
+}
+
+fn uplink(bench: &Bench) -> Uplink {
+    Uplink::total(bench.gateway.table.cells().iter().map(|cell| cell.uplink))
+}
+
+fn events(bench: &Bench, event: Event) -> u64 {
+    bench.gateway.table.counters().events(event)
+}
+
+fn finish(bench: &mut Bench) {
+    bench.faults.clear();
+    bench.finish();
+    accounts::check(bench);
+}
+
+#[test]
+fn torques_that_come_twice_are_dropped_and_counted() {
+    let mut bench = pressed(Format::Fd, 1);
+    let before = bench.gateway.table.counters().received(Kind::Torque);
+    bench.fault(Fault::new(Harm::Duplicate, 1.0).at(Party::Gateway).of(Kind::Torque));
+    bench.run_epochs(50);
+    finish(&mut bench);
+    let twice = events(&bench, Event::RepeatedTorque);
+    assert_eq!(twice, 50 * CELLS as u64);
+    let torques = bench.gateway.table.counters().received(Kind::Torque) - before;
+    assert_eq!(torques, 2 * twice + CELLS as u64, "the last epoch was clean");
+    assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
+    assert_eq!(uplink(&bench).surplus, twice);
+}
+
+#[test]
+fn joints_that_come_twice_are_answered_once() {
+    let mut bench = pressed(Format::Fd, 2);
+    bench.fault(Fault::new(Harm::Duplicate, 1.0).on_the_wire().of(Kind::Command));
+    bench.run_epochs(50);
+    finish(&mut bench);
+    assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
+    assert_eq!(events(&bench, Event::RepeatedTorque) + events(&bench, Event::StaleTorque), 0);
+    for cell in bench.gateway.table.cells() {
+        assert_eq!(cell.heard.unwrap().1.joints_repeated, 50);
+        assert_eq!(cell.unanswered(), Some((0, 0)));
+    }
+}
+
+#[test]
+fn a_torque_that_was_overtaken_by_a_later_one_is_dropped_as_stale() {
+    let mut bench = pressed(Format::Fd, 3);
+    // Each of them comes between one and three epochs late, and some overtake others.
+    let delay = Harm::Delay(Span(3 * bench.epoch().0));
+    bench.fault(Fault::new(delay, 0.5).at(Party::Gateway).of(Kind::Torque));
+    bench.run_epochs(200);
+    finish(&mut bench);
+    let Replies { due, in_time, late, missing, .. } = replies(&bench);
+    let stale = events(&bench, Event::StaleTorque);
+    assert!(late > 10 && stale > 10 && in_time > due / 3, "{:?} {stale}", replies(&bench));
+    assert_eq!(missing, stale, "what was overtaken counts as missing");
+    assert!(
+        bench.gateway.table.accuracy().single.max() < 1e-3,
+        "late ones are compared with their own epoch"
+    );
+}
+
+#[test]
+fn a_torque_may_be_three_epochs_late_and_not_four() {
+    for (late, used) in [(1, true), (2, true), (3, true), (4, false)] {
+        let mut bench = pressed(Format::Fd, 4);
+        let epoch = bench.epoch();
+        // Cell 1's next torque is repeated by somebody so many epochs later, and it says nothing itself.
+        bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of(Kind::Torque).from(Party::Seat(0)));
+        bench.run_epochs(1);
+        let answers = epoch_of(bench.gateway.broadcasts() - 1);
+        let before = bench.gateway.table.cells()[0].replies;
+        bench.run_epochs(late);
+        let torque = [protocol::fixed::Q3_12::from_bits(5); 6];
+        let from = bench.seats[0].identity.cell;
+        bench.witness.compares = false;
+        bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque }));
+        bench.run(Span(epoch.0 / 4));
+        let now = bench.gateway.table.cells()[0].replies;
+        assert_eq!(now.late - before.late, u64::from(used), "{late} epochs late");
+        assert_eq!(events(&bench, Event::StaleTorque), u64::from(!used), "{late} epochs late");
+        finish(&mut bench);
+    }
+}
+
+#[test]
+fn a_broadcast_that_the_gateway_does_not_read_back_confuses_no_torque() {
+    for harm in [Harm::Lose, Harm::Reorder, Harm::Delay(Span::from_millis(40))] {
+        let mut bench = pressed(Format::Fd, 5);
+        bench.fault(Fault::new(harm, 0.3).at(Party::Gateway).from(Party::Gateway).of(Kind::Command));
+        bench.run_epochs(200);
+        finish(&mut bench);
+        let accuracy = bench.gateway.table.accuracy();
+        assert!(accuracy.single.max() < 1e-3, "{harm:?}: {accuracy:?}");
+        assert!(bench.gateway.table.snapshot().contributing > 0);
+    }
+}
+
+#[test]
+fn broadcasts_that_change_places_on_the_wire_are_answered_forward_and_back() {
+    let mut bench = pressed(Format::Fd, 6);
+    let fault = Fault::new(Harm::Delay(Span(2 * bench.epoch().0)), 0.3);
+    bench.fault(fault.on_the_wire().of(Kind::Command));
+    bench.run_epochs(200);
+    finish(&mut bench);
+    let Replies { due, in_time, late, missing, .. } = replies(&bench);
+    assert!(in_time + late > due * 9 / 10, "{:?}", replies(&bench));
+    // A cell answers what the wire carried in its order, so it misses nothing.
+    assert_eq!(missing, 0);
+    assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
+}
+
+#[test]
+fn epochs_may_jump_forward_and_back() {
+    let mut bench = pressed(Format::Fd, 7);
+    let mut dice = Pcg64Mcg::seed_from_u64(7);
+    let before = replies(&bench);
+    for _ in 0..300 {
+        bench.run(Span(bench.epoch().0 / 2));
+        // As if it had been started anew, or a recording went round. Not the epoch of the last or next one.
+        let ours = bench.gateway.broadcasts();
+        let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
+        let joints = Joints { positions: [Q1_14::ZERO; 6], in_use: 6 };
+        bench.act(Act::Say(Message::Joints { epoch, joints }));
+        bench.run(Span(bench.epoch().0 / 2));
+    }
+    let now = replies(&bench);
+    assert_eq!(now.due - before.due, now.in_time - before.in_time, "{now:?}");
+    assert!(now.due - before.due >= 600 * CELLS as u64, "{now:?}");
+    finish(&mut bench);
+    assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
+}
+
+#[test]
+fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
+    let mut bench = pressed(Format::Fd, 8);
+    for late in 0..20 {
+        let from = From::Epoch(epoch_of(bench.gateway.broadcasts() - 1 - late % 3));
+        bench.press_from(0, 1.5 + 0.05 * late as f64, from);
+        bench.run_epochs(2);
+    }
+    finish(&mut bench);
+    assert_eq!(bench.gateway.table.cells()[0].heard.unwrap().1.stimuli_late, 20);
+    assert_eq!(replies(&bench).missing, 0);
+    assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "both sides take it at the same joints");
+}
+
+#[test]
+fn a_touch_that_a_cell_never_heard_of_shows_as_missing_replies() {
+    let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Seat(0)).of(Kind::Stimulus));
+    bench.press(0, 2.0);
+    bench.run_epochs(30);
+    finish(&mut bench);
+    let replies = replies(&bench);
+    assert!(replies.due >= 30 && replies.missing == replies.due, "{replies:?}");
+    assert_eq!(bench.gateway.table.counters().epochs_complete, 0);
+    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)), "it heard all joints");
+}
+
+#[test]
+fn a_release_that_a_cell_never_heard_of_shows_as_torques_that_nobody_asked_for() {
+    let mut bench = pressed(Format::Fd, 10);
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Seat(0)).of(Kind::Stimulus));
+    bench.press(0, 0.0);
+    bench.run_epochs(30);
+    finish(&mut bench);
+    let replies = replies(&bench);
+    assert!(replies.unasked >= 29 && replies.missing == 0, "{replies:?}");
+    let single = bench.gateway.table.accuracy().single;
+    assert!(single.max() > 0.01, "a torque that should not be: {single:?}");
+}
+
+#[test]
+fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
+    let joints = Joints { positions: [Q1_14::ZERO; 6], in_use: 6 };
+    let joints = Message::Joints { epoch: Epoch(77), joints };
+    let page = NetworkPage::Heartbeat(Heartbeat::default());
+    let heartbeat = Message::Network { from: Node::Gateway, epoch: Epoch(0), page };
+    for message in [joints, heartbeat] {
+        let mut bench = pressed(Format::Fd, 11);
+        bench.act(Act::Inject(message));
+        bench.run(Span(5_000));
+        assert_eq!(events(&bench, Event::Rival), 1);
+        assert_eq!(bench.gateway.table.snapshot().rivals, 1);
+        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(told, [Notice::Rival]);
+        finish(&mut bench);
+        // What cells answered to the other one is nothing that this one uses.
+        assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
+    }
+}
+
+#[test]
+fn half_a_packet_that_is_lost_costs_that_packet_and_no_other() {
+    for seed in 0..20 {
+        let mut bench = pressed(Format::Classic, seed);
+        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::Gateway).of(Kind::Torque));
+        bench.run_epochs(100);
+        finish(&mut bench);
+        let Replies { due, missing, late, unasked, .. } = replies(&bench);
+        // Of two halves one is lost in 18 of 100 packets, both in one.
+        assert!(missing > 0 && missing < due * 28 / 100, "{:?}", replies(&bench));
+        assert_eq!((late, unasked), (0, 0));
+        let incomplete = events(&bench, Event::Incomplete);
+        assert!(incomplete > 0 && incomplete <= missing, "{incomplete} of {missing}");
+        assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "no two halves of two packets");
+    }
+}
+
+#[test]
+fn cells_pair_halves_as_the_gateway_does() {
+    for seed in 0..20 {
+        let mut bench = pressed(Format::Classic, seed);
+        bench.act(Act::Say(Message::Report));
+        bench.run(Span(2_000));
+        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::Seat(0)).of(Kind::Command));
+        bench.run_epochs(100);
+        finish(&mut bench);
+        let cell = &bench.gateway.table.cells()[0];
+        let (skipped, unheard) = cell.unanswered().unwrap();
+        assert!(cell.refused.unwrap().incomplete > 0);
+        assert_eq!((skipped, unheard), (0, cell.replies.missing));
+        assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
+    }
+}
+
+#[test]
+fn neither_the_order_of_starts_nor_that_of_replies_changes_a_single_torque() {
+    let skin = skins::arm(6, Format::Fd);
+    let run = |seed: u64| {
+        let mut dice = Pcg64Mcg::seed_from_u64(seed);
+        let starts: Vec<u64> = (0..6).map(|_| dice.random_range(0..400_000)).collect();
+        let idle = gateway::scenario::Scenario::idle(Span(0));
+        let mut bench = Bench::with(&skin, &idle, seed, |place| Micros(starts[place]));
+        for seat in &mut bench.seats {
+            // Within a tick, or the arm, which gives way to the sum, would move differently.
+            seat.thinks = Span(dice.random_range(0..1_500));
+        }
+        bench.settle();
+        bench.begin();
+        for step in 0..60_u32 {
+            for place in 0..6 {
+                let newtons = f64::from((step * 7 + place * 5) % 11) * 0.3;
+                let from = From::Epoch(epoch_of(bench.gateway.broadcasts() + 2));
+                bench.press_from(place as usize, newtons, from);
+            }
+            bench.run_epochs(1);
+        }
+        bench.finish();
+        accounts::check(&bench);
+        let order: Vec<u32> = bench.wire.iter().map(|it| it.frame.id()).collect();
+        let torques: Vec<_> = (0..6).map(|place| bench.torques(place)).collect();
+        (order, torques, bench.gateway.last().unwrap().q.map(f64::to_bits))
+    };
+    let (order, torques, q) = run(0);
+    assert!(torques.iter().all(|torques| torques.len() > 40), "{torques:?}");
+    for seed in 1..30 {
+        let (other_order, other_torques, other_q) = run(seed);
+        assert_ne!(order, other_order, "another order on the wire");
+        assert_eq!(torques, other_torques);
+        assert_eq!(q, other_q, "the sum does not depend on the order either");
+    }
+}
