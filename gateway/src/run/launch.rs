@@ -2,6 +2,7 @@
 //! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
 
 use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -78,6 +79,7 @@ impl ServedBus {
     pub fn start(program: &Path, bus: &str) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
+        apart(&mut command);
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
         let mut served = Self { child: command.spawn().map_err(start)? };
         let mut line = String::new();
@@ -266,8 +268,15 @@ impl Start {
     fn spawn(&self) -> Result<Child, LaunchError> {
         let mut command = Command::new(&self.program);
         command.args(&self.arguments).stdin(Stdio::null()).stdout(Stdio::null());
+        apart(&mut command);
         command.spawn().map_err(|source| LaunchError::Start { path: self.program.clone(), source })
     }
+}
+
+/// Ctrl-C on a terminal goes to everyone in its process group, and is meant for the gateway alone: cells and
+/// buses have to outlive it until the last words are said.
+fn apart(command: &mut Command) {
+    command.process_group(0);
 }
 
 /// Runs of consecutive numbers, at most `size` long.
