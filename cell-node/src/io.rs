@@ -32,6 +32,16 @@ impl FlashFile {
         Self { identity, path }
     }
 
+    /// What people call it: `flash of cell 12 (DIR/vcan0-12.flash)`.
+    #[must_use]
+    pub fn name(&self) -> String {
+        let cell = self.identity.cell;
+        self.path.as_ref().map_or_else(
+            || format!("flash of cell {cell}"),
+            |path| format!("flash of cell {cell} ({})", path.display()),
+        )
+    }
+
     /// What it holds. What is there but not sound is damaged; why is the second value.
     ///
     /// # Errors
@@ -56,10 +66,18 @@ impl FlashFile {
     pub fn store(&self, parameters: &Parameters) -> io::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
         let part = path.with_extension("flash.part");
-        let mut file = File::create(&part)?;
-        file.write_all(&flash::encode(self.identity, parameters))?;
-        file.sync_all()?;
-        fs::rename(&part, path)
+        let store = || {
+            let mut file = File::create(&part)?;
+            file.write_all(&flash::encode(self.identity, parameters))?;
+            file.sync_all()?;
+            fs::rename(&part, path)
+        };
+        let stored = store();
+        if stored.is_err() {
+            // It may not even have been made.
+            let _ = fs::remove_file(&part);
+        }
+        stored
     }
 }
 

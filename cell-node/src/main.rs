@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
-use cell_node::io::{Cells, FlashFile};
+use cell_node::io::{Cells, FlashFile, Stopped};
 use cell_node::node::{Flash, Identity};
 use clap::Parser;
 use protocol::bus::{Bus, Choice, Filter, Options};
@@ -57,11 +57,22 @@ fn range(text: &str) -> Result<(u8, u8), String> {
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        // Help and version, which are asked for, are printed as they are.
+        Err(asked) if !asked.use_stderr() => asked.exit(),
+        Err(wrong) => {
+            eprintln!("cell-node: {}", one_line(&wrong.render().to_string()));
+            return ExitCode::from(2);
+        }
+    };
     match prepare(&arguments) {
         Ok((mut cells, bus)) => {
             let Err(stopped) = cells.run(&bus);
-            eprintln!("cell-node: {stopped}");
+            // Whoever started hundreds of cells says once that their bus is gone.
+            if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
+                eprintln!("cell-node: {stopped}");
+            }
             ExitCode::from(1)
         }
         Err(error) => {
@@ -71,9 +82,19 @@ fn main() -> ExitCode {
     }
 }
 
+/// What clap says in several lines: what is wrong and its tip, without the usage.
+fn one_line(text: &str) -> String {
+    let text = text.strip_prefix("error: ").unwrap_or(text);
+    let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
+    let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
+    let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
+    format!("{lines}; try '--help'")
+}
+
 fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
     if let Some(parent) = arguments.with_parent {
-        set_parent_process_death_signal(Some(Signal::TERM))?;
+        // Not TERM, which a stopped process would not take before it is continued.
+        set_parent_process_death_signal(Some(Signal::KILL))?;
         // It may have ended before that.
         if getppid() != Pid::from_raw(parent) {
             bail!("process {parent} is not the parent of this one");
@@ -101,15 +122,16 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
         let identity = Identity { cell, serial: described.serial };
         heard.extend(identity.hears());
         let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
-        let (mut flash, damage) = flash_file.load().with_context(|| format!("flash of cell {cell}"))?;
+        let (mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
         if let Some(damage) = damage {
             eprintln!(
-                "cell-node: flash of cell {cell} is not used: {damage}; write it anew or delete the file"
+                "cell-node: {} is not used: {damage}; write it anew or delete the file",
+                flash_file.name()
             );
         }
         if flash == Flash::Empty {
             let parameters = skin.parameters(described);
-            flash_file.store(&parameters).with_context(|| format!("flash of cell {cell}"))?;
+            flash_file.store(&parameters).with_context(|| flash_file.name())?;
             flash = Flash::Sound(parameters);
         }
         cells.start(identity, &flash, flash_file);
