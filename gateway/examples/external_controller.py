@@ -80,8 +80,8 @@ def main():
                 print(f"waiting for a gateway at {arguments.socket}", file=sys.stderr, flush=True)
             waiting = True
             time.sleep(0.2)
-        except BlockingIOError:
-            continue  # the gateway's queue is full; the next state will come
+        except (BlockingIOError, TimeoutError):
+            continue  # the gateway's queue is full, or it is still starting; the next state will come
 
 
 if __name__ == "__main__":

@@ -1,8 +1,11 @@
 //! `gateway run` and `gateway demo`.
 
+use std::fs::File;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use gateway::run::file::WholeFile;
 use gateway::run::{self, Options, RunError};
 use gateway::scenario::Scenario;
 use gateway::summary::Summary;
@@ -155,21 +158,26 @@ impl Common {
 
 fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
     let failure = |error: RunError| Failure { code: error.exit_code(), text: error.to_string() };
-    let summary = run::run(options).map_err(failure)?;
-    print::summary(&summary);
-    if let Some(path) = summary_file {
-        write_json(path, &summary)?;
+    if summary_file.is_some() && summary_file == options.candump.as_deref() {
+        return Err(Failure::usage("--summary and --candump name the same file: name two"));
     }
+    // Before the run: nobody wants to hear after an hour that there is nowhere to write.
+    let json = summary_file.map(|path| {
+        WholeFile::create(path)
+            .map_err(|error| Failure::usage(format!("--summary {}: {error}", path.display())))
+    });
+    let json = json.transpose()?;
+    let summary = run::run(options).map_err(failure)?;
+    if let Some((whole, file)) = json {
+        write_json(whole, file, &summary)?;
+    }
+    print::summary(&summary);
     Ok(())
 }
 
-/// A whole file, or none under this name.
-fn write_json(path: &Path, summary: &Summary) -> Result<(), Failure> {
-    let failure = |error: &dyn core::fmt::Display| Failure::run(format!("{}: {error}", path.display()));
+fn write_json(whole: WholeFile, mut file: File, summary: &Summary) -> Result<(), Failure> {
+    let path = whole.path().display().to_string();
+    let failure = |error: &dyn core::fmt::Display| Failure::run(format!("{path}: {error}"));
     let text = serde_json::to_string_pretty(summary).map_err(|error| failure(&error))?;
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    std::fs::write(&part, text + "\n")
-        .and_then(|()| std::fs::rename(&part, path))
-        .map_err(|error| failure(&error))
+    writeln!(file, "{text}").and_then(|()| whole.finish()).map_err(|error| failure(&error))
 }

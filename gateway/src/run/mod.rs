@@ -13,6 +13,7 @@
 
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
+pub mod file;
 pub mod launch;
 mod log;
 mod progress;
@@ -30,7 +31,6 @@ use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use thiserror::Error;
 
-use crate::external::SocketError;
 use crate::scenario::Scenario;
 use crate::summary::Summary;
 
@@ -74,9 +74,6 @@ pub enum RunError {
     /// A program does not start.
     #[error(transparent)]
     Launch(#[from] launch::LaunchError),
-    /// The socket of an external controller cannot be had.
-    #[error(transparent)]
-    External(#[from] SocketError),
     /// What was asked for cannot be done.
     #[error("{0}")]
     Usage(String),
@@ -98,7 +95,7 @@ impl RunError {
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {
-            Self::Document(_) | Self::Bus(_) | Self::Launch(_) | Self::External(_) | Self::Usage(_) => 2,
+            Self::Document(_) | Self::Bus(_) | Self::Launch(_) | Self::Usage(_) => 2,
             Self::Failed(_) | Self::Write { .. } => 1,
         }
     }

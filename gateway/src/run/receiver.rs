@@ -8,6 +8,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::bus::{Bus, Inbox};
 use protocol::can::Frame;
 use protocol::id::Kind;
+use protocol::message::{Heartbeat, State};
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
@@ -57,8 +58,12 @@ pub struct View {
 pub struct CellView {
     /// Its number.
     pub node: u8,
+    /// Whether it has been heard of and is not dead.
+    pub heard: bool,
     /// Whether it can be expected to answer.
     pub ready: bool,
+    /// Whether it is there for good and has no parameters to compute with.
+    pub unconfigured: bool,
     /// Whether its configuration is not the skin's.
     pub other: bool,
     /// What it has said since it was asked.
@@ -178,7 +183,11 @@ impl Receiver {
         }
         let cells = self.table.cells().iter().map(|cell| CellView {
             node: cell.node.get(),
+            heard: cell.heartbeat.is_some(),
             ready: cell.is_ready(),
+            unconfigured: cell.heartbeat.is_some_and(|Heartbeat { state, .. }| {
+                !state.has(State::CONFIGURED) && !state.has(State::CLAIMING)
+            }),
             other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
             said: cell.said(),
         });

@@ -1,5 +1,6 @@
 //! From a description to a bench whose cells are ready.
 
+use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver as Inlet};
 use std::sync::{Arc, Mutex};
@@ -13,11 +14,14 @@ use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
 
-use super::launch::{Plan, Processes, ServedBus, program};
+use super::launch::{Ended, Plan, Processes, ServedBus, program};
 use super::log::Log;
 use super::receiver::{Captured, CellView, News, Received, Receiver, View};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, realtime};
+use crate::controller;
+use crate::cycle::Cycle;
+use crate::robot::SimulatedArm;
 use crate::scenario::FaultKind;
 use crate::summary::histogram;
 use crate::table::{Notice, Table};
@@ -59,6 +63,7 @@ pub(super) struct Bench<'a> {
     pub(super) lines: Vec<Line>,
     pub(super) news: Inlet<(usize, News)>,
     pub(super) signalled: Arc<AtomicBool>,
+    pub(super) cycle: Option<Cycle>,
     pub(super) log: Option<Log>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
@@ -74,8 +79,13 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         signal_hook::flag::register(signal, Arc::clone(&signalled))
             .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
     }
+    let log = options.candump.as_deref().map(|path| {
+        Log::create(path).map_err(|error| RunError::Usage(format!("--candump {}: {error}", path.display())))
+    });
+    let log = log.transpose()?;
+    // An external controller can find its socket from now on, so that it is there when the loop begins.
+    let cycle = Some(cycle(options)?);
     let idle = idle_lateness(options.skin.timing.tick_nanos());
-    let log = options.candump.as_deref().map(Log::create).transpose()?;
     let mut served = Vec::new();
     let mut buses = Vec::new();
     for described in &options.skin.buses {
@@ -96,7 +106,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     }
     let processes = Processes::default();
     let mut bench =
-        Bench { options, began, idle, shared, lanes, lines, news, signalled, log, processes, served };
+        Bench { options, began, idle, shared, lanes, lines, news, signalled, cycle, log, processes, served };
     if let Err(error) = bench.begin() {
         bench.stop_receivers();
         return Err(error);
@@ -104,8 +114,26 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     Ok(bench)
 }
 
-/// What a description may say and this program cannot do.
+/// The loop's state, by the scenario's motion.
+fn cycle(options: &Options) -> Result<Cycle, RunError> {
+    let (skin, motion) = (&options.skin, options.scenario.motion);
+    let controller = controller::of_motion(skin, &motion).map_err(|error| {
+        // Its cause says why the system refuses.
+        let cause = error.source().map(|cause| format!(": {cause}")).unwrap_or_default();
+        RunError::Usage(format!("{error}{cause}"))
+    })?;
+    Ok(Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, motion.start_rad))))
+}
+
+/// What a description may say and this program cannot do, and what it needs and is not there.
 fn refuse(options: &Options) -> Result<(), RunError> {
+    if options.spawn {
+        program("cell-node", options.cell_node.as_deref())?;
+    }
+    if let Some(flash) = options.flash.as_deref().filter(|flash| !flash.is_dir()) {
+        let flash = flash.display();
+        return Err(RunError::Usage(format!("--flash {flash}: there is no such directory; make it first")));
+    }
     for bus in &options.skin.buses {
         if bus.reply != Reply::Torque {
             let name = &bus.name;
@@ -196,6 +224,9 @@ impl Bench<'_> {
         let options = self.options;
         let listened = Instant::now() + LISTEN;
         if options.spawn {
+            if self.served.len() < self.lanes.len() {
+                self.find_alone(listened)?;
+            }
             let program = program("cell-node", options.cell_node.as_deref())?;
             self.processes = Processes::start(&Plan {
                 program: &program,
@@ -211,7 +242,8 @@ impl Bench<'_> {
         loop {
             thread::sleep(Duration::from_millis(5));
             self.hear_while_starting()?;
-            let now_ready = self.count(|cell| cell.ready);
+            // Who has no parameters will not get any by waiting.
+            let now_ready = self.count(|cell| cell.ready || cell.unconfigured);
             if now_ready > ready {
                 (ready, progress) = (now_ready, Instant::now());
             }
@@ -221,14 +253,38 @@ impl Bench<'_> {
                 break;
             }
         }
-        self.judge_start(ready)?;
+        self.judge_start()?;
         // What a gateway before this one halted goes on; what cells have counted and feel is asked for.
         self.say(&Message::Resume)?;
         self.say(&Message::Report)
     }
 
-    fn judge_start(&self, ready: usize) -> Result<(), RunError> {
-        let silent = self.names(|cell| !cell.ready);
+    /// A bus that was there before may have a gateway, or cells whose numbers ours would take: nobody is
+    /// disturbed by listening first.
+    fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
+        while Instant::now() < until {
+            thread::sleep(Duration::from_millis(5));
+            self.hear_while_starting()?;
+        }
+        let there = self.names(|cell| cell.heard);
+        if there.is_empty() {
+            return Ok(());
+        }
+        Err(RunError::Failed(format!(
+            "cells are on the bus already: {there}; use them with --no-spawn, or stop them"
+        )))
+    }
+
+    fn judge_start(&self) -> Result<(), RunError> {
+        let silent = self.names(|cell| !cell.ready && !cell.unconfigured);
+        let unconfigured = self.names(|cell| cell.unconfigured);
+        let ready = self.count(|cell| cell.ready);
+        if !unconfigured.is_empty() && (ready == 0 || self.options.spawn) {
+            return Err(RunError::Failed(format!(
+                "cells without parameters: {unconfigured}; configure them, or delete their flash files if \
+                 these are damaged"
+            )));
+        }
         if ready == 0 || (self.options.spawn && !silent.is_empty()) {
             let remedy = if self.options.spawn {
                 "see their own messages above"
@@ -245,8 +301,12 @@ impl Bench<'_> {
                 self.options.skin_file.display()
             )));
         }
-        if !silent.is_empty() && !self.options.quiet {
-            eprintln!("cells that do not answer, the run goes on without them: {silent}");
+        if !self.options.quiet {
+            for (what, who) in [("do not answer", silent), ("have no parameters", unconfigured)] {
+                if !who.is_empty() {
+                    eprintln!("cells that {what}, the run goes on without them: {who}");
+                }
+            }
         }
         Ok(())
     }
@@ -265,16 +325,20 @@ impl Bench<'_> {
             }
         }
         if let Some(ended) = self.processes.ended().first() {
-            let name = self.options.skin.buses.get(ended.bus).map_or("", |bus| bus.name.as_str());
-            let (first, last) = ended.nodes;
-            let cells =
-                if first == last { format!("cell {first}") } else { format!("cells {first} to {last}") };
-            return Err(RunError::Failed(format!(
-                "{cells} on {name} ended while starting ({}); see the message above",
-                ended.status
-            )));
+            let (cells, status) = (self.cells_of(ended), ended.status);
+            let why = format!("{cells} ended while starting ({status}); see the message above");
+            return Err(RunError::Failed(why));
         }
         Ok(())
+    }
+
+    /// The cells of a process that has ended, for people.
+    pub(super) fn cells_of(&self, ended: &Ended) -> String {
+        let bus = self.options.skin.buses.get(ended.bus).map_or("", |bus| bus.name.as_str());
+        match ended.nodes {
+            (first, last) if first == last => format!("cell {first} on {bus}"),
+            (first, last) => format!("cells {first} to {last} on {bus}"),
+        }
     }
 
     pub(super) fn count(&self, wanted: impl Fn(&CellView) -> bool) -> usize {

@@ -21,11 +21,11 @@ use super::receiver::{News, Received};
 use super::start::{Bench, rival};
 use super::turn::{Timed, Turn};
 use super::{RunError, usage};
-use crate::controller;
-use crate::cycle::{Cycle, Halt};
-use crate::robot::SimulatedArm;
+use crate::cycle::Halt;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary, histogram};
+use crate::summary::{
+    AccuracySummary, BusSummary, Loop, Processor, Quantiles, Recording, Summary, histogram,
+};
 use crate::table::{Accuracy, Notice};
 
 /// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
@@ -63,16 +63,29 @@ impl Bench<'_> {
     pub(super) fn watch(mut self) -> Result<Summary, RunError> {
         let outcome = self.drive();
         if outcome.is_err() {
-            self.stop_receivers();
+            let received = self.stop_receivers();
+            // What led to the failure is what people want to see; a second failure adds nothing to it.
+            if let Ok(Some(Recording { path, frames, .. })) = self.finish_log(&received)
+                && !self.options.quiet
+            {
+                eprintln!("{frames} frames until then are in {path}");
+            }
         }
         outcome
+    }
+
+    /// Writes what the receivers left, and gives the log its name.
+    fn finish_log(&mut self, received: &[Option<Received>]) -> Result<Option<Recording>, RunError> {
+        self.write_log()?;
+        let lost = received.iter().flatten().map(|received| received.unrecorded).sum();
+        self.log.take().map(|log| log.finish(lost)).transpose()
     }
 
     fn drive(&mut self) -> Result<Summary, RunError> {
         let options = self.options;
         let (records, inlet) = Self::records();
         let turn = Turn::new(
-            self.cycle()?,
+            self.cycle.take().expect("the loop begins once"),
             std::mem::take(&mut self.lines),
             Arc::new(options.scenario.clone()),
             Arc::clone(&self.shared),
@@ -116,9 +129,7 @@ impl Bench<'_> {
         self.last_words(interrupted)?;
         self.write_log()?;
         let received = self.stop_receivers();
-        self.write_log()?;
-        let lost = received.iter().flatten().map(|received| received.unrecorded).sum();
-        let recording = self.log.take().map(|log| log.finish(lost)).transpose()?;
+        let recording = self.finish_log(&received)?;
         Ok(Summary {
             skin: options.skin.name.clone(),
             cells: options.skin.cells.len(),
@@ -133,13 +144,6 @@ impl Bench<'_> {
             cell_private_kib,
             recording,
         })
-    }
-
-    /// The loop's state, by the scenario's motion.
-    fn cycle(&self) -> Result<Cycle, RunError> {
-        let (skin, motion) = (&self.options.skin, self.options.scenario.motion);
-        let controller = controller::of_motion(skin, &motion)?;
-        Ok(Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, motion.start_rad))))
     }
 
     fn start_loop(&self, mut turn: Turn) -> Result<thread::JoinHandle<Granted>, RunError> {
@@ -167,10 +171,20 @@ impl Bench<'_> {
         records: &mut rtrb::Consumer<Timed>,
         started: Instant,
     ) -> Result<(), RunError> {
+        let options = self.options;
         self.press(script)?;
         self.break_things(script, progress, started)?;
         self.hear(script, progress)?;
+        let before = measured.halted();
         measured.take(records, self.began);
+        match (before, measured.halted()) {
+            (None, Some(why)) => {
+                let remedy = format!("`gateway ack {}` lets it go on", options.skin_file.display());
+                progress.note(&format!("the robot is halted: {why}; {remedy}"));
+            }
+            (Some(_), None) => progress.note("the robot goes on"),
+            (Some(_), Some(_)) | (None, None) => {}
+        }
         self.write_log()?;
         let shared = Arc::clone(&self.shared);
         progress.show(|| {
@@ -278,10 +292,7 @@ impl Bench<'_> {
             }
         }
         for ended in self.processes.ended() {
-            let (first, last) = ended.nodes;
-            let cells =
-                if first == last { format!("cell {first}") } else { format!("cells {first} to {last}") };
-            progress.note(&format!("the process of {cells} on {} ended ({})", name(ended.bus), ended.status));
+            progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.status));
         }
         Ok(())
     }
