@@ -217,7 +217,16 @@ impl Witness {
                 }
             }
             Message::Halt => self.mirrors.iter_mut().for_each(Mirror::let_go),
-            _ => {}
+            Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
         }
     }
 
@@ -268,7 +277,8 @@ impl Witness {
         }
         let sum = sum.map(|steps| f64::from(steps) / 4_096.0);
         assert!(
-            sum == snapshot.torque && contributing == snapshot.contributing,
+            sum.map(f64::to_bits) == snapshot.torque.map(f64::to_bits)
+                && contributing == snapshot.contributing,
             "at {} us the sum is {:?} of {} cells, and should be {sum:?} of {contributing}",
             now.0,
             snapshot.torque,
@@ -293,10 +303,11 @@ impl Mirror {
         self.value = match missed {
             missed if missed <= hold => held,
             _ if left == 0 => [0; WORDS],
-            _ => held.map(|word| {
-                let part = f64::from(word) * left as f64 / decay as f64;
-                part as i32
-            }),
+            _ => held.map(|word| word * as_i32(left) / as_i32(decay)),
         };
     }
+}
+
+fn as_i32(epochs: usize) -> i32 {
+    i32::try_from(epochs).unwrap_or(i32::MAX)
 }
