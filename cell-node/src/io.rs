@@ -1,6 +1,5 @@
 //! The shell around the cells of a process: clock, bus, flash files. It decides nothing.
 
-use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -8,6 +7,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::bus::{Bus, BusError, Inbox};
 use protocol::can::{Format, Frame};
+use protocol::id::Kind;
+use protocol::packet;
 use protocol::parameters::Parameters;
 use protocol::time::{Micros, Span};
 
@@ -85,11 +86,20 @@ impl FlashFile {
 #[derive(Debug)]
 pub struct Cells {
     cells: Vec<(Node, FlashFile)>,
-    /// Which cells hear an identifier, as indices.
-    hearers: HashMap<u32, Vec<usize>>,
+    /// Where a number stands in `cells`.
+    places: [Option<u8>; 256],
     format: Format,
-    start: Instant,
+    clock: Clock,
     outbox: Vec<Frame>,
+}
+
+/// A monotonic clock, and how the wall's time is had from it without asking twice.
+#[derive(Debug)]
+struct Clock {
+    start: Instant,
+    /// The wall's time at the start, in µs since 1970; measured again at each heartbeat, because somebody
+    /// may set the wall's clock.
+    wall: u64,
 }
 
 /// Why cells stop.
@@ -117,17 +127,19 @@ impl Cells {
     /// No cells yet, on a bus of this format.
     #[must_use]
     pub fn new(format: Format) -> Self {
-        let (cells, hearers, outbox) = (Vec::new(), HashMap::new(), Vec::new());
-        Self { cells, hearers, format, start: Instant::now(), outbox }
+        let (cells, outbox) = (Vec::new(), Vec::new());
+        let mut clock = Clock { start: Instant::now(), wall: 0 };
+        clock.set();
+        Self { cells, places: [None; 256], format, clock, outbox }
     }
 
     /// Starts a cell with what flash holds; a simulated cell has no sensors, so it obeys stimuli.
     pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile) {
-        let index = self.cells.len();
-        for id in identity.hears() {
-            self.hearers.entry(u32::from(id.to_bits())).or_default().push(index);
+        if let Some(place) = self.places.get_mut(usize::from(identity.cell.get())) {
+            *place = u8::try_from(self.cells.len()).ok();
         }
-        self.cells.push((Node::new(identity, self.format, flash, true, self.now()), file));
+        let node = Node::new(identity, self.format, flash, true, self.clock.now());
+        self.cells.push((node, file));
     }
 
     /// Runs the cells until the bus is gone or a number turns out to be taken.
@@ -136,8 +148,9 @@ impl Cells {
     /// Always: it only ends by stopping.
     pub fn run(&mut self, bus: &Bus) -> Result<core::convert::Infallible, Stopped> {
         let mut inbox = Inbox::new();
+        let mut now = self.clock.now();
         loop {
-            match self.turn(bus, &mut inbox) {
+            match self.turn(bus, &mut inbox, now) {
                 Ok(()) => {}
                 // What was to be sent is lost, as on a microcontroller without a bus.
                 Err(Stopped::Bus(error)) if error.may_pass() => {
@@ -146,37 +159,44 @@ impl Cells {
                 }
                 Err(error) => return Err(error),
             }
+            now = self.clock.now();
+            self.take(&inbox, bus, now)?;
         }
     }
 
-    /// Lets time pass, sends, waits, and takes what came.
-    fn turn(&mut self, bus: &Bus, inbox: &mut Inbox) -> Result<(), Stopped> {
-        let now = self.now();
+    /// Lets time pass, sends, and waits for frames.
+    fn turn(&mut self, bus: &Bus, inbox: &mut Inbox, now: Micros) -> Result<(), Stopped> {
+        inbox.clear();
         let mut next = Micros(u64::MAX);
         for (node, _) in &mut self.cells {
             if node.poll_timeout() <= now {
                 node.handle_timeout(now);
+                self.clock.set();
             }
             next = next.min(node.poll_timeout());
         }
         self.flush(bus)?;
         let wait = Duration::from_micros(next.since(now).0);
-        let count = if wait >= Bus::PATIENCE {
-            bus.receive_patiently(inbox)?
+        if wait >= Bus::PATIENCE {
+            bus.receive_patiently(inbox)?;
         } else if bus.wait(Some(wait))? {
-            bus.receive(inbox)?
-        } else {
-            0
-        };
-        if count == 0 {
-            return Ok(());
+            bus.receive(inbox)?;
         }
-        let (now, wall) = (self.now(), wall_nanos());
+        Ok(())
+    }
+
+    /// Gives each frame to the cells that may hear it.
+    fn take(&mut self, inbox: &Inbox, bus: &Bus, now: Micros) -> Result<(), Stopped> {
         for received in inbox.frames() {
-            let age = Span(wall.saturating_sub(received.at_nanos) / 1_000);
-            let hearers = self.hearers.get(&received.frame.raw_id()).map_or(&[][..], Vec::as_slice);
-            for &index in hearers {
-                let Some((node, _)) = self.cells.get_mut(index) else { continue };
+            let age = self.clock.age(now, received.at_nanos);
+            // Anything else than one of our packets goes to all: each counts what it cannot use.
+            let id = packet::data_id(&received.frame).ok().filter(|id| id.kind != Kind::Command);
+            let one = id.and_then(|id| *self.places.get(usize::from(id.node))?);
+            let hearers = match one {
+                Some(place) => self.cells.get_mut(usize::from(place)..=usize::from(place)),
+                None => self.cells.get_mut(..),
+            };
+            for (node, _) in hearers.unwrap_or_default() {
                 node.handle_frame(now, age, &received.frame);
                 if let Some(serial) = node.taken() {
                     let (bus, cell) = (bus.name().to_owned(), node.identity().cell.get());
@@ -184,7 +204,7 @@ impl Cells {
                 }
             }
         }
-        self.flush(bus)
+        Ok(())
     }
 
     /// Writes what has to go into flash, and sends what is to be sent.
@@ -203,14 +223,21 @@ impl Cells {
         }
         Ok(())
     }
+}
 
+impl Clock {
     fn now(&self) -> Micros {
         Micros(u64::try_from(self.start.elapsed().as_micros()).unwrap_or(u64::MAX))
     }
-}
 
-fn wall_nanos() -> u64 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |time| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX))
+    /// Compares itself with the wall's clock.
+    fn set(&mut self) {
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_micros();
+        self.wall = u64::try_from(wall).unwrap_or(0).saturating_sub(self.now().0);
+    }
+
+    /// How long before `now` a wall's time in ns was.
+    const fn age(&self, now: Micros, at_nanos: u64) -> Span {
+        Span((self.wall + now.0).saturating_sub(at_nanos / 1_000))
+    }
 }

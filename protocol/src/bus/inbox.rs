@@ -62,7 +62,8 @@ impl Inbox {
         self.unreadable
     }
 
-    pub(super) fn clear(&mut self) {
+    /// Forgets the frames.
+    pub fn clear(&mut self) {
         self.frames.clear();
     }
 
