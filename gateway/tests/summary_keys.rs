@@ -1,0 +1,220 @@
+//! `docs/summary.md` names every key that a summary has, and no other, and its sums are right.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use gateway::summary::{
+    AccuracySummary, BusSummary, ErrorsSummary, Loop, Processor, Quantiles, Recording, Summary, histogram,
+};
+use gateway::table::{Accuracy, Event, Status, Table};
+use protocol::can::Format;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use serde_json::Value;
+
+const SUMMARY_MD: &str = include_str!("../../docs/summary.md");
+const SKIN_MD: &str = include_str!("../../docs/skin.md");
+
+/// The two cells of `docs/skin.md`.
+fn skin() -> Skin {
+    let text = SKIN_MD.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+    Skin::parse("docs/skin.md", text).unwrap()
+}
+
+/// A run of which everything is known that may be unknown.
+fn summary(bus: BusSummary) -> Summary {
+    let quantiles = Quantiles::of(&histogram(), 1.0);
+    Summary {
+        skin: "two-cells".to_owned(),
+        cells: 2,
+        duration_s: 1.0,
+        interrupted: false,
+        halted: Some("somebody sent a halt frame".to_owned()),
+        first_broadcast_s: 1.0,
+        control: Loop {
+            ticks: 500,
+            ticks_skipped: 0,
+            broadcasts: 63,
+            broadcasts_skipped: 0,
+            bad_cycles: BTreeMap::new(),
+            late_us: quantiles,
+            idle_late_us: quantiles,
+            took_us: quantiles,
+            central_us: quantiles,
+            took_distributed_us: quantiles,
+            fifo: true,
+            memory_locked: true,
+            records_lost: 0,
+            unsent: 0,
+        },
+        accuracy: AccuracySummary::from(Accuracy::default()),
+        buses: vec![bus],
+        processor: Processor::default(),
+        cell_private_kib: Some(768),
+        recording: Some(Recording { path: "run.log".to_owned(), frames: 0, lost: 0 }),
+    }
+}
+
+/// Each key of a value with its type: objects that are quantiles or errors and maps are one key.
+fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<String, &'static str>) {
+    let kind = match value {
+        _ if maps.contains(path) => "map",
+        Value::Null | Value::Number(_) => "number",
+        Value::String(_) => "text",
+        Value::Bool(_) => "flag",
+        Value::Array(all) if all.iter().any(Value::is_object) => {
+            return all.iter().for_each(|value| keys(&format!("{path}[]"), value, maps, into));
+        }
+        Value::Array(_) => "numbers",
+        Value::Object(object) if object.contains_key("p50") => "quantiles",
+        Value::Object(object) if object.contains_key("mean_nm") => "errors",
+        Value::Object(object) => {
+            for (key, value) in object {
+                let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                keys(&path, value, maps, into);
+            }
+            return;
+        }
+    };
+    into.insert(path.to_owned(), kind);
+}
+
+/// First and second column of the tables whose rows begin with a key, with the heading above them.
+fn rows() -> impl Iterator<Item = (&'static str, &'static str, &'static str)> {
+    let mut heading = "";
+    SUMMARY_MD.lines().filter_map(move |line| {
+        if let Some(text) = line.strip_prefix("## ") {
+            heading = text;
+        }
+        let mut columns = line.strip_prefix("| `")?.split(" | ");
+        let (key, kind) = (columns.next()?.trim_end_matches('`'), columns.next()?);
+        Some((heading, key, kind.trim_end_matches(" or null")))
+    })
+}
+
+fn documented(wanted: impl Fn(&str) -> bool) -> BTreeMap<String, &'static str> {
+    let events: BTreeSet<_> = Event::ALL.into_iter().map(Event::name).collect();
+    let rows = rows().filter(|(heading, key, _)| wanted(heading) && !events.contains(key));
+    rows.map(|(_, key, kind)| (key.to_owned(), kind)).collect()
+}
+
+fn maps() -> BTreeSet<String> {
+    rows().filter(|(_, _, kind)| *kind == "map").map(|(_, key, _)| key.to_owned()).collect()
+}
+
+fn serialised(summary: &Summary) -> Value {
+    serde_json::from_str(&serde_json::to_string(summary).unwrap()).unwrap()
+}
+
+#[test]
+fn every_key_is_documented_with_its_type_and_no_other() {
+    let bus = BusSummary::new("vcan0", "embedded", 0, &Table::new(&skin(), 0), 0, Micros(0));
+    let mut found = BTreeMap::new();
+    keys("", &serialised(&summary(bus)), &maps(), &mut found);
+    assert_eq!(documented(|heading| !["Quantiles", "Errors"].contains(&heading)), found);
+}
+
+#[test]
+fn the_keys_of_quantiles_and_errors_are_documented() {
+    let of = |value: Value| {
+        let mut found = BTreeMap::new();
+        let keys = value.as_object().unwrap().keys();
+        found.extend(keys.map(|key| (key.clone(), "number")));
+        found
+    };
+    let quantiles = serde_json::to_value(Quantiles::default()).unwrap();
+    assert_eq!(documented(|heading| heading == "Quantiles"), of(quantiles));
+    let errors = serde_json::to_value(ErrorsSummary::from(Accuracy::default().single)).unwrap();
+    assert_eq!(documented(|heading| heading == "Errors"), of(errors));
+}
+
+#[test]
+fn the_names_in_maps_are_documented() {
+    let statuses = [Status::Unknown, Status::Quiet, Status::Active, Status::Stale, Status::Dead];
+    let names = Event::ALL.into_iter().map(Event::name);
+    let names = names.chain(Kind::ALL.into_iter().map(Kind::name)).chain(statuses.map(Status::name));
+    for name in names {
+        assert!(SUMMARY_MD.contains(&format!("`{name}`")), "{name}");
+    }
+}
+
+/// A bus whose two cells are pressed: one answers in time, the other one's replies are lost, refused, late
+/// and repeated.
+fn troubled_bus() -> (BusSummary, u64) {
+    let skin = skin();
+    let mut table = Table::new(&skin, 0);
+    let mut broadcasts = 0;
+    let mut at = 0;
+    let mut say = |table: &mut Table, own: bool, message: &Message, spoil: bool| {
+        at += 100;
+        for frame in message.encode().frames(Format::Fd) {
+            let mut bytes = frame.data().to_vec();
+            bytes[0] ^= u8::from(spoil);
+            let frame =
+                protocol::can::Frame::with_data(frame.id(), Format::Fd, frame.flags(), &bytes).unwrap();
+            table.handle_frame(Micros(at), own, &frame, &mut |_| None);
+        }
+    };
+    let cells = [1, 2].map(|node| CellId::new(node).unwrap());
+    let heartbeat = |table: &Table, place: usize, sent| {
+        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        let configuration = table.cells()[place].configuration;
+        let page = Heartbeat { serial: 1, configuration, sent, rejected: 0, state };
+        let from = Node::Cell(cells[place]);
+        Message::Network { from, epoch: Epoch(0), page: NetworkPage::Heartbeat(page) }
+    };
+    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+    let torque = |place: usize, epoch| Message::Torque {
+        from: cells[place],
+        epoch: Epoch(epoch),
+        torque: [Q3_12::nearest(0.5); WORDS],
+    };
+    let skin_page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
+    table.set_comparing(true);
+    for place in 0..2 {
+        let word = heartbeat(&table, place, 0);
+        say(&mut table, false, &word, false);
+    }
+    let press = Message::Stimulus { to: Node::Everyone, from: From::Next, page: SensorPage::Skin(skin_page) };
+    say(&mut table, true, &press, false);
+    for epoch in 0..8 {
+        say(&mut table, true, &Message::Joints { epoch: Epoch(epoch), joints }, false);
+        broadcasts += 1;
+        say(&mut table, false, &torque(0, epoch), false);
+        match epoch {
+            0 | 4 => say(&mut table, false, &torque(1, epoch), false),
+            1 => say(&mut table, false, &torque(1, epoch), true),
+            3 => say(&mut table, false, &torque(1, 2), false),
+            5 => (0..2).for_each(|_| say(&mut table, false, &torque(1, 5), false)),
+            _ => {}
+        }
+    }
+    for (place, sent) in [(0, 9), (1, 9)] {
+        let word = heartbeat(&table, place, sent);
+        say(&mut table, false, &word, false);
+    }
+    table.finish();
+    (BusSummary::new("vcan0", "embedded", 0, &table, 1, Micros(1_000)), broadcasts)
+}
+
+#[test]
+fn what_the_document_says_adds_up_does() {
+    let (bus, broadcasts) = troubled_bus();
+    let up = bus.uplink;
+    assert_eq!(up.sent + up.surplus, up.delivered + up.rejected + up.dropped + up.unknown, "{up:?}");
+    let replies = bus.replies;
+    let missing = replies.skipped + replies.not_heard + replies.lost + replies.in_doubt + replies.unknown;
+    assert_eq!(replies.due, replies.in_time + replies.late + missing, "{replies:?}");
+    assert!(bus.epochs_complete <= bus.epochs_due && bus.epochs_due <= broadcasts);
+    let event = |name| bus.events.get(name).copied().unwrap_or(0);
+    let used = replies.in_time + replies.late + replies.unasked;
+    let refused = event("wrong CRC");
+    let counted = used + event("stale torque") + event("repeated torque") + refused;
+    assert_eq!(bus.received["torque"], counted, "{bus:?}");
+    let seen = (replies.due, replies.in_time, replies.late, up.rejected, event("repeated torque"));
+    assert_eq!(seen, (16, 11, 1, 1, 1), "the bus was troubled: {bus:?}");
+}
