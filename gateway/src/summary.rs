@@ -192,7 +192,7 @@ pub struct UplinkSummary {
     pub restarts: u32,
 }
 
-/// Replies: due = in time + late + missing; missing = skipped + not heard + lost + in doubt + unknown.
+/// Replies: due = in time + late + missing; missing = too late + skipped + not heard + lost + in doubt + unknown.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct RepliesSummary {
     /// Epochs that cells had to answer.
@@ -201,6 +201,8 @@ pub struct RepliesSummary {
     pub in_time: u64,
     /// Answered after it.
     pub late: u64,
+    /// Dropped, because they came when their epoch was long over.
+    pub too_late: u64,
     /// Skipped by the cell, because the joints were older than a period when it got to them.
     pub skipped: u64,
     /// Not heard by the cell.
@@ -314,7 +316,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
 fn replies(table: &Table) -> RepliesSummary {
     let mut summary = RepliesSummary::default();
     for cell in table.cells() {
-        let Replies { due, in_time, late, missing, in_doubt, unasked } = cell.replies;
+        let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
         let mut rest = missing - in_doubt;
         let mut explain = |count: u64| {
             let explained = rest.min(count);
@@ -325,6 +327,7 @@ fn replies(table: &Table) -> RepliesSummary {
         summary.due += due;
         summary.in_time += in_time;
         summary.late += late;
+        summary.too_late += explain(too_late);
         summary.skipped += explain(skipped);
         summary.not_heard += explain(not_heard);
         summary.lost += explain(cell.uplink.lost);

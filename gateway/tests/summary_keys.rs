@@ -207,7 +207,12 @@ fn what_the_document_says_adds_up_does() {
     let up = bus.uplink;
     assert_eq!(up.sent + up.surplus, up.delivered + up.rejected + up.dropped + up.unknown, "{up:?}");
     let replies = bus.replies;
-    let missing = replies.skipped + replies.not_heard + replies.lost + replies.in_doubt + replies.unknown;
+    let missing = replies.too_late
+        + replies.skipped
+        + replies.not_heard
+        + replies.lost
+        + replies.in_doubt
+        + replies.unknown;
     assert_eq!(replies.due, replies.in_time + replies.late + missing, "{replies:?}");
     assert!(bus.epochs_complete <= bus.epochs_due && bus.epochs_due <= broadcasts);
     let event = |name| bus.events.get(name).copied().unwrap_or(0);

@@ -109,8 +109,8 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
     let why = format!(
-        "{} skipped, {} not heard, {} lost, {} in doubt, {} unknown",
-        replies.skipped, replies.not_heard, replies.lost, replies.in_doubt, replies.unknown
+        "{} too late, {} skipped, {} not heard, {} lost, {} in doubt, {} unknown",
+        replies.too_late, replies.skipped, replies.not_heard, replies.lost, replies.in_doubt, replies.unknown
     );
     rows.row("  missing", missing, why);
     rows.row("broadcast to last reply, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");

@@ -11,9 +11,9 @@
 //!       └─ progress line, log file, summary
 //! ```
 
+pub mod file;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
-pub mod file;
 pub mod launch;
 mod log;
 mod progress;

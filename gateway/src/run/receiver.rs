@@ -8,12 +8,12 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::bus::{Bus, Inbox};
 use protocol::can::Frame;
 use protocol::id::Kind;
-use protocol::message::{Heartbeat, State};
+use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
 use super::turn::Shared;
-use crate::table::{Notice, Said, Snapshot, Table};
+use crate::table::{Notice, Said, Snapshot, Status, Table};
 
 /// Frames are left to gather for so long, so that one wake-up takes many.
 const GATHER: Duration = Duration::from_millis(1);
@@ -60,8 +60,10 @@ pub struct CellView {
     pub node: u8,
     /// Whether it has been heard of and is not dead.
     pub heard: bool,
-    /// Whether it can be expected to answer.
+    /// Whether it can be expected to answer, once nobody halts it.
     pub ready: bool,
+    /// Whether it waits for a resume.
+    pub halted: bool,
     /// Whether it is there for good and has no parameters to compute with.
     pub unconfigured: bool,
     /// Whether its configuration is not the skin's.
@@ -176,20 +178,26 @@ impl Receiver {
     /// Lets time pass, and shows the main thread how things are.
     fn look(&mut self) {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        self.table.handle_time(Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX)));
+        let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
+        self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
             self.tell(News::Notice(notice));
         }
-        let cells = self.table.cells().iter().map(|cell| CellView {
-            node: cell.node.get(),
-            heard: cell.heartbeat.is_some(),
-            ready: cell.is_ready(),
-            unconfigured: cell.heartbeat.is_some_and(|Heartbeat { state, .. }| {
-                !state.has(State::CONFIGURED) && !state.has(State::CLAIMING)
-            }),
-            other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
-            said: cell.said(),
+        let cells = self.table.statuses(now).map(|(cell, status)| {
+            let state = cell.heartbeat.map(|heartbeat| heartbeat.state);
+            let alive = !matches!(status, Status::Dead | Status::Unknown);
+            let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
+            let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
+            CellView {
+                node: cell.node.get(),
+                heard: state.is_some(),
+                ready,
+                halted: ready && !cell.is_ready(),
+                unconfigured: settled.is_some() && !ready,
+                other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+                said: cell.said(),
+            }
         });
         let (cells, commands) = (cells.collect(), self.table.counters().sent(Kind::Command));
         if let Ok(mut view) = self.view.lock() {

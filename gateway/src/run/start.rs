@@ -254,9 +254,26 @@ impl Bench<'_> {
             }
         }
         self.judge_start()?;
-        // What a gateway before this one halted goes on; what cells have counted and feel is asked for.
-        self.say(&Message::Resume)?;
+        self.wake_up()?;
+        // What they have counted and feel.
         self.say(&Message::Report)
+    }
+
+    /// Cells that a gateway before this one has halted go on.
+    fn wake_up(&mut self) -> Result<(), RunError> {
+        self.say(&Message::Resume)?;
+        let halted = |bench: &Self| bench.count(|cell| cell.halted);
+        if halted(self) == 0 {
+            return Ok(());
+        }
+        // Their next heartbeats say so.
+        self.say(&Message::Sync)?;
+        let give_up = Instant::now() + SHOWING;
+        while halted(self) > 0 && Instant::now() < give_up {
+            thread::sleep(Duration::from_millis(5));
+            self.hear_while_starting()?;
+        }
+        Ok(())
     }
 
     /// A bus that was there before may have a gateway, or cells whose numbers ours would take: nobody is

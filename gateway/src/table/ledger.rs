@@ -103,6 +103,8 @@ pub struct Replies {
     pub in_doubt: u64,
     /// Torques that nobody was waiting for: ends of contacts, and cells whose sensors are unknown.
     pub unasked: u64,
+    /// Torques that came when their epoch, or a later one of the same cell, was over, and were dropped.
+    pub too_late: u64,
 }
 
 impl Replies {
@@ -116,6 +118,7 @@ impl Replies {
             missing: sum.missing + one.missing,
             in_doubt: sum.in_doubt + one.in_doubt,
             unasked: sum.unasked + one.unasked,
+            too_late: sum.too_late + one.too_late,
         })
     }
 }

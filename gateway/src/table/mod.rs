@@ -379,12 +379,16 @@ impl Table {
         let Some(cell) = self.cells.get_mut(place) else { return };
         // Not by the epochs' difference: broadcasts may be lost on the way back, or change places.
         let Some(lag) = broadcast.recent.iter().position(|&recent| recent == Some(epoch)) else {
+            cell.replies.too_late += 1;
             return self.counters.count(Event::StaleTorque);
         };
         let number = broadcast.number - lag as u64;
         if cell.answered.is_some_and(|last| number <= last) {
-            let repeated = cell.answered == Some(number);
-            return self.counters.count(if repeated { Event::RepeatedTorque } else { Event::StaleTorque });
+            if cell.answered == Some(number) {
+                return self.counters.count(Event::RepeatedTorque);
+            }
+            cell.replies.too_late += 1;
+            return self.counters.count(Event::StaleTorque);
         }
         if words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN)) {
             self.counters.count(Event::Saturated);
