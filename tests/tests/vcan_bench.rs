@@ -49,32 +49,10 @@ fn program(name: &str) -> PathBuf {
     path
 }
 
-fn ip(arguments: &str) {
-    let done = Command::new("ip").args(arguments.split(' ')).status();
-    let done = done.unwrap_or_else(|error| panic!("ip cannot be run ({error}): install iproute2"));
-    assert!(
-        done.success(),
-        "`ip {arguments}` failed: this test needs root and a kernel with vcan; \
-        tests/vcan runs it where both are there"
-    );
-}
-
-/// An interface that goes away with the test.
-struct Vcan(&'static str);
-
-impl Vcan {
-    fn up(name: &'static str) -> Self {
-        ip(&format!("link add {name} type vcan"));
-        let vcan = Self(name);
-        ip(&format!("link set {name} mtu 72 up"));
-        vcan
-    }
-}
-
-impl Drop for Vcan {
-    fn drop(&mut self) {
-        let _ = Command::new("ip").args(["link", "del", self.0]).status();
-    }
+/// The interface that these tests need, with room for FD frames.
+fn needs_vcan0() {
+    let mtu = fs::read_to_string("/sys/class/net/vcan0/mtu").unwrap_or_default();
+    assert_eq!(mtu.trim(), "72", "these tests need vcan0 with MTU 72, up; tests/vcan runs them where it is");
 }
 
 /// `candump -L`, with a receive buffer for a whole run.
@@ -158,7 +136,7 @@ fn torques(frames: &[Frame]) -> BTreeMap<(u8, u8), [u8; 12]> {
 #[ignore = "needs vcan"]
 fn a_bench_of_processes_runs_on_vcan_and_candump_sees_what_the_gateway_counts() {
     let directory = tempfile::tempdir().unwrap();
-    let _vcan = Vcan::up("vcan0");
+    needs_vcan0();
     let candump = Candump::start("vcan0", &directory.path().join("candump.log"));
     let (summary, ours) = run(directory.path(), "socketcan");
     let theirs = candump.frames(ours.len());
@@ -190,7 +168,7 @@ fn a_bench_of_processes_runs_on_vcan_and_candump_sees_what_the_gateway_counts() 
 #[ignore = "needs vcan"]
 fn torques_are_the_same_bit_for_bit_on_vcan_and_on_the_embedded_bus() {
     let directory = tempfile::tempdir().unwrap();
-    let _vcan = Vcan::up("vcan0");
+    needs_vcan0();
     let (on_vcan, vcan) = run(directory.path(), "socketcan");
     let (on_embedded, embedded) = run(directory.path(), "embedded");
     for summary in [&on_vcan, &on_embedded] {
