@@ -1,0 +1,148 @@
+//! What a recorded log says about the run that it is of.
+
+use std::collections::BTreeMap;
+
+use protocol::can::{Format, Frame};
+use protocol::candump::{self, Line};
+use protocol::fixed::Q;
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, Half, Packet, Paired, WORDS, data_id};
+use protocol::time::Micros;
+
+/// A whole log.
+pub(crate) struct Log {
+    pub(crate) frames: Vec<Frame>,
+    /// What could be understood, in the bus' order, with the packet that said it.
+    pub(crate) messages: Vec<(Message, Packet)>,
+}
+
+/// What a torque is a function of, beside the cell's parameters: its number, the joints, and what it feels.
+pub(crate) type Cause = (u8, [i16; WORDS], [i16; 6]);
+
+impl Log {
+    /// Reads a log of one bus; every line must be a frame.
+    pub(crate) fn read(text: &str, format: Format) -> Self {
+        let frame = |line: &str| match candump::parse(line) {
+            Ok(Line::Frame(record)) => record.frame,
+            other => panic!("{line}: {other:?}"),
+        };
+        let frames: Vec<Frame> = text.lines().map(frame).collect();
+        let mut halves = BTreeMap::new();
+        let packet = |frame: &Frame| match format {
+            Format::Fd => Packet::from_fd(frame).ok(),
+            Format::Classic => {
+                let id = data_id(frame).ok()?;
+                let half = halves.entry(id).or_insert(Half::NONE);
+                match half.push(Micros(0), id, frame.data()) {
+                    Ok(Paired::Whole(packet)) => Some(packet),
+                    _ => None,
+                }
+            }
+        };
+        let messages = frames.iter().filter_map(packet);
+        let messages = messages.filter_map(|packet| Some((Message::decode(&packet).ok()?, packet)));
+        Self { messages: messages.collect(), frames }
+    }
+
+    /// Each broadcast's words.
+    pub(crate) fn joints(&self) -> Vec<[i16; WORDS]> {
+        let joints = self.messages.iter().filter_map(|(message, _)| match message {
+            Message::Joints { joints, .. } => Some(joints.positions.map(Q::to_bits)),
+            _ => None,
+        });
+        joints.collect()
+    }
+
+    /// How many torques of a cell stand after the message at an index.
+    pub(crate) fn torques_after(&self, index: usize, cell: u8) -> usize {
+        let torque =
+            |message: &Message| matches!(message, Message::Torque { from, .. } if from.get() == cell);
+        self.messages.iter().skip(index).filter(|(message, _)| torque(message)).count()
+    }
+
+    /// Every torque with its cause and the number of the broadcast that it answers.
+    pub(crate) fn torques(&self) -> Vec<(usize, Cause, Packet)> {
+        let mut felt: BTreeMap<u8, Feeling> = BTreeMap::new();
+        let mut causes: BTreeMap<(u8, u8), (usize, Cause)> = BTreeMap::new();
+        let (mut number, mut last) = (0, None);
+        let mut torques = Vec::new();
+        for (message, packet) in &self.messages {
+            match *message {
+                Message::Stimulus { to, from, page: SensorPage::Skin(skin) } => {
+                    let Node::Cell(cell) = to else { panic!("a stimulus to {to:?}") };
+                    felt.entry(cell.get()).or_default().push(from, skin, last);
+                }
+                Message::Joints { epoch, joints } => {
+                    last = Some(epoch);
+                    for (&cell, feeling) in &mut felt {
+                        feeling.latch(epoch);
+                        let cause = (cell, joints.positions.map(Q::to_bits), words(&feeling.now));
+                        causes.insert((cell, epoch.0), (number, cause));
+                    }
+                    number += 1;
+                }
+                Message::Torque { from, epoch, .. } => {
+                    let (number, cause) = causes[&(from.get(), epoch.0)];
+                    torques.push((number, cause, *packet));
+                }
+                _ => {}
+            }
+        }
+        torques
+    }
+}
+
+fn words(skin: &SkinSensors) -> [i16; 6] {
+    let SkinSensors { contact: [a, b, c], proximity, temperature: [d, e] } = *skin;
+    [a.to_bits(), b.to_bits(), c.to_bits(), proximity.to_bits(), d.to_bits(), e.to_bits()]
+}
+
+/// What a cell feels, by the protocol's rules, as the document has them.
+#[derive(Default)]
+struct Feeling {
+    waiting: Vec<(From, SkinSensors)>,
+    now: SkinSensors,
+}
+
+impl Feeling {
+    fn push(&mut self, from: From, skin: SkinSensors, last: Option<Epoch>) {
+        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
+        self.waiting.push((if late { From::Next } else { from }, skin));
+    }
+
+    fn latch(&mut self, epoch: Epoch) {
+        for (from, skin) in std::mem::take(&mut self.waiting) {
+            match from {
+                From::Epoch(first) if epoch.since(first) < 0 => self.waiting.push((from, skin)),
+                From::Epoch(_) | From::Next => self.now = skin,
+            }
+        }
+    }
+}
+
+/// Sees that the same causes have the same torques in both runs, bit for bit, and that the same causes at the
+/// same broadcast have the same packets; returns how many causes they share, and how many the smaller has.
+pub(crate) fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
+    let [one, other] = [one, other].map(Log::torques);
+    let mut by_cause: BTreeMap<Cause, [i16; WORDS]> = BTreeMap::new();
+    let mut by_number: BTreeMap<(usize, Cause), Packet> = BTreeMap::new();
+    for (number, cause, packet) in &one {
+        let words = *by_cause.entry(*cause).or_insert(packet.words);
+        assert_eq!(words, packet.words, "one run, twice the same cause: {cause:?}");
+        by_number.insert((*number, *cause), *packet);
+    }
+    let mut shared = BTreeMap::new();
+    let mut causes = BTreeMap::new();
+    for (number, cause, packet) in &other {
+        causes.insert(*cause, ());
+        if let Some(words) = by_cause.get(cause) {
+            assert_eq!(*words, packet.words, "the same cause in two runs: {cause:?}");
+            shared.insert(*cause, ());
+        }
+        if let Some(before) = by_number.get(&(*number, *cause)) {
+            assert_eq!(before, packet, "broadcast {number}, {cause:?}");
+        }
+    }
+    (shared.len(), by_cause.len().min(causes.len()))
+}

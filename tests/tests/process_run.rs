@@ -1,0 +1,225 @@
+//! Benches of real processes that nothing goes wrong with.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+
+mod process;
+
+use std::fs;
+
+use gateway::generate;
+use process::log::{Log, same_torques};
+use process::{PRESSED, Place, Summary, example, skin_of, until};
+use protocol::can::Format;
+use rustix::process::Signal;
+
+/// Every frame on the buses is in the log: packets by their kinds, as both sides counted them, and what was
+/// no packet.
+fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
+    let buses = summary.0["buses"].as_array().unwrap().len();
+    let packets = |bus| {
+        ["received", "sent"].map(|way| summary.total(&format!("/buses/{bus}/{way}"))).iter().sum::<u64>()
+    };
+    let counted: u64 = (0..buses).map(packets).sum::<u64>() * frames_a_packet;
+    let lines = place.read("run.log").lines().count();
+    assert_eq!(summary.number("/recording/frames"), u64::try_from(lines).unwrap());
+    assert_eq!((lines as u64, summary.number("/recording/lost")), (counted, 0), "{:#}", summary.0);
+    assert_eq!(summary.0["recording"]["path"], "run.log");
+}
+
+#[test]
+fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
+    let place = Place::new();
+    fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
+    fs::copy(example("all-active.toml"), place.path("scenario.toml")).unwrap();
+    let ended = place.bench(3.0, "").end().well();
+    place.is_left_clean();
+    assert!(ended.stdout.contains("253 cells") && ended.stdout.contains("253 active"), "{}", ended.stdout);
+    assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"]);
+
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!((summary.number("/cells"), summary.silent().len()), (253, 0));
+    assert!(summary.0["halted"].is_null() && summary.0["interrupted"] == false, "{:#}", summary.0);
+    // Every cell feels the touch from the first epoch on.
+    assert_eq!(summary.of_bus("/replies/due"), 253 * summary.number("/loop/broadcasts"));
+    let answered = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
+    assert!(answered > 253, "{:#}", summary.0);
+    assert_eq!(summary.count("/buses/0/received", "torque"), answered, "{:#}", summary.0);
+    assert!(summary.figure("/accuracy/single/mean_nm") <= 1.2e-4, "{:#}", summary.0);
+    assert!(summary.figure("/accuracy/unquantised/mean_nm") <= 1.2e-4, "{:#}", summary.0);
+    assert_eq!(summary.total("/buses/0/events"), 0, "{:#}", summary.0);
+
+    log_is_whole(&place, &summary, 1);
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    assert_eq!(log.messages.len(), log.frames.len(), "every frame has a meaning");
+    assert_eq!(log.joints().len() as u64, summary.number("/loop/broadcasts"));
+    assert_eq!(log.torques().len() as u64, answered);
+}
+
+#[test]
+fn buses_of_classic_frames_carry_the_same_bench() {
+    let place = Place::new();
+    place.write("skin.toml", &skin_of(9, 2, generate::Format::Classic));
+    place.scenario(PRESSED);
+    place.bench(1.5, "").end().well();
+    place.is_left_clean();
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.0["buses"].as_array().unwrap().len(), 2);
+    for bus in 0..2 {
+        let due = summary.number(&format!("/buses/{bus}/replies/due"));
+        assert!(due > 0 && summary.total(&format!("/buses/{bus}/events")) == 0, "{:#}", summary.0);
+    }
+    assert!(summary.figure("/accuracy/single/mean_nm") <= 1.2e-4, "{:#}", summary.0);
+    log_is_whole(&place, &summary, 2);
+}
+
+/// Two runs of this scenario, the second one told more.
+fn twice(scenario: &str, more: &str) {
+    let place = Place::new();
+    place.skin(8);
+    place.scenario(scenario);
+    let logs = ["", more].map(|more| {
+        place.bench(2.0, more).end().well();
+        place.summary().adds_up();
+        Log::read(&place.read("run.log"), Format::Fd)
+    });
+    place.is_left_clean();
+    let (shared, all) = same_torques(&logs[0], &logs[1]);
+    assert!(all > 300 && shared > all / 2, "the two runs share only {shared} of {all} causes");
+}
+
+/// While the arm stands, each epoch's touch differs from the one before.
+const WAVES: &str = r#"version = 1
+duration_s = 2.0
+
+[motion]
+kind = "hold"
+start_rad = [0.3, -1.2, 1.0, -1.4, -1.57, 0.0]
+
+[[touch]]
+at_s = 0.1
+for_s = 1.5
+bus = "vcan0"
+cells = [1, 2, 3, 4, 5, 6, 7, 8]
+force_n = 6.0
+profile = "half-sine"
+
+[[fault]]
+at_s = 0.2
+for_s = 1.6
+kind = "drift"
+n_per_s = 2.0
+all = true
+"#;
+
+/// While the touch stays, each epoch's joints differ from those before.
+const SWINGING: &str = r#"version = 1
+duration_s = 2.0
+
+[motion]
+kind = "sine"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]
+period_s = 10.0
+
+[[touch]]
+at_s = 0.0
+for_s = 2.0
+all = true
+force_n = 2.5
+profile = "step"
+"#;
+
+#[test]
+fn a_touch_on_a_standing_arm_makes_the_same_torques_twice() {
+    twice(WAVES, "");
+}
+
+#[test]
+fn a_swinging_arm_makes_the_same_torques_twice() {
+    twice(SWINGING, "");
+}
+
+#[test]
+fn eight_cells_in_one_process_answer_as_eight_processes_do() {
+    twice(WAVES, "--cells-per-process 8");
+    twice(SWINGING, "--cells-per-process 3");
+}
+
+#[test]
+fn cells_share_processes_as_they_are_told() {
+    let place = Place::new();
+    place.pressed();
+    for (more, expected) in
+        [("", vec!["1", "2", "3", "4", "5", "6", "7", "8"]), ("--cells-per-process 5", vec!["1-5", "6-8"])]
+    {
+        let bench = place.running_bench(20.0, more);
+        let mut nodes: Vec<_> = bench.cells().into_iter().map(|(_, nodes)| nodes).collect();
+        nodes.sort();
+        assert_eq!(nodes, expected);
+        bench.signal(Signal::TERM);
+        bench.end().well();
+        place.is_left_clean();
+    }
+}
+
+#[test]
+fn cells_started_by_hand_serve_one_gateway_after_the_other() {
+    let place = Place::new();
+    place.pressed();
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let cells = ["--nodes 1-5", "--nodes 6-7", "--node 8"]
+        .map(|nodes| place.start("cell-node", &format!("--bus vcan0 {nodes} --skin skin.toml")));
+    // One is interrupted, and leaves the cells halted.
+    for interrupt in [false, true, false] {
+        let bench = place.running_bench(if interrupt { 30.0 } else { 1.5 }, "--no-spawn");
+        if interrupt {
+            place.guest().waits_for_epoch(10);
+            bench.signal(Signal::INT);
+        }
+        let ended = bench.end().well();
+        assert!(ended.stdout.contains("8 cells"), "{}", ended.stdout);
+        let summary = place.summary();
+        summary.adds_up();
+        assert_eq!(summary.0["interrupted"], interrupt);
+        assert_eq!(summary.silent().len(), 0);
+    }
+    let summary = place.summary();
+    assert_eq!(summary.of_bus("/replies/due"), 8 * summary.number("/loop/broadcasts"));
+    assert!(summary.of_bus("/replies/in_time") > 0, "{:#}", summary.0);
+    // They are nobody's children, and are still there.
+    assert_eq!(place.processes().len(), 4);
+
+    server.signal(Signal::TERM);
+    server.end().well();
+    for cell in cells {
+        let ended = cell.end();
+        let said = "cell-node: the embedded bus vcan0 was closed: its server ended";
+        assert_eq!(ended.refusal(1), said);
+    }
+    place.is_left_clean();
+}
+
+#[test]
+fn a_gateway_without_cells_says_who_is_missing() {
+    let place = Place::new();
+    place.pressed();
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let ended = place.bench(1.0, "--no-spawn --quiet").end();
+    let said = "gateway: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
+                or leave out --no-spawn";
+    assert_eq!(ended.refusal(1), said);
+    assert_eq!(place.files(), ["buses", "scenario.toml", "skin.toml"]);
+
+    // Those that are there are enough.
+    let cells = place.start("cell-node", "--bus vcan0 --nodes 1-6 --skin skin.toml");
+    let ended = place.bench(1.0, "--no-spawn").end().well();
+    assert!(ended.stderr.contains("run goes on without them: 7, 8 on vcan0"), "{}", ended.stderr);
+    let summary = place.summary();
+    assert_eq!(summary.adds_up().silent(), [7, 8]);
+    assert_eq!(summary.of_bus("/replies/due"), 6 * summary.number("/loop/broadcasts"));
+    drop((cells, server));
+    until("the server's end", || place.processes().is_empty().then_some(()));
+}
