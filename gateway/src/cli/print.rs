@@ -21,8 +21,8 @@ pub(crate) fn summary(summary: &Summary) {
 struct Rows(Table);
 
 impl Rows {
-    fn section(&mut self, name: impl Display) {
-        self.0.add_row([name.to_string(), String::new(), String::new()]);
+    fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+        self.0.add_row([name.to_string(), value.to_string(), beside.to_string()]);
     }
 
     fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
@@ -55,8 +55,8 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
     if accuracy.single.mean_nm.is_none() {
         return;
     }
-    let paper = format!("paper {PAPER_SINGLE_NM} Nm");
-    rows.section("distributed against central torque, mean (greatest) absolute error");
+    let paper = format!("paper {PAPER_SINGLE_NM}");
+    rows.section("accuracy", "mean (greatest) error, Nm", "distributed against central");
     rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
     rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
     rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
@@ -68,13 +68,13 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
 fn errors(errors: &ErrorsSummary) -> String {
     errors.mean_nm.map_or_else(
         || "nothing compared".to_owned(),
-        |mean| format!("{mean:.2e} ({:.1e}) Nm of {}", errors.max_nm, errors.count),
+        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max_nm, errors.count),
     )
 }
 
 fn control(rows: &mut Rows, summary: &Summary) {
     let control = &summary.control;
-    rows.section("control loop, µs: median / 90 % / 99 % / greatest");
+    rows.section("control loop", "50 % / 90 % / 99 % / greatest, µs", "");
     rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
     if control.central_us.count > 0 {
         rows.row("tick, comparing", quantiles(&control.took_us), "");
@@ -99,7 +99,7 @@ fn control(rows: &mut Rows, summary: &Summary) {
 fn replies(rows: &mut Rows, bus: &BusSummary) {
     let replies = &bus.replies;
     let statuses: Vec<_> = bus.cells.iter().map(|(status, count)| format!("{count} {status}")).collect();
-    rows.section(format!("{} ({}): {}", bus.name, bus.kind, statuses.join(", ")));
+    rows.section(format!("{} ({})", bus.name, bus.kind), statuses.join(", "), "");
     if !bus.silent_cells.is_empty() {
         let names: Vec<_> = bus.silent_cells.iter().map(u8::to_string).collect();
         rows.row("silent cells", names.join(" "), "");
@@ -108,12 +108,21 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     rows.row("replies due", replies.due, complete);
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
-    let why = format!(
-        "{} too late, {} skipped, {} not heard, {} lost, {} in doubt, {} unknown",
-        replies.too_late, replies.skipped, replies.not_heard, replies.lost, replies.in_doubt, replies.unknown
-    );
-    rows.row("  missing", missing, why);
-    rows.row("broadcast to last reply, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+    let reasons = [
+        (replies.too_late, "too late"),
+        (replies.skipped, "skipped by cells"),
+        (replies.not_heard, "not heard"),
+        (replies.lost, "lost"),
+        (replies.in_doubt, "in doubt"),
+    ];
+    rows.row("  missing", missing, explained(&reasons, replies.unknown));
+    rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+}
+
+/// The reasons that there were, and always how many nobody knows.
+fn explained(reasons: &[(u64, &str)], unknown: u64) -> String {
+    let known = reasons.iter().filter(|(count, _)| *count > 0).map(|(count, why)| format!("{count} {why}, "));
+    known.collect::<String>() + &format!("{unknown} unknown")
 }
 
 fn frames(rows: &mut Rows, bus: &BusSummary) {
@@ -121,7 +130,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     let lost = up.dropped + up.unknown;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.row("  lost", lost, format!("{} dropped by the bus, {} unknown", up.dropped, up.unknown));
+    rows.row("  lost", lost, explained(&[(up.dropped, "dropped by the bus")], up.unknown));
     for (name, count) in [("surplus", up.surplus), ("after the last heartbeat", up.unsettled)] {
         if count > 0 {
             rows.row(format!("  {name}"), count, "");
@@ -142,7 +151,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
 
 fn costs(rows: &mut Rows, summary: &Summary) {
     let processor = &summary.processor;
-    rows.section("cost");
+    rows.section("cost", "", "");
     rows.row(
         "processor, cores",
         format!("{:.3}", processor.gateway + processor.cells + processor.buses),
