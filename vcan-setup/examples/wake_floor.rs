@@ -1,0 +1,76 @@
+//! What this machine takes for waking 253 processes 62.5 times a second, whatever they compute and whatever
+//! carries their frames: each waits in one call, and sends back the 72 bytes that it was sent. The floor
+//! under every bench of processes, to be measured beside one.
+//!
+//! `cargo run --release -p vcan-setup --example wake_floor [PROCESSES] [SECONDS]`
+#![allow(clippy::print_stdout, reason = "an example that prints")]
+
+use std::error::Error;
+use std::os::fd::OwnedFd;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, recv, send, socketpair};
+
+const PERIOD: Duration = Duration::from_millis(16);
+const FRAME: [u8; 72] = [0; 72];
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut arguments = std::env::args().skip(1);
+    let first = arguments.next();
+    if first.as_deref() == Some("echo") {
+        return Ok(echo()?);
+    }
+    let processes: usize = first.map_or(Ok(253), |word| word.parse())?;
+    let seconds: u32 = arguments.next().map_or(Ok(5), |word| word.parse())?;
+    let mut echoes = Vec::new();
+    for _ in 0..processes {
+        echoes.push(start()?);
+    }
+    let cpu = || echoes.iter().map(|(child, _)| processor_seconds(child.id())).sum::<f64>();
+    let cycles = seconds.saturating_mul(125).div_ceil(2);
+    let (before, own, began) = (cpu(), processor_seconds(std::process::id()), Instant::now());
+    let mut due = began;
+    for _ in 0..cycles {
+        due += PERIOD;
+        for (_, socket) in &echoes {
+            send(socket, &FRAME, SendFlags::empty())?;
+        }
+        for (_, socket) in &echoes {
+            recv(socket, &mut FRAME.clone(), RecvFlags::empty())?;
+        }
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    }
+    let took = began.elapsed().as_secs_f64();
+    let (echo, ask) = ((cpu() - before) / took, (processor_seconds(std::process::id()) - own) / took);
+    println!("{processes} processes, {cycles} cycles: {:.3} cores", echo + ask);
+    println!("the processes {echo:.3}, whoever asks them {ask:.3}");
+    for (child, socket) in &mut echoes {
+        rustix::net::shutdown(&*socket, rustix::net::Shutdown::Both)?;
+        child.wait()?;
+    }
+    Ok(())
+}
+
+/// A process at the other end of a socket, which is its standard input.
+fn start() -> Result<(Child, OwnedFd), Box<dyn Error>> {
+    let (near, far) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
+    let child = Command::new(std::env::current_exe()?).arg("echo").stdin(Stdio::from(far)).spawn()?;
+    Ok((child, near))
+}
+
+fn echo() -> rustix::io::Result<()> {
+    let mut bytes = FRAME;
+    let socket = std::io::stdin();
+    while recv(&socket, &mut bytes, RecvFlags::empty())?.0 > 0 {
+        send(&socket, &bytes, SendFlags::NOSIGNAL)?;
+    }
+    Ok(())
+}
+
+/// Processor time of a process so far, in s, as the scheduler counts it.
+fn processor_seconds(pid: u32) -> f64 {
+    let text = std::fs::read_to_string(format!("/proc/{pid}/schedstat")).unwrap_or_default();
+    let nanos = text.split_whitespace().next().and_then(|nanos| nanos.parse::<f64>().ok());
+    nanos.unwrap_or(0.0) * 1e-9
+}
