@@ -12,6 +12,8 @@
 
 pub(crate) mod log;
 
+use std::cell::RefCell;
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::Read;
 use std::os::unix::process::ExitStatusExt;
@@ -262,6 +264,17 @@ impl Guest {
     pub(crate) fn waits_for_epoch(&self, number: u8) {
         let there = |message: &Message| matches!(message, Message::Joints { epoch, .. } if epoch.0 >= number);
         self.waits_for(&format!("joints of epoch {number}"), there);
+    }
+
+    /// Waits until the robot has been seen in four positions.
+    pub(crate) fn waits_for_motion(&self) {
+        let seen = RefCell::new(BTreeSet::new());
+        self.waits_for("a robot that moves", |message| {
+            if let Message::Joints { joints, .. } = message {
+                seen.borrow_mut().insert(joints.positions);
+            }
+            seen.borrow().len() >= 4
+        });
     }
 
     pub(crate) fn sends(&self, message: &Message) {
