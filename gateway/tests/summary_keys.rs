@@ -4,7 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gateway::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Loop, Processor, Quantiles, Recording, Summary, histogram,
+    AccuracySummary, BusSummary, ErrorsSummary, Loop, Processor, Quantiles, Recording, RepliesSummary,
+    Summary, histogram,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
@@ -207,19 +208,16 @@ fn what_the_document_says_adds_up_does() {
     let up = bus.uplink;
     assert_eq!(up.sent + up.surplus, up.delivered + up.rejected + up.dropped + up.unknown, "{up:?}");
     let replies = bus.replies;
-    let missing = replies.too_late
-        + replies.skipped
-        + replies.not_heard
-        + replies.lost
-        + replies.in_doubt
-        + replies.unknown;
-    assert_eq!(replies.due, replies.in_time + replies.late + missing, "{replies:?}");
+    let RepliesSummary { due, in_time, late, too_late, skipped, not_heard, lost, in_doubt, unknown, unasked } =
+        replies;
+    let missing = too_late + skipped + not_heard + lost + in_doubt + unknown;
+    assert_eq!(due, in_time + late + missing, "{replies:?}");
     assert!(bus.epochs_complete <= bus.epochs_due && bus.epochs_due <= broadcasts);
     let event = |name| bus.events.get(name).copied().unwrap_or(0);
-    let used = replies.in_time + replies.late + replies.unasked;
+    let used = in_time + late + unasked;
     let refused = event("wrong CRC");
     let counted = used + event("stale torque") + event("repeated torque") + refused;
     assert_eq!(bus.received["torque"], counted, "{bus:?}");
-    let seen = (replies.due, replies.in_time, replies.late, up.rejected, event("repeated torque"));
+    let seen = (due, in_time, late, up.rejected, event("repeated torque"));
     assert_eq!(seen, (16, 11, 1, 1, 1), "the bus was troubled: {bus:?}");
 }
