@@ -1,6 +1,7 @@
 //! One skin cell as a process, or several in one.
 
 use std::collections::BTreeSet;
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -56,13 +57,19 @@ fn range(text: &str) -> Result<(u8, u8), String> {
     }
 }
 
+/// One line in one piece, for hundreds of cells may share this standard error.
+fn say(text: impl core::fmt::Display) {
+    // When it is closed, nobody wants to know.
+    let _ = std::io::stderr().write_all(format!("cell-node: {text}\n").as_bytes());
+}
+
 fn main() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         // Help and version, which are asked for, are printed as they are.
         Err(asked) if !asked.use_stderr() => asked.exit(),
         Err(wrong) => {
-            eprintln!("cell-node: {}", one_line(&wrong.render().to_string()));
+            say(one_line(&wrong.render().to_string()));
             return ExitCode::from(2);
         }
     };
@@ -71,12 +78,12 @@ fn main() -> ExitCode {
             let Err(stopped) = cells.run(&bus);
             // Whoever started hundreds of cells says once that their bus is gone.
             if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
-                eprintln!("cell-node: {stopped}");
+                say(stopped);
             }
             ExitCode::from(1)
         }
         Err(error) => {
-            eprintln!("cell-node: {error:#}");
+            say(format_args!("{error:#}"));
             ExitCode::from(2)
         }
     }
@@ -124,10 +131,8 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
         let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
         let (mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
         if let Some(damage) = damage {
-            eprintln!(
-                "cell-node: {} is not used: {damage}; write it anew or delete the file",
-                flash_file.name()
-            );
+            let name = flash_file.name();
+            say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
         }
         if flash == Flash::Empty {
             let parameters = skin.parameters(described);

@@ -6,6 +6,16 @@ use std::time::{Duration, Instant};
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
+/// Writes a line on standard error in one piece, for the cells write there too.
+pub(super) fn say(line: &str) {
+    write_piece(&format!("{line}\n"));
+}
+
+fn write_piece(text: &str) {
+    // Whoever closed it needs no progress.
+    let _ = std::io::stderr().write_all(text.as_bytes());
+}
+
 /// The progress line, on standard error.
 #[derive(Debug)]
 pub(super) struct Progress {
@@ -37,25 +47,23 @@ impl Progress {
             return;
         }
         self.clear();
-        eprintln!("{text}");
+        say(text);
     }
 
     /// Takes the line away.
     pub(super) fn clear(&mut self) {
         if self.terminal && self.shown {
-            eprint!("\r\x1b[2K");
+            write_piece("\r\x1b[2K");
             self.shown = false;
         }
     }
 
     fn write(&mut self, line: &str) {
         if self.terminal {
-            eprint!("\r\x1b[2K{line}");
-            // A terminal that is gone needs no progress.
-            let _ = std::io::stderr().flush();
+            write_piece(&format!("\r\x1b[2K{line}"));
             self.shown = true;
         } else {
-            eprintln!("{line}");
+            say(line);
         }
     }
 }

@@ -16,6 +16,7 @@ use protocol::skin::Reply;
 
 use super::launch::{Ended, Plan, Processes, ServedBus, program};
 use super::log::Log;
+use super::progress::say;
 use super::receiver::{Captured, CellView, News, Received, Receiver, View};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, realtime};
@@ -92,7 +93,8 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         let bus = open(options, &described.name, &mut served)?;
         if !options.quiet {
             let kib = bus.receive_buffer() / 1_024;
-            eprintln!("{} is {}, with a receive buffer of {kib} KiB", described.name, bus.kind());
+            let (name, kind) = (&described.name, bus.kind());
+            say(&format!("{name} is {kind}, with a receive buffer of {kib} KiB"));
         }
         buses.push(Arc::new(bus));
     }
@@ -321,7 +323,7 @@ impl Bench<'_> {
         if !self.options.quiet {
             for (what, who) in [("do not answer", silent), ("have no parameters", unconfigured)] {
                 if !who.is_empty() {
-                    eprintln!("cells that {what}, the run goes on without them: {who}");
+                    say(&format!("cells that {what}, the run goes on without them: {who}"));
                 }
             }
         }

@@ -15,7 +15,7 @@ use protocol::message::{From, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::time::Micros;
 
-use super::progress::Progress;
+use super::progress::{Progress, say};
 use super::realtime::{self, Granted};
 use super::receiver::{News, Received};
 use super::start::{Bench, rival};
@@ -68,7 +68,7 @@ impl Bench<'_> {
             if let Ok(Some(Recording { path, frames, .. })) = self.finish_log(&received)
                 && !self.options.quiet
             {
-                eprintln!("{frames} frames until then are in {path}");
+                say(&format!("{frames} frames until then are in {path}"));
             }
         }
         outcome
