@@ -1,0 +1,141 @@
+//! Another program closes the loop of a bench of real processes, well and badly.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+
+mod process;
+
+use std::os::unix::net::UnixDatagram;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use process::{PATIENCE, PRESSED, Place, Running, example, until};
+use protocol::message::Message;
+use rustix::process::Signal;
+
+const MISSING: &str = "the external controller's answer is missing";
+const NOBODY: &str = "no external controller is connected";
+const NONSENSE: &str = "the external controller sent nonsense";
+
+/// A bench whose loop another program closes, halted after so many bad cycles in a row.
+fn place(bad_cycles: u32) -> Place {
+    let place = Place::new();
+    let socket = place.path("controller.sock");
+    let kinesthetic = |line: &&str| !line.starts_with("inertia = ") && !line.starts_with("damping = ");
+    let text = process::skin(8);
+    let text: String = text.lines().filter(kinesthetic).map(|line| format!("{line}\n")).collect();
+    let text = text.replace(
+        "kind = \"kinesthetic\"",
+        &format!("kind = \"external\"\nsocket = \"{}\"", socket.display()),
+    );
+    let safety = format!("\n[safety]\nbad_cycles = {bad_cycles}\n\n[controller]");
+    place.write("skin.toml", &text.replace("\n[controller]", &safety));
+    place.scenario(&PRESSED.replace("\"hold\"", "\"kinesthetic\""));
+    place
+}
+
+/// The example in Python.
+fn python(place: &Place) -> Running {
+    let mut command = Command::new("python3");
+    command.arg(example("external_controller.py")).arg(place.path("controller.sock"));
+    Running::start(command)
+}
+
+#[test]
+fn the_example_in_python_moves_the_arm() {
+    let place = place(500);
+    let python = python(&place);
+    python.hears("waiting for a gateway at ");
+    let bench = place.running_bench(3.0, "");
+    place.guest().waits_for_motion();
+    bench.end().well();
+    place.is_left_clean();
+    assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"], "no socket is left");
+    let summary = place.summary();
+    summary.adds_up();
+    assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
+    // It is there when the loop begins; then it may be late, as the machine is.
+    assert_eq!(summary.count("/loop/bad_cycles", NONSENSE), 0, "{:#}", summary.0);
+    assert!(summary.total("/loop/bad_cycles") < summary.number("/loop/ticks") / 2, "{:#}", summary.0);
+    python.prints(" 8 cells ");
+}
+
+#[test]
+fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_ack() {
+    let place = place(250);
+    let first = python(&place);
+    first.hears("waiting for a gateway at ");
+    let bench = place.running_bench(60.0, "");
+    place.guest().waits_for_motion();
+    first.signal(Signal::KILL);
+    assert_eq!(first.end().signal(), Some(9));
+    bench.hears(&format!(
+        "the robot is halted: too many bad cycles in a row: {NOBODY}; `gateway ack skin.toml`"
+    ));
+    // What was lost is not had again by somebody saying hello; a person has to say so.
+    let second = python(&place);
+    second.prints("HALTED");
+    assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
+    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    bench.hears("the robot goes on");
+    place.guest().waits_for_motion();
+    bench.signal(Signal::TERM);
+    bench.end().well();
+    place.is_left_clean();
+    let summary = place.summary();
+    assert!(summary.count("/loop/bad_cycles", NOBODY) >= 250 - 1, "{:#}", summary.0);
+    summary.adds_up();
+}
+
+/// An answer to a tick, in rad/s.
+fn answer(tick: u64, velocity: f64) -> Vec<u8> {
+    let head = [b"SKBC".as_slice(), &1_u16.to_le_bytes(), &2_u16.to_le_bytes(), &tick.to_le_bytes()].concat();
+    let numbers: Vec<u8> = [velocity; 6].iter().flat_map(|number| number.to_le_bytes()).collect();
+    [head.as_slice(), &1_u32.to_le_bytes(), &0_u32.to_le_bytes(), &numbers].concat()
+}
+
+#[test]
+fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
+    let place = place(25);
+    let gateway = place.path("controller.sock");
+    let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
+    own.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    let bench = place.bench(60.0, "");
+    until("the gateway's socket", || gateway.exists().then_some(()));
+    own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), &gateway).unwrap();
+
+    let mut state = [0; 200];
+    let (mut told, give_up) = (0, Instant::now() + PATIENCE);
+    while told < 200 {
+        assert!(Instant::now() < give_up, "the gateway stopped talking to us: {}", bench.stderr());
+        let Ok(184) = own.recv(&mut state) else { continue };
+        let tick = u64::from_le_bytes(state[8..16].try_into().unwrap());
+        let good = answer(tick, 1.0);
+        let mut magic = good.clone();
+        magic[0] = b'X';
+        let nonsense: [&[u8]; 6] = [
+            &answer(tick, f64::NAN),
+            &answer(tick, f64::INFINITY),
+            &good[..71],
+            &[good.as_slice(), b"?"].concat(),
+            &magic,
+            &answer(tick + 1_000, 1.0),
+        ];
+        let _ = own.send_to(nonsense[told % nonsense.len()], &gateway);
+        told += 1;
+    }
+    bench.hears("the robot is halted: too many bad cycles in a row: ");
+    bench.signal(Signal::TERM);
+    let ended = bench.end().well();
+    place.is_left_clean();
+    assert_eq!(ended.stderr.matches("panicked").count(), 0);
+    let summary = place.summary();
+    summary.adds_up();
+    assert!(summary.count("/loop/bad_cycles", NONSENSE) > 0, "{:#}", summary.0);
+    let reasons = [NONSENSE, NOBODY, MISSING].map(|reason| summary.count("/loop/bad_cycles", reason));
+    assert_eq!(summary.total("/loop/bad_cycles"), reasons.iter().sum::<u64>());
+    // Nothing of it was done: the robot stands where it stood.
+    let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);
+    let mut positions = log.joints();
+    positions.dedup();
+    assert_eq!(positions.len(), 1);
+    assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are told");
+}
