@@ -133,6 +133,37 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
 }
 
 #[test]
+fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
+    let mut skin = skins::arm(4, Format::Fd);
+    skin.safety.hold_epochs = 10_000;
+    let mut bench = Bench::new(&skin, 11).started();
+    bench.press(CELL, 2.0);
+    bench.run_epochs(5);
+    bench.act(Act::Kill(CELL));
+    bench.run(Span(DEAD_AFTER.0 - bench.epoch().0));
+    assert_eq!(bench.gateway.table.snapshot().contributing, 1, "held");
+    bench.run(Span(2 * bench.epoch().0));
+    assert_eq!(bench.gateway.table.snapshot().contributing, 0, "dead");
+    assert_eq!(bench.gateway.table.snapshot().torque.map(f64::to_bits), [0; 6]);
+    finish(&mut bench);
+}
+
+#[test]
+fn replies_that_a_cell_owed_when_it_started_anew_are_in_doubt() {
+    let mut bench = bench(12);
+    bench.press(CELL, 2.0);
+    bench.run_epochs(20);
+    bench.run(Span(1_000));
+    bench.act(Act::Kill(CELL));
+    bench.act(Act::Start(CELL));
+    bench.run(Span::from_millis(70)); // its claim
+    let Replies { due, in_time, missing, in_doubt, .. } = replies(&bench, CELL);
+    assert!(missing >= 1 && missing == in_doubt, "{missing} {in_doubt}");
+    assert_eq!(due, in_time + missing, "settled at once");
+    finish(&mut bench);
+}
+
+#[test]
 fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
     for seed in 0..20 {
         let mut bench = bench(seed);
@@ -261,6 +292,10 @@ fn of_two_cells_with_one_number_exactly_one_stays_whenever_they_start() {
             bench.run(Span::from_millis(2_000));
             let gave_up = [0, second].map(|seat| bench.seats[seat].gave_up().is_some());
             assert_ne!(gave_up[0], gave_up[1], "{apart} us apart, serial {serial}");
+            if apart + 64_000 < CLAIM.0 {
+                let greater = usize::from(serial > first.serial);
+                assert!(gave_up[greater], "{apart} us apart both claim, so the lesser serial number stays");
+            }
             assert!(bench.gateway.table.cells()[0].is_ready());
         }
     }
@@ -288,11 +323,15 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         let now = replies(&bench, 0);
         assert_eq!((now.due, now.in_time), (before.due + 60, before.in_time + 60), "{now:?}");
         // It may hear a heartbeat before its first word, and then says none.
-        let claimed = bench.wire.iter().any(|it| it.from == Party::Seat(newcomer));
+        let claim = bench.wire.iter().find(|it| it.from == Party::Seat(newcomer)).map(|it| it.at);
+        let claimed = claim.is_some();
         claims[usize::from(claimed)] += 1;
         let node = bench.seats[0].identity.cell;
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
+        if let (Some(claim), Some((told, _))) = (claim, bench.gateway.notices.first()) {
+            assert!(told.since(claim) < Span::from_millis(6), "a claim is answered at once");
+        }
         assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
         finish(&mut bench);
         let uplink = bench.gateway.table.cells()[0].uplink;

@@ -86,6 +86,10 @@ fn bad_cycles_in_a_row_halt_the_robot_until_someone_resumes() {
     bench.run(Span(bench.gateway.period().0 * 50));
     assert_eq!(halted(&bench), Some(Halt::BadCycles(BadCycle::Torque)));
     assert_eq!(on_the_wire(&bench, Command::Halt, Party::Gateway).len(), 1, "said once");
+    let first = bench.gateway.records.iter().position(|record| record.halted.is_some()).unwrap();
+    let before =
+        bench.gateway.records[..first].iter().rev().take_while(|record| record.bad.is_some()).count();
+    assert_eq!(before as u64, limit - 1, "the last one of so many halts");
 
     bench.gateway.works = true;
     let (stands, due) = (q(&bench), replies(&bench).due);
