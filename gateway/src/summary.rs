@@ -186,6 +186,9 @@ pub struct UplinkSummary {
     pub unknown: u64,
     /// Arrived more often than sent.
     pub surplus: u64,
+    /// Arrived of what a cell sent after its last heartbeat before it started anew: what else it sent then,
+    /// nobody knows.
+    pub in_doubt: u64,
     /// Arrived after a cell's last heartbeat, which nothing can be compared with.
     pub unsettled: u64,
     /// Cells that started anew.
@@ -307,6 +310,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         dropped,
         unknown: total.lost - dropped,
         surplus: total.surplus,
+        in_doubt: total.in_doubt,
         unsettled: total.unsettled(),
         restarts: total.restarts,
     }
@@ -317,7 +321,7 @@ fn replies(table: &Table) -> RepliesSummary {
     let mut summary = RepliesSummary::default();
     for cell in table.cells() {
         let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
-        let mut rest = missing - in_doubt;
+        let mut rest = missing.saturating_sub(in_doubt);
         let mut explain = |count: u64| {
             let explained = rest.min(count);
             rest -= explained;

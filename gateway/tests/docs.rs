@@ -82,11 +82,13 @@ fn what_may_be_left_out_has_the_default_that_the_text_says() {
     assert_eq!(Skin::parse("skin.toml", &skin_text().replace(safety, "")), Ok(skin.clone()));
     let plain = Scenario::parse("scenario.toml", "version = 1\nduration_s = 6.0\n", &skin).unwrap();
     assert_eq!(plain, Scenario::idle(plain.duration));
-    for key in ["alpha_c", "alpha_p", "contact_threshold_n", "proximity_threshold"] {
+    let defaults =
+        [("alpha_c", 1.0), ("alpha_p", 0.0), ("contact_threshold_n", 0.0), ("proximity_threshold", 0.0)];
+    for (key, default) in defaults {
         let line = skin_text().lines().find(|line| line.starts_with(key)).unwrap();
         let without = Skin::parse("skin.toml", &skin_text().replace(line, "")).unwrap();
-        let zero = Skin::parse("skin.toml", &skin_text().replace(line, &format!("{key} = 0.0"))).unwrap();
-        assert_eq!(without, zero, "{key}");
+        let given = skin_text().replace(line, &format!("{key} = {default:.1}"));
+        assert_eq!(without, Skin::parse("skin.toml", &given).unwrap(), "{key}");
     }
 }
 

@@ -5,6 +5,8 @@ use std::fmt::Display;
 use comfy_table::{ContentArrangement, Table, presets};
 use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
 
+use super::{Failure, output};
+
 /// The paper's mean absolute error of single torques, in Nm.
 const PAPER_SINGLE_NM: f64 = 0.0054;
 
@@ -12,9 +14,8 @@ const PAPER_SINGLE_NM: f64 = 0.0054;
 const WIDTH: u16 = 110;
 
 /// Prints the whole run on standard output.
-#[expect(clippy::print_stdout, reason = "this is the command's output")]
-pub(crate) fn summary(summary: &Summary) {
-    println!("{}", table(summary));
+pub(crate) fn summary(summary: &Summary) -> Result<(), Failure> {
+    output::print(&format!("{}\n", table(summary)))
 }
 
 /// What is printed: a name, a value, and what it is to be compared with.
@@ -77,7 +78,7 @@ fn control(rows: &mut Rows, summary: &Summary) {
     rows.section("control loop", "50 % / 90 % / 99 % / greatest, µs", "");
     rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
     if control.central_us.count > 0 {
-        rows.row("tick, comparing", quantiles(&control.took_us), "");
+        rows.row("tick", quantiles(&control.took_us), "");
         rows.row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
     }
     if control.took_distributed_us.count > 0 {
@@ -131,7 +132,9 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
     rows.row("  lost", lost, explained(&[(up.dropped, "dropped by the bus")], up.unknown));
-    for (name, count) in [("surplus", up.surplus), ("after the last heartbeat", up.unsettled)] {
+    for (name, count) in
+        [("surplus", up.surplus), ("in doubt", up.in_doubt), ("after the last heartbeat", up.unsettled)]
+    {
         if count > 0 {
             rows.row(format!("  {name}"), count, "");
         }

@@ -26,7 +26,7 @@ const IDLE: Span = Span::from_millis(10_000);
 #[derive(Args, Debug)]
 struct Common {
     /// End after so many seconds; else after the scenario's duration
-    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Write the figures of the end as JSON; docs/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
@@ -171,7 +171,7 @@ fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> 
     if let Some((whole, file)) = json {
         write_json(whole, file, &summary)?;
     }
-    print::summary(&summary);
+    print::summary(&summary)?;
     Ok(())
 }
 

@@ -106,5 +106,9 @@ impl RunError {
 /// # Errors
 /// When it cannot begin, or does not come to its end; cells and buses that were started are ended again.
 pub fn run(options: &Options) -> Result<Summary, RunError> {
-    start::start(options)?.watch()
+    start::start(options)?.watch().map_err(|error| match error {
+        // A bus that was there and is gone is no wrong use.
+        RunError::Bus(error) => RunError::Failed(error.to_string()),
+        error => error,
+    })
 }

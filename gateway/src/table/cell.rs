@@ -235,14 +235,20 @@ impl Cell {
             })
     }
 
-    /// The cell said what it feels.
-    pub(super) fn feels(&mut self, skin: SkinSensors) {
-        let obeys = self.heartbeat.is_some_and(|heartbeat| heartbeat.state.has(State::TEST_MODE));
-        self.felt.said(skin, obeys);
+    /// Whether it feels what stimuli say, and not what it measures.
+    fn obeys(&self) -> bool {
+        self.heartbeat.is_some_and(|heartbeat| heartbeat.state.has(State::TEST_MODE))
     }
 
+    /// The cell said what it feels.
+    pub(super) fn feels(&mut self, skin: SkinSensors) {
+        self.felt.said(skin);
+    }
+
+    /// What the cell feels from the joints of this epoch on; `None` where only the cell knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
-        self.felt.latch(epoch)
+        let felt = self.felt.latch(epoch);
+        felt.filter(|_| self.obeys())
     }
 
     /// A new broadcast: what was not answered in three epochs is missing, and what is held grows old.
@@ -363,12 +369,12 @@ impl Cell {
         self.due = 0;
     }
 
-    /// It started anew: what it still owed, it will never send.
+    /// It started anew: what it still owed, it will never send; and why it owed what is missing, its
+    /// counters can no longer say.
     fn doubt(&mut self) {
-        let owed = u64::from(self.due.count_ones());
+        self.replies.missing += u64::from(self.due.count_ones());
         self.due = 0;
-        self.replies.missing += owed;
-        self.replies.in_doubt += owed;
+        self.replies.in_doubt = self.replies.missing.saturating_sub(self.replies.too_late);
         self.answered = None;
     }
 

@@ -26,12 +26,10 @@ impl Felt {
         self.waiting.push_back((if late { From::Next } else { from }, skin));
     }
 
-    /// The cell said what it feels. One that obeys stimuli says nothing new by it, unless nobody knew: its
-    /// word may be older than the joints at which it took the next stimulus.
-    pub(super) const fn said(&mut self, skin: SkinSensors, obeys: bool) {
-        if !obeys || self.now.is_none() {
-            self.now = Some(skin);
-        }
+    /// The cell said what it feels. That is news only while nobody knows: its word may be older than the
+    /// joints at which it took the next stimulus.
+    pub(super) fn said(&mut self, skin: SkinSensors) {
+        self.now.get_or_insert(skin);
     }
 
     /// The cell started anew: nothing touches it.
@@ -70,10 +68,8 @@ mod tests {
         assert_eq!(felt.latch(Epoch(255)), Some(press(2.0)), "late, so from the next on");
         assert_eq!(felt.latch(Epoch(0)), Some(press(1.0)));
         assert_eq!(felt.latch(Epoch(1)), Some(press(1.0)));
-        felt.said(press(3.0), true);
-        assert_eq!(felt.latch(Epoch(2)), Some(press(1.0)), "an old word of a cell that obeys");
-        felt.said(press(3.0), false);
-        assert_eq!(felt.latch(Epoch(3)), Some(press(3.0)), "a cell that measures");
+        felt.said(press(3.0));
+        assert_eq!(felt.latch(Epoch(2)), Some(press(1.0)), "an old word");
         felt.restart();
         assert_eq!(felt.latch(Epoch(4)), Some(SkinSensors::default()));
     }

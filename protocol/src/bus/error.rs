@@ -37,7 +37,9 @@ pub enum BusError {
         name: String,
     },
     /// The kernel has SocketCAN and no such interface.
-    #[error("there is no interface {name}: make it with `vcan-setup up {name}`")]
+    #[error(
+        "there is no interface {name}: make it with `ip link add {name} type vcan && ip link set {name} mtu 72 up`"
+    )]
     NoInterface {
         /// The bus.
         name: String,
@@ -62,15 +64,13 @@ pub enum BusError {
         mtu: i32,
     },
     /// The interface is down: found when it was opened, or while it was in use. It may come back.
-    #[error("{name} is down: bring it up with `vcan-setup up {name}` or `ip link set {name} up`")]
+    #[error("{name} is down: bring it up with `ip link set {name} up`")]
     Down {
         /// The interface.
         name: String,
     },
     /// The interface was removed while it was in use.
-    #[error(
-        "{name} was removed while it was in use: make it again with `vcan-setup up {name}` and open it again"
-    )]
+    #[error("{name} was removed while it was in use: make it again and open it again")]
     Gone {
         /// The interface.
         name: String,

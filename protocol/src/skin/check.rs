@@ -25,7 +25,7 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     }
     let robot = robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
-    let contact = contact(&[Key("contact")], raw.contact, Contact::default())?;
+    let contact = contact(&[Key("contact")], raw.contact, plain_contact())?;
     let buses = buses(&raw.bus)?;
     let controller = controller(raw.controller, robot.joints.len())?;
     let safety = safety(&raw.safety)?;
@@ -122,6 +122,11 @@ fn timing(raw: &raw::Timing) -> Checked<Timing> {
     )]
     let ticks_per_broadcast = ratio as u32;
     Ok(Timing { control_hz, ticks_per_broadcast })
+}
+
+/// What a skin has that says nothing of contacts: the force is the sum of the three words.
+fn plain_contact() -> Contact {
+    Contact { alpha_c: Q::nearest(1.0), ..Contact::default() }
 }
 
 /// Takes what is given, and the rest from `base`.
