@@ -106,9 +106,8 @@ impl RunError {
 /// # Errors
 /// When it cannot begin, or does not come to its end; cells and buses that were started are ended again.
 pub fn run(options: &Options) -> Result<Summary, RunError> {
-    start::start(options)?.watch().map_err(|error| match error {
-        // A bus that was there and is gone is no wrong use.
-        RunError::Bus(error) => RunError::Failed(error.to_string()),
-        error => error,
-    })
+    // A bus that was there and is gone is no wrong use.
+    let failed =
+        |error| if let RunError::Bus(bus) = error { RunError::Failed(bus.to_string()) } else { error };
+    start::start(options)?.watch().map_err(failed)
 }
