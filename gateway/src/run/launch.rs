@@ -61,6 +61,8 @@ pub enum LaunchError {
 pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, LaunchError> {
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
     let path = given.map(Path::to_owned).or_else(beside).unwrap_or_else(|| PathBuf::from(name));
+    // A bare name would be looked for in PATH, and not here.
+    let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 
