@@ -1,5 +1,6 @@
 //! Benches of real processes in which something breaks: it is named and counted, and the loop goes on.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
 mod process;
 
@@ -176,7 +177,7 @@ fn cells_on_the_bus_are_not_started_twice() {
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let cells = place.start("cell-node", "--bus vcan0 --nodes 2-3 --skin skin.toml");
+    let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 2-3 --skin skin.toml");
     place.guest().waits_for(
         "cell 3",
         |message| matches!(message, Message::Network { from: Node::Cell(cell), .. } if cell.get() == 3),
@@ -194,7 +195,8 @@ fn a_newcomer_under_a_taken_number_leaves_with_one_line() {
     // A stranger, and a twin by the same description.
     for skin in ["other.toml", "skin.toml"] {
         let bench = place.running_bench(60.0, "");
-        let newcomer = place.start("cell-node", &format!("--bus vcan0 --node 3 --skin {skin}"));
+        let newcomer =
+            place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded --node 3 --skin {skin}"));
         let said = "cell-node: cell 3 is on vcan0 already, with serial number 100003: stop that one or give \
                     this one another number";
         assert_eq!(newcomer.end().refusal(1), said);

@@ -1,5 +1,5 @@
 //! Cells that keep their parameters in files: written once, found again, and not trusted when damaged.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
 
@@ -89,7 +89,8 @@ fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     damage(&place, 3);
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let cells = place.start("cell-node", "--bus vcan0 --nodes 1-8 --skin skin.toml --flash flash");
+    let cells = place
+        .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
     cells.hears("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
     place.guest().waits_for("a heartbeat of cell 3 that says so", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
@@ -142,7 +143,8 @@ fn a_directory_that_is_not_there_is_named() {
     place.pressed();
     let said = "gateway: --flash flash: there is no such directory; make it first";
     assert_eq!(place.bench(1.0, "--flash flash").end().refusal(2), said);
-    let cell = place.start("cell-node", "--bus vcan0 --node 1 --skin skin.toml --flash flash");
+    let cell =
+        place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 1 --skin skin.toml --flash flash");
     let said = "cell-node: flash of cell 1 (flash/vcan0-1.flash): No such file or directory (os error 2)";
     assert_eq!(cell.end().refusal(2), said);
     assert_eq!(place.files(), ["scenario.toml", "skin.toml"]);

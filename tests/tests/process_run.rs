@@ -1,5 +1,5 @@
 //! Benches of real processes that nothing goes wrong with.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
 
@@ -169,8 +169,9 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let cells = ["--nodes 1-5", "--nodes 6-7", "--node 8"]
-        .map(|nodes| place.start("cell-node", &format!("--bus vcan0 {nodes} --skin skin.toml")));
+    let cells = ["--nodes 1-5", "--nodes 6-7", "--node 8"].map(|nodes| {
+        place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded {nodes} --skin skin.toml"))
+    });
     // One is interrupted, and leaves the cells halted.
     for interrupt in [false, true, false] {
         let bench = place.running_bench(if interrupt { 30.0 } else { 1.5 }, "--no-spawn");
@@ -214,7 +215,7 @@ fn a_gateway_without_cells_says_who_is_missing() {
     assert_eq!(place.files(), ["buses", "scenario.toml", "skin.toml"]);
 
     // Those that are there are enough.
-    let cells = place.start("cell-node", "--bus vcan0 --nodes 1-6 --skin skin.toml");
+    let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-6 --skin skin.toml");
     let ended = place.bench(1.0, "--no-spawn").end().well();
     assert!(ended.stderr.contains("run goes on without them: 7, 8 on vcan0"), "{}", ended.stderr);
     let summary = place.summary();
