@@ -278,7 +278,7 @@ fn wrong_options_are_one_line() {
             "invalid value '0' for '--cells-per-process <N>': 0 is not in 1..=254; try '--help'".to_owned(),
         ),
         ("gateway", "run", format!("{needed}: <SKIN>; try '--help'")),
-        ("gateway", "run skin.toml --xyzzy", "unexpected argument '--xyzzy' found; try '--help'".to_owned()),
+        ("gateway", "run skin.toml --fast", "unexpected argument '--fast' found; a similar argument exists: '--flash'; try '--help'".to_owned()),
         ("cell-node", "--bus vcan0 --skin skin.toml", format!("{needed}: --node <N>; try '--help'")),
         (
             "cell-node",
