@@ -168,9 +168,10 @@ impl Cells {
     fn turn(&mut self, bus: &Bus, inbox: &mut Inbox, now: Micros) -> Result<(), Stopped> {
         inbox.clear();
         let mut next = Micros(u64::MAX);
-        for (node, _) in &mut self.cells {
+        for (node, file) in &mut self.cells {
             if node.poll_timeout() <= now {
                 node.handle_timeout(now);
+                collect(node, file, self.format, &mut self.outbox);
                 self.clock.set();
             }
             next = next.min(node.poll_timeout());
@@ -185,7 +186,7 @@ impl Cells {
         Ok(())
     }
 
-    /// Gives each frame to the cells that may hear it.
+    /// Gives each frame to the cells that may hear it, and takes at once what they say to it.
     fn take(&mut self, inbox: &Inbox, bus: &Bus, now: Micros) -> Result<(), Stopped> {
         for received in inbox.frames() {
             let age = self.clock.age(now, received.at_nanos);
@@ -196,32 +197,35 @@ impl Cells {
                 Some(place) => self.cells.get_mut(usize::from(place)..=usize::from(place)),
                 None => self.cells.get_mut(..),
             };
-            for (node, _) in hearers.unwrap_or_default() {
+            for (node, file) in hearers.unwrap_or_default() {
                 node.handle_frame(now, age, &received.frame);
                 if let Some(serial) = node.taken() {
                     let (bus, cell) = (bus.name().to_owned(), node.identity().cell.get());
                     return Err(Stopped::Taken { bus, cell, serial });
                 }
+                collect(node, file, self.format, &mut self.outbox);
             }
         }
         Ok(())
     }
 
-    /// Writes what has to go into flash, and sends what is to be sent.
+    /// Sends what is to be sent.
     fn flush(&mut self, bus: &Bus) -> Result<(), Stopped> {
-        for (node, file) in &mut self.cells {
-            if let Some(parameters) = node.poll_store() {
-                node.handle_stored(file.store(&parameters).is_ok());
-            }
-            while let Some(packet) = node.poll_transmit() {
-                self.outbox.extend(packet.frames(self.format));
-            }
-        }
         if !self.outbox.is_empty() {
             bus.send(&self.outbox).map_err(|error| error.cause)?;
             self.outbox.clear();
         }
         Ok(())
+    }
+}
+
+/// Writes what a cell has for flash, and takes what it has to send.
+fn collect(node: &mut Node, file: &FlashFile, format: Format, outbox: &mut Vec<Frame>) {
+    if let Some(parameters) = node.poll_store() {
+        node.handle_stored(file.store(&parameters).is_ok());
+    }
+    while let Some(packet) = node.poll_transmit() {
+        outbox.extend(packet.frames(format));
     }
 }
 

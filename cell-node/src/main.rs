@@ -10,6 +10,7 @@ use cell_node::io::{Cells, FlashFile, Stopped};
 use cell_node::node::{Flash, Identity};
 use clap::Parser;
 use protocol::bus::{Bus, Choice, Filter, Options};
+use protocol::can::Format;
 use protocol::id::{CellId, Id};
 use protocol::skin::Skin;
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
@@ -141,7 +142,8 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
         }
         cells.start(identity, &flash, flash_file);
     }
-    let options = Options { filters: filters(&heard), ..Options::default() };
+    let fd = format == Format::Fd;
+    let options = Options { filters: filters(&heard), fd, ..Options::default() };
     let bus = Bus::open(&arguments.bus, arguments.bus_kind, &options)?;
     Ok((cells, bus))
 }

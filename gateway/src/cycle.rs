@@ -2,7 +2,7 @@
 //! comes out.
 //!
 //! ```text
-//!   Tick, Snapshots ─> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
+//!   Tick, Sums ──────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
 //!                                   ├─> Outcome::command > a halt or a resume for every bus
 //!                                   └─> Record ──────────> what this tick was like
 //! ```
@@ -20,7 +20,7 @@ use protocol::time::Micros;
 use crate::central::{Central, Felt};
 use crate::controller::{BadCycle, Controller, Input, Step};
 use crate::robot::{Moved, Robot};
-use crate::table::Snapshot;
+use crate::table::{Snapshot, Sums};
 
 /// When a tick is.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -92,6 +92,8 @@ pub struct Cycle {
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     bad_limit: u32,
+    /// Broadcasts that may be on their way before the bus counts as broken.
+    unread_limit: u64,
     epoch: Epoch,
     broadcasts: u64,
     /// The last broadcast's place in the schedule.
@@ -125,6 +127,7 @@ impl Cycle {
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
             bad_limit: skin.safety.bad_cycles,
+            unread_limit: u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1),
             epoch: Epoch(255),
             broadcasts: 0,
             slot: None,
@@ -141,18 +144,25 @@ impl Cycle {
         self.robot.positions()
     }
 
+    /// What the controller has counted, by name.
+    #[must_use]
+    pub fn counts(&self) -> Vec<(String, u64)> {
+        self.controller.counts()
+    }
+
     /// Broadcasts so far.
     #[must_use]
     pub const fn broadcasts(&self) -> u64 {
         self.broadcasts
     }
 
-    /// One tick; `skipped` ticks before it did not happen, and `valid` says whether the buses work.
+    /// One tick; `skipped` ticks before it did not happen, and `valid` says whether the buses work. It is
+    /// given sums and no cells, so its work cannot grow with them.
     pub fn tick<'a>(
         &mut self,
         tick: Tick,
         skipped: u64,
-        buses: impl IntoIterator<Item = &'a Snapshot>,
+        buses: impl IntoIterator<Item = &'a Sums>,
         valid: bool,
     ) -> Outcome {
         let mut input = Input {
@@ -168,6 +178,7 @@ impl Cycle {
             for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
                 *sum += torque;
             }
+            input.valid &= self.is_read_back(bus.read_back);
             input.contributing += bus.contributing;
             input.age = input.age.max(bus.age);
             (stale, dead) = (stale + bus.stale, dead + bus.dead);
@@ -221,6 +232,13 @@ impl Cycle {
             felt.active += part.active;
         }
         felt
+    }
+
+    /// Whether a bus still carries what is sent on it: torques are let go by the broadcasts that are read
+    /// back, so without them an old torque would be held for ever.
+    fn is_read_back(&self, last: Option<Epoch>) -> bool {
+        let behind = last.map_or(self.broadcasts, |last| u64::from(self.epoch.0.wrapping_sub(last.0)));
+        behind <= self.unread_limit
     }
 
     /// Halts and resumes that others sent; a halt outdoes a resume. Returns what the other buses have to
@@ -279,7 +297,6 @@ mod tests {
     use super::*;
     use crate::controller::Kinesthetic;
     use crate::robot::SimulatedArm;
-    use crate::table::Table;
     use crate::testing;
 
     struct Dead;
@@ -294,10 +311,10 @@ mod tests {
         Tick { number, time: Micros(number * 2_000) }
     }
 
-    fn cycle(controller: Box<dyn Controller>) -> (Cycle, Snapshot) {
+    fn cycle(controller: Box<dyn Controller>) -> (Cycle, Sums) {
         let skin = testing::skin();
         let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
-        (Cycle::new(&skin, controller, Box::new(robot)), Table::new(&skin, 0).snapshot().clone())
+        (Cycle::new(&skin, controller, Box::new(robot)), Sums::default())
     }
 
     #[test]
@@ -328,6 +345,21 @@ mod tests {
         bus.halts = 1;
         let halted = cycle.tick(tick(100), 0, [&bus], true);
         assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
+    }
+
+    #[test]
+    fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
+        let skin = testing::skin();
+        let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
+        let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
+        let mut bad =
+            |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [bus], true).record.bad;
+        for number in 0..=limit * 8 {
+            assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
+        }
+        assert_eq!(bad(&mut cycle, &bus, limit * 8 + 8), Some(BadCycle::Torque));
+        bus.read_back = Some(Epoch(7));
+        assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
     }
 
     #[test]

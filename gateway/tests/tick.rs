@@ -1,4 +1,6 @@
-//! What a tick may not do: allocate, or do more work the more cells there are.
+//! What a tick may not do: allocate, whether its buses take what it sends or not.
+//!
+//! That its work does not grow with the cells needs no test: `Cycle::tick` is given sums and no cells.
 
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 #![expect(unsafe_code, reason = "an allocator that counts has to be one")]
@@ -17,7 +19,7 @@ use gateway::run::turn::{Line, Shared, Turn};
 use gateway::scenario::{Mode, ModeChange, Scenario};
 use gateway::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};
-use protocol::packet::WORDS;
+use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use vcan_setup::embedded::Served;
@@ -68,58 +70,49 @@ fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<gateway::table::
 }
 
 #[test]
-fn a_tick_allocates_nothing_in_either_mode_also_when_it_sends_on_a_bus() {
+fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let directory = directory.path().join("skinbus");
     let served = Served::start_in(&directory, "vcan0").unwrap();
     let options = Options { directory: Some(directory), ..Options::default() };
     let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
     for mode in [Mode::Distributed, Mode::Compare] {
-        let (mut turn, mut snapshots, table) = turn(&skin(253), mode);
-        let mut sent = 0;
-        let mut allocated = 0;
-        for number in 0..1_000 {
-            snapshots.input_buffer_mut().take(table.snapshot(), true);
-            snapshots.publish();
-            let tick = Tick { number, time: Micros(number * 2_000) };
-            let before = ALLOCATIONS.with(Cell::get);
-            turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
-                sent += frames.len();
-                bus.send(frames).is_ok()
-            });
-            allocated += ALLOCATIONS.with(Cell::get) - before;
-        }
-        assert_eq!((sent, allocated), (125, 0), "{mode:?}");
+        assert_eq!(ticks(mode, &bus, true), Run { sent: 125, taken: 125, allocations: 0 }, "{mode:?}");
     }
     served.stop().unwrap();
+    let without = ticks(Mode::Distributed, &bus, false);
+    assert_eq!(
+        without,
+        Run { sent: 126, taken: 0, allocations: 0 },
+        "the joints, and a halt: the bus is gone"
+    );
 }
 
-/// Not how long it takes, which another program decides too, but what it looks at: a tick in distributed
-/// mode has the same inputs whether there is one cell or 253, and so takes the same steps.
-#[test]
-fn a_tick_in_distributed_mode_does_not_look_at_cells() {
-    for cells in [1, 253] {
-        let (mut turn, mut snapshots, table) = turn(&skin(cells), Mode::Distributed);
-        // A snapshot without any cell's state: a tick that looked at cells would miss them.
-        let mut snapshot = table.snapshot().clone();
-        snapshot.felt = Vec::new();
-        snapshot.torque = [1.0; WORDS];
-        *snapshots.input_buffer_mut() = snapshot;
+#[derive(Debug, PartialEq)]
+struct Run {
+    sent: usize,
+    taken: usize,
+    allocations: u64,
+}
+
+/// A thousand ticks that send on a bus, which carries what is sent on it or not.
+fn ticks(mode: Mode, bus: &Bus, carries: bool) -> Run {
+    let (mut turn, mut snapshots, table) = turn(&skin(253), mode);
+    let mut run = Run { sent: 0, taken: 0, allocations: 0 };
+    for number in 0..1_000_u64 {
+        let snapshot = snapshots.input_buffer_mut();
+        snapshot.take(table.snapshot(), true);
+        snapshot.sums.read_back = carries.then(|| Epoch((number / 8).to_le_bytes()[0]));
         snapshots.publish();
-        let mut sent = Vec::new();
-        for number in 0..64 {
-            let tick = Tick { number, time: Micros(number * 2_000) };
-            turn.turn(
-                tick,
-                0,
-                0,
-                || 0,
-                |_, frames| {
-                    sent.extend_from_slice(frames);
-                    true
-                },
-            );
-        }
-        assert_eq!(sent.len(), 8, "{cells} cells");
+        let tick = Tick { number, time: Micros(number * 2_000) };
+        let before = ALLOCATIONS.with(Cell::get);
+        turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
+            let taken = bus.offer(frames);
+            run.sent += frames.len();
+            run.taken += if taken { frames.len() } else { 0 };
+            taken
+        });
+        run.allocations += ALLOCATIONS.with(Cell::get) - before;
     }
+    run
 }

@@ -317,6 +317,14 @@ impl Bus {
         Ok(())
     }
 
+    /// Sends frames, at most 64, if the bus takes them all at once, and says whether it did. Never waits,
+    /// never allocates, and does not say why not: for a loop that has its own deadline.
+    #[must_use]
+    pub fn offer(&self, frames: &[Frame]) -> bool {
+        let fits = self.fd || frames.iter().all(|frame| frame.format() == Format::Classic);
+        fits && self.send_some(frames).is_ok_and(|sent| sent == frames.len())
+    }
+
     fn send_some(&self, frames: &[Frame]) -> std::io::Result<usize> {
         if let [frame] = frames {
             let (bytes, len) = (frame.to_bytes(), frame.byte_len());

@@ -16,7 +16,7 @@ pub fn check(bench: &Bench) {
     frames(bench);
     let table = &bench.gateway.table;
     let counters = table.counters();
-    let dead = bench.gateway.table.snapshot().dead;
+    let dead = bench.gateway.table.snapshot().sums.dead;
     let silent = table.statuses(bench.now()).filter(|(_, status)| status.name() == "dead").count();
     assert_eq!(dead as usize, silent, "the dead are counted");
     assert!(counters.epochs_complete <= counters.epochs_due, "{counters:?}");

@@ -306,7 +306,7 @@ impl Bench {
             Event::Wake(seat) => self.wake(seat),
             Event::Tick if self.ticking => {
                 let messages = self.gateway.turn(self.now);
-                self.witness.check_sum(self.now, self.gateway.table.snapshot());
+                self.witness.check_sum(self.now, &self.gateway.table.snapshot().sums);
                 self.say(&messages);
                 self.schedule(self.now + self.gateway.period(), Event::Tick);
             }

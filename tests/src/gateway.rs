@@ -134,7 +134,7 @@ impl Gateway {
         let skipped = self.records.last().map_or(0, |last| self.tick - last.tick.number - 1);
         self.snapshot.take(self.table.snapshot(), true);
         let tick = Tick { number: self.tick, time };
-        let outcome = self.cycle.tick(tick, skipped, [&self.snapshot], self.works);
+        let outcome = self.cycle.tick(tick, skipped, [&self.snapshot.sums], self.works);
         self.tick += 1;
         self.records.push(outcome.record);
         self.broadcasts_skipped += outcome.broadcasts_skipped;

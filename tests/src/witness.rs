@@ -2,7 +2,7 @@
 //! whom they were sent and when each cell was switched on. What the real one makes of the same frames
 //! must agree with it, whatever was broken.
 
-use gateway::table::{Notice, Snapshot};
+use gateway::table::{Notice, Sums};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
@@ -263,7 +263,7 @@ impl Witness {
     }
 
     /// The sum that a tick takes must be this one's, to the last bit.
-    pub(crate) fn check_sum(&self, now: Micros, snapshot: &Snapshot) {
+    pub(crate) fn check_sum(&self, now: Micros, snapshot: &Sums) {
         if !self.compares {
             return;
         }

@@ -44,14 +44,14 @@ fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
     let mut bench = bench(1);
     bench.press(CELL, 3.0);
     bench.run_epochs(3);
-    let whole = magnitude(&bench.gateway.table.snapshot().torque);
+    let whole = magnitude(&bench.gateway.table.snapshot().sums.torque);
     assert!(whole > 0.01);
     // The cell goes on to speak of a contact, but none of its torques arrives.
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::Seat(CELL)));
     let course: Vec<_> = (0..10)
         .map(|_| {
             bench.run_epochs(1);
-            let snapshot = bench.gateway.table.snapshot();
+            let snapshot = bench.gateway.table.snapshot().sums;
             let part = (magnitude(&snapshot.torque) / whole * 20.0).round() / 20.0;
             (part, snapshot.age, snapshot.stale, snapshot.contributing)
         })
@@ -87,11 +87,11 @@ fn a_heartbeat_that_says_quiet_clears_a_held_torque() {
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque));
     bench.press(CELL, 0.0);
     let let_go = bench.now();
-    while bench.gateway.table.snapshot().contributing > 0 {
+    while bench.gateway.table.snapshot().sums.contributing > 0 {
         bench.run(Span::from_millis(1));
         assert!(bench.now().since(let_go) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
     }
-    assert_eq!(bench.gateway.table.snapshot().torque.map(f64::to_bits), [0; 6]);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; 6]);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
 }
@@ -113,15 +113,15 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         // It answered every epoch, so its last word is at most an epoch old.
         let after = dead.since(killed);
         assert!((DEAD_AFTER.0 - bench.epoch().0..DEAD_AFTER.0 + 5_000).contains(&after.0), "{after:?}");
-        assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().dead), (Status::Dead, 1));
-        assert_eq!(bench.gateway.table.snapshot().contributing, 0);
+        assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().sums.dead), (Status::Dead, 1));
+        assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0);
 
         bench.act(Act::Start(CELL));
         bench.run(START);
         let told: Vec<_> = bench.gateway.notices[1..].iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, [Notice::Back(node), Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
-        assert_eq!(bench.gateway.table.snapshot().dead, 0);
+        assert_eq!(bench.gateway.table.snapshot().sums.dead, 0);
         let before = replies(&bench, CELL);
         bench.run_epochs(20);
         let now = replies(&bench, CELL);
@@ -141,10 +141,10 @@ fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
     bench.run_epochs(5);
     bench.act(Act::Kill(CELL));
     bench.run(Span(DEAD_AFTER.0 - bench.epoch().0));
-    assert_eq!(bench.gateway.table.snapshot().contributing, 1, "held");
+    assert_eq!(bench.gateway.table.snapshot().sums.contributing, 1, "held");
     bench.run(Span(2 * bench.epoch().0));
-    assert_eq!(bench.gateway.table.snapshot().contributing, 0, "dead");
-    assert_eq!(bench.gateway.table.snapshot().torque.map(f64::to_bits), [0; 6]);
+    assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0, "dead");
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; 6]);
     finish(&mut bench);
 }
 
@@ -258,7 +258,7 @@ fn a_long_run_does_not_confuse_the_count_of_joints() {
 }
 
 #[test]
-fn stimuli_that_found_no_room_after_a_hang_are_counted_and_a_new_one_puts_it_right() {
+fn a_cell_that_hung_feels_what_was_said_meanwhile_and_no_stimulus_is_refused() {
     let mut bench = bench(6);
     bench.run_epochs(5);
     bench.act(Act::Hang(CELL));
@@ -270,12 +270,9 @@ fn stimuli_that_found_no_room_after_a_hang_are_counted_and_a_new_one_puts_it_rig
     bench.run_epochs(2);
     bench.act(Act::GoOn(CELL));
     bench.run_epochs(5);
-    bench.press(CELL, 0.0);
-    bench.run_epochs(5);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
-    let refused = bench.gateway.table.cells()[CELL].refused.unwrap();
-    assert_eq!(usize::from(refused.stimuli), 2 * PENDING + 1 - PENDING, "{refused:?}");
+    assert_eq!(bench.gateway.table.cells()[CELL].refused.unwrap().stimuli, 0);
 }
 
 #[test]
@@ -317,7 +314,7 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         bench.act(Act::Start(newcomer));
         for _ in 0..60 {
             bench.run_epochs(1);
-            assert_eq!(bench.gateway.table.snapshot().contributing, 1, "the torque is held throughout");
+            assert_eq!(bench.gateway.table.snapshot().sums.contributing, 1, "the torque is held throughout");
         }
         assert_eq!(bench.seats[newcomer].gave_up(), Some(bench.seats[0].identity.serial));
         let now = replies(&bench, 0);

@@ -124,7 +124,7 @@ fn a_broadcast_that_the_gateway_does_not_read_back_confuses_no_torque() {
         finish(&mut bench);
         let accuracy = bench.gateway.table.accuracy();
         assert!(accuracy.single.max() < 1e-3, "{harm:?}: {accuracy:?}");
-        assert!(bench.gateway.table.snapshot().contributing > 0);
+        assert!(bench.gateway.table.snapshot().sums.contributing > 0);
     }
 }
 
@@ -214,7 +214,7 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         bench.act(Act::Inject(message));
         bench.run(Span(5_000));
         assert_eq!(events(&bench, Event::Rival), 1);
-        assert_eq!(bench.gateway.table.snapshot().rivals, 1);
+        assert_eq!(bench.gateway.table.snapshot().sums.rivals, 1);
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, [Notice::Rival]);
         finish(&mut bench);

@@ -50,7 +50,7 @@ fn a_halt_from_anybody_stops_robot_and_cells_and_a_resume_lets_both_go_on() {
     bench.run(Span(5_000));
     assert_eq!(halted(&bench), Some(Halt::Frame));
     assert_eq!(
-        (bench.gateway.table.snapshot().torque, bench.gateway.table.snapshot().contributing),
+        (bench.gateway.table.snapshot().sums.torque, bench.gateway.table.snapshot().sums.contributing),
         ([0.0; 6], 0)
     );
     let (stands, due, sent) = (q(&bench), replies(&bench).due, bench.torques(0).len());
@@ -145,11 +145,11 @@ fn skipped_ticks_skip_whole_broadcasts_and_are_counted() {
 fn a_gateway_that_stops_broadcasting_holds_what_it_has_and_nobody_is_stale() {
     let mut bench = pressed(5);
     bench.run(Span(1_000));
-    let torque = bench.gateway.table.snapshot().torque;
+    let torque = bench.gateway.table.snapshot().sums.torque;
     bench.gateway.skip_ticks(100);
     bench.run(Span::from_millis(190));
-    assert_eq!(bench.gateway.table.snapshot().torque.map(f64::to_bits), torque.map(f64::to_bits));
-    assert_eq!(bench.gateway.table.snapshot().stale, 0);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), torque.map(f64::to_bits));
+    assert_eq!(bench.gateway.table.snapshot().sums.stale, 0);
     bench.run_epochs(5);
     finish(&mut bench);
     assert_eq!(replies(&bench).missing, 0);
@@ -165,7 +165,7 @@ fn a_press_moves_the_joints_the_way_it_pushes() {
     bench.press(0, 4.0);
     bench.run_epochs(2);
     // Frame 1 has its z axis along minus y of the base: the force -4 N along it pushes towards plus y.
-    let torque = bench.gateway.table.snapshot().torque;
+    let torque = bench.gateway.table.snapshot().sums.torque;
     assert!((torque[0] - 2.0).abs() < 0.01, "{torque:?}");
     bench.run_epochs(10);
     assert!(f64::from_bits(q(&bench)[0]) > 0.01);

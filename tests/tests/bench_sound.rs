@@ -54,7 +54,7 @@ fn without_faults_every_reply_that_is_due_comes_in_time_and_is_right() {
             let pressed = [0, 3, 5, 11].contains(&place);
             assert_eq!(status, if pressed { Status::Active } else { Status::Quiet }, "{place}");
         }
-        assert_eq!(bench.gateway.table.snapshot().contributing, 4);
+        assert_eq!(bench.gateway.table.snapshot().sums.contributing, 4);
         bench.finish();
         assert_flawless(&bench);
         assert_accurate(&bench);
@@ -72,7 +72,7 @@ fn a_contact_ends_with_one_zero_torque_and_nothing_is_held() {
     bench.run_epochs(10);
     bench.press(1, 0.0);
     bench.run_epochs(2);
-    let snapshot = bench.gateway.table.snapshot();
+    let snapshot = bench.gateway.table.snapshot().sums;
     assert_eq!((snapshot.torque, snapshot.contributing), ([0.0; 6], 0));
     let torques = bench.torques(1);
     bench.run_epochs(10);
@@ -137,7 +137,7 @@ fn all_253_cells_pressed_at_once_answer_every_epoch() {
     let mut bench = Bench::new(&skin, 6).started();
     (0..253).for_each(|place| bench.press(place, 1.5));
     bench.run_epochs(60);
-    assert_eq!(bench.gateway.table.snapshot().contributing, 253);
+    assert_eq!(bench.gateway.table.snapshot().sums.contributing, 253);
     bench.finish();
     assert_flawless(&bench);
     assert_accurate(&bench);

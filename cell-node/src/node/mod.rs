@@ -109,7 +109,6 @@ pub struct Node {
     outbox: Deque<Message, OUTBOX>,
     storing: Option<(Parameters, u8)>,
     claim: Claim,
-    settles: Micros,
     next_heartbeat: Micros,
     defended: Option<Micros>,
     taken: Option<u32>,
@@ -137,7 +136,6 @@ impl Node {
             outbox: Deque::new(),
             storing: None,
             claim: Claim::Unsaid,
-            settles: now + CLAIM + phase(identity.cell),
             next_heartbeat: now + Span(u64::from(identity.serial) * 1_000 % FIRST_WORD.0),
             defended: None,
             taken: None,
@@ -196,7 +194,7 @@ impl Node {
         }
         if self.claim == Claim::Unsaid {
             self.claim = Claim::Said;
-            self.next_heartbeat = self.settles;
+            self.next_heartbeat = now + CLAIM + phase(self.identity.cell);
             return self.push_heartbeat();
         }
         self.claim = Claim::Settled;
@@ -290,17 +288,19 @@ impl Node {
             return;
         }
         let in_use = self.configuration.in_use();
-        if in_use.is_some_and(|in_use| age.0 > u64::from(in_use.parameters.period_us)) {
-            count(&mut self.heard.joints_late);
-            return;
-        }
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.refused.meaning);
             return;
         }
+        // Old joints are not answered, but what holds from them on holds: a cell that hung would else keep
+        // feeling what was there before.
         self.epoch = Some(epoch);
-        count(&mut self.heard.joints);
         self.stimuli.latch(epoch);
+        if in_use.is_some_and(|in_use| age.0 > u64::from(in_use.parameters.period_us)) {
+            count(&mut self.heard.joints_late);
+            return;
+        }
+        count(&mut self.heard.joints);
         if self.claim != Claim::Settled || self.flags.has(State::HALTED) {
             return;
         }
@@ -442,9 +442,10 @@ impl Node {
         self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
-    /// A shell that does not take what is sent loses what no longer fits; it is not counted as sent.
+    /// One frame leads to four packets at most, and a shell takes them after each, so that there is room.
     fn push(&mut self, message: Message) {
-        let _ = self.outbox.push_back(message);
+        let fits = self.outbox.push_back(message).is_ok();
+        debug_assert!(fits, "a shell takes what is to be sent after each call");
     }
 }
 

@@ -9,10 +9,11 @@ use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Options as BusOptions};
-use protocol::can::Frame;
+use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use super::launch::{Ended, Plan, Processes, ServedBus, program};
 use super::log::Log;
@@ -76,7 +77,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     refuse(options)?;
     let signalled = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+    for signal in [SIGHUP, SIGINT, SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&signalled))
             .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
     }
@@ -166,6 +167,7 @@ fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 /// Opens a bus; an embedded one that nobody serves is served.
 fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bus, RunError> {
     let wanted = BusOptions {
+        fd: options.skin.buses.iter().any(|bus| bus.name == name && bus.format == Format::Fd),
         filters: vec![Filter::ALL],
         own_frames: true,
         error_mask: u32::MAX,
@@ -200,7 +202,7 @@ fn listen(
     };
     let works = Arc::new(AtomicBool::new(true));
     let view = Arc::new(Mutex::new(View::default()));
-    let format = options.skin.buses.get(index).map_or(protocol::can::Format::Fd, |bus| bus.format);
+    let format = options.skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
     let line = Line { format, snapshot, positions, works: Arc::clone(&works) };
     let receiver = Receiver {
         index,

@@ -39,9 +39,9 @@ pub use ledger::{Replies, Uplink};
 /// so that one lost frame kills nobody.
 pub const DEAD_AFTER: Span = Span::from_millis(600);
 
-/// What a tick needs to know of a bus.
-#[derive(Clone, Debug)]
-pub struct Snapshot {
+/// What a tick needs to know of a bus: the same few words whatever the cells' number.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sums {
     /// The sum of all held torques in Nm.
     pub torque: [f64; WORDS],
     /// Cells in it.
@@ -52,12 +52,21 @@ pub struct Snapshot {
     pub stale: u32,
     /// Cells that have fallen silent.
     pub dead: u32,
+    /// The last broadcast of this gateway that was read back from the bus.
+    pub read_back: Option<Epoch>,
     /// Halts heard that this gateway did not send.
     pub halts: u32,
     /// Resumes heard that this gateway did not send.
     pub resumes: u32,
     /// Frames of another gateway.
     pub rivals: u32,
+}
+
+/// What a receiver leaves for the loop: the sums, and what a central computation beside them needs.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    /// What a tick needs.
+    pub sums: Sums,
     /// What each cell feels, in the order of the bus' cells; only kept up to date while comparing.
     pub felt: Vec<SkinSensors>,
 }
@@ -65,12 +74,9 @@ pub struct Snapshot {
 impl Snapshot {
     /// Takes over another one without allocating; what cells feel only if `felt`.
     pub fn take(&mut self, other: &Self, felt: bool) {
-        let Self { torque, contributing, age, stale, dead, halts, resumes, rivals, felt: skins } = self;
-        *torque = other.torque;
-        (*contributing, *age, *stale, *dead) = (other.contributing, other.age, other.stale, other.dead);
-        (*halts, *resumes, *rivals) = (other.halts, other.resumes, other.rivals);
+        self.sums = other.sums;
         if felt {
-            skins.clone_from(&other.felt);
+            self.felt.clone_from(&other.felt);
         }
     }
 }
@@ -143,17 +149,7 @@ impl Table {
             }
             cells.push(Cell::new(described, &part.parameters(described)));
         }
-        let snapshot = Snapshot {
-            torque: [0.0; WORDS],
-            contributing: 0,
-            age: 0,
-            stale: 0,
-            dead: 0,
-            halts: 0,
-            resumes: 0,
-            rivals: 0,
-            felt: vec![SkinSensors::default(); cells.len()],
-        };
+        let snapshot = Snapshot { sums: Sums::default(), felt: vec![SkinSensors::default(); cells.len()] };
         Self {
             format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
             safety: skin.safety,
@@ -305,17 +301,17 @@ impl Table {
         match *message {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
                 self.counters.count(Event::Rival);
-                self.snapshot.rivals += 1;
+                self.snapshot.sums.rivals += 1;
                 self.notices.push_back(Notice::Rival);
                 return;
             }
             Message::Halt => {
-                self.snapshot.halts += 1;
+                self.snapshot.sums.halts += 1;
                 self.each_cell(Cell::halt);
                 return;
             }
             Message::Resume => {
-                self.snapshot.resumes += 1;
+                self.snapshot.sums.resumes += 1;
                 self.cells.iter_mut().for_each(Cell::resume);
                 return;
             }
@@ -333,7 +329,7 @@ impl Table {
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
         if cell.hear(at) {
-            self.snapshot.dead -= 1;
+            self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
         cell.uplink.arrive();
@@ -448,7 +444,8 @@ impl Table {
             }
             self.apply(change);
         }
-        (self.snapshot.stale, self.snapshot.age) = (stale, age);
+        let sums = &mut self.snapshot.sums;
+        (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
         let error = [0.0; WORDS];
         self.broadcast =
             Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
@@ -471,7 +468,7 @@ impl Table {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             if cell.falls_silent(now) {
-                self.snapshot.dead += 1;
+                self.snapshot.sums.dead += 1;
                 self.notices.push_back(Notice::Dead(cell.node));
                 let change = cell.let_go();
                 self.apply(change);
@@ -507,12 +504,13 @@ impl Table {
     /// Adds what a cell's contribution changed by to the running sum.
     fn apply(&mut self, change: cell::Change) {
         for ((sum, torque), difference) in
-            self.sum.iter_mut().zip(&mut self.snapshot.torque).zip(change.torque)
+            self.sum.iter_mut().zip(&mut self.snapshot.sums.torque).zip(change.torque)
         {
             *sum += i64::from(difference);
             *torque = cell::to_nm(*sum);
         }
-        self.snapshot.contributing = self.snapshot.contributing.saturating_add_signed(change.contributing);
+        self.snapshot.sums.contributing =
+            self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
     }
 
     /// The cells' statuses now.
