@@ -208,7 +208,7 @@ fn a_newcomer_under_a_taken_number_leaves_with_one_line() {
         // It may also have heard of cell 3 before it said a word.
         let named =
             ended.stderr.contains("cell 3 on vcan0 hears another cell under its number: stop one of the two");
-        assert_eq!(named, summary.count("/buses/0/events", "duplicate number") > 0, "{:#}", summary.0);
+        assert!(!named || summary.count("/buses/0/events", "duplicate number") > 0, "{:#}", summary.0);
         // What the twin says cannot be told from a cell that starts anew, so it is in the cell's accounts.
         if skin == "other.toml" {
             summary.adds_up();

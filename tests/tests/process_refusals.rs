@@ -290,7 +290,7 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --node 0",
-            "invalid value '0' for '--node <N>': 0 is not in 1..=254; try '--help'".to_owned(),
+            "0 is no cell number: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
         ),
     ] {
         let said = refusal(&place, program, words, 2);

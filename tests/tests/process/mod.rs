@@ -161,7 +161,7 @@ impl Place {
     /// The same, once its loop runs.
     pub(crate) fn running_bench(&self, seconds: f64, more: &str) -> Running {
         let bench = self.bench(seconds, more);
-        bench.hears(" s  ");
+        bench.hears_the_loop();
         bench
     }
 
@@ -347,6 +347,11 @@ impl Running {
         self.err.wait_for(words);
     }
 
+    /// Waits until a bench's loop runs: then come the lines that say how it goes.
+    pub(crate) fn hears_the_loop(&self) {
+        self.err.wait_until("how it goes", |text| text.contains(" s  ") || text.contains("\nstarting\n"));
+    }
+
     /// Waits until it has said something on standard output.
     pub(crate) fn prints(&self, words: &str) {
         self.out.wait_for(words);
@@ -419,10 +424,14 @@ impl Output {
     }
 
     fn wait_for(&self, words: &str) {
+        self.wait_until(words, |text| text.contains(words));
+    }
+
+    fn wait_until(&self, words: &str, said: impl Fn(&str) -> bool) {
         let give_up = Instant::now() + PATIENCE;
         loop {
             let text = self.text.lock().unwrap().clone();
-            if text.contains(words) {
+            if said(&text) {
                 return;
             }
             let over = self.reader.as_ref().is_none_or(JoinHandle::is_finished);
