@@ -352,8 +352,7 @@ mod tests {
         let skin = testing::skin();
         let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
         let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
-        let mut bad =
-            |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [bus], true).record.bad;
+        let bad = |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [bus], true).record.bad;
         for number in 0..=limit * 8 {
             assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
         }

@@ -54,6 +54,8 @@ pub struct Loop {
     pub broadcasts_skipped: u64,
     /// Bad cycles, by reason.
     pub bad_cycles: BTreeMap<String, u64>,
+    /// What an external controller's datagrams came to, by name; empty for other controllers.
+    pub controller: BTreeMap<String, u64>,
     /// How late ticks began.
     pub late_us: Quantiles,
     /// How late the same machine wakes a thread when nothing else runs.

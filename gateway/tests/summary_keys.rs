@@ -42,6 +42,7 @@ fn summary(bus: BusSummary) -> Summary {
             broadcasts: 63,
             broadcasts_skipped: 0,
             bad_cycles: BTreeMap::new(),
+            controller: BTreeMap::new(),
             late_us: quantiles,
             idle_late_us: quantiles,
             took_us: quantiles,

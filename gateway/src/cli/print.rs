@@ -86,6 +86,16 @@ fn control(rows: &mut Rows, summary: &Summary) {
     }
     rows.row("ticks", control.ticks, format!("{} skipped", control.ticks_skipped));
     rows.row("broadcasts", control.broadcasts, format!("{} skipped", control.broadcasts_skipped));
+    for (name, count) in
+        [("frames not sent", control.unsent), ("records of ticks lost", control.records_lost)]
+    {
+        if count > 0 {
+            rows.row(name, count, "the bus did not take them, or this machine was busy");
+        }
+    }
+    for (name, count) in &control.controller {
+        rows.row("external controller", count, name);
+    }
     for (reason, count) in &control.bad_cycles {
         rows.row("bad cycles", count, reason);
     }

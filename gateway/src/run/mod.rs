@@ -16,6 +16,7 @@ pub mod file;
 mod io;
 pub mod launch;
 mod log;
+mod measured;
 mod progress;
 pub mod realtime;
 pub mod receiver;

@@ -5,6 +5,7 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use protocol::bus::batch::BATCH;
 use protocol::bus::{Bus, Inbox};
 use protocol::can::Frame;
 use protocol::id::Kind;
@@ -160,7 +161,8 @@ impl Receiver {
                 self.look();
             }
             self.publish();
-            if count > 0 {
+            // A full inbox has more behind it.
+            if (1..BATCH).contains(&count) {
                 std::thread::sleep(GATHER);
             }
         }

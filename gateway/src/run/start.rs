@@ -391,8 +391,14 @@ impl Bench<'_> {
     pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
         for (lane, described) in self.lanes.iter().zip(&self.options.skin.buses) {
             let frames: Vec<Frame> = message.encode().frames(described.format).collect();
-            lane.bus.send(&frames).map_err(BusError::from)?;
-            self.shared.commands.fetch_add(1, Ordering::Relaxed);
+            match lane.bus.send(&frames).map_err(BusError::from) {
+                Ok(()) => self.shared.commands.fetch_add(1, Ordering::Relaxed),
+                // Counted; a bus that is down for a while costs no run its end.
+                Err(error) if error.may_pass() => {
+                    self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed)
+                }
+                Err(error) => return Err(error.into()),
+            };
         }
         Ok(())
     }

@@ -1,32 +1,32 @@
 //! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, news and
 //! progress for people, frames into the log, and at the end the summary.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use hdrhistogram::Histogram;
 use protocol::bus::Bus;
 use protocol::can::Frame;
-use protocol::id::Node;
+use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::time::Micros;
 
+use super::measured::Measured;
 use super::progress::{Progress, say};
 use super::realtime::{self, Granted};
 use super::receiver::{News, Received};
 use super::start::{Bench, rival};
 use super::turn::{Timed, Turn};
 use super::{RunError, usage};
-use crate::cycle::Halt;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{
-    AccuracySummary, BusSummary, Loop, Processor, Quantiles, Recording, Summary, histogram,
-};
+use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Recording, Summary};
 use crate::table::{Accuracy, Notice};
+
+/// What a controller counted, by name.
+type Counts = BTreeMap<String, u64>;
 
 /// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
 const LEAD: u64 = 5;
@@ -34,20 +34,6 @@ const LEAD: u64 = 5;
 const LOOK: Duration = Duration::from_millis(4);
 /// How long the cells may take to say their last words; a machine that is overloaded needs it.
 const LAST_WORDS: Duration = Duration::from_secs(3);
-
-/// What the loop's records add up to.
-#[derive(Debug)]
-struct Measured {
-    late: Histogram<u64>,
-    took: Histogram<u64>,
-    took_distributed: Histogram<u64>,
-    central: Histogram<u64>,
-    ticks: u64,
-    skipped: u64,
-    bad: BTreeMap<String, u64>,
-    last: Option<Timed>,
-    first_broadcast_s: Option<f64>,
-}
 
 /// Faults and touches that are still to come.
 struct Script {
@@ -95,7 +81,7 @@ impl Bench<'_> {
             Script { touches: Touches::new(&options.scenario, &options.skin), epoch: 0, fault: 0 };
         self.press(&mut script)?;
 
-        let before = self.processor();
+        let before = self.spent();
         let started = Instant::now();
         let control = self.start_loop(turn)?;
         let mut progress = Progress::new(options.quiet);
@@ -115,7 +101,8 @@ impl Bench<'_> {
                 break;
             }
         }
-        let granted = control.join().map_err(|_| RunError::Failed("the control loop panicked".to_owned()))?;
+        let panicked = |_| RunError::Failed("the control loop panicked".to_owned());
+        let (granted, controller) = control.join().map_err(panicked)?;
         let duration_s = started.elapsed().as_secs_f64();
         progress.clear();
         if let Some(failure) = failure {
@@ -124,7 +111,7 @@ impl Bench<'_> {
             return Err(failure);
         }
         measured.take(&mut inlet, self.began);
-        let processor = self.processor().since(before, duration_s);
+        let processor = self.spent().since(&before, duration_s);
         let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
         self.last_words(interrupted)?;
         self.write_log()?;
@@ -137,7 +124,7 @@ impl Bench<'_> {
             interrupted,
             halted: measured.halted(),
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
-            control: self.loop_summary(&measured, granted),
+            control: self.loop_summary(&measured, granted, controller),
             accuracy: accuracy(&received),
             buses: self.bus_summaries(&received),
             processor,
@@ -146,17 +133,17 @@ impl Bench<'_> {
         })
     }
 
-    fn start_loop(&self, mut turn: Turn) -> Result<thread::JoinHandle<Granted>, RunError> {
+    /// The loop's thread, which leaves what the machine granted and what the controller counted.
+    fn start_loop(&self, mut turn: Turn) -> Result<thread::JoinHandle<(Granted, Counts)>, RunError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
         let buses: Vec<Arc<Bus>> = self.lanes.iter().map(|lane| Arc::clone(&lane.bus)).collect();
         let control = move || {
             let granted = realtime::prepare();
-            let send =
-                |bus: usize, frames: &[Frame]| buses.get(bus).is_some_and(|bus| bus.send(frames).is_ok());
+            let send = |bus: usize, frames: &[Frame]| buses.get(bus).is_some_and(|bus| bus.offer(frames));
             realtime::run(&mut turn, &shared, period_ns, ticks, send);
-            granted
+            (granted, turn.counts().into_iter().filter(|(_, count)| *count > 0).collect())
         };
         let thread = thread::Builder::new().name("control".to_owned()).spawn(control);
         thread.map_err(|error| RunError::Failed(format!("cannot start the control loop: {error}")))
@@ -173,6 +160,11 @@ impl Bench<'_> {
     ) -> Result<(), RunError> {
         let options = self.options;
         self.press(script)?;
+        if self.lanes.iter().any(|lane| lane.receiver.as_ref().is_some_and(thread::JoinHandle::is_finished)) {
+            // One that lost its bus says so; one that has gone without a word must not be missed.
+            self.hear(script, progress)?;
+            return Err(RunError::Failed("a receiver ended while the loop ran".to_owned()));
+        }
         self.break_things(script, progress, started)?;
         self.hear(script, progress)?;
         let before = measured.halted();
@@ -201,13 +193,15 @@ impl Bench<'_> {
 
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
     fn press(&self, script: &mut Script) -> Result<(), RunError> {
-        let until = self.shared.broadcasts.load(Ordering::Acquire) + LEAD;
-        while script.epoch < until {
-            let (epoch, from) = (script.epoch, From::Epoch(epoch_of(script.epoch)));
-            for stimulus in script.touches.stimuli_for(epoch) {
+        let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
+        while script.epoch < broadcasts + LEAD {
+            // Epochs that have passed while this thread was away cannot be made good one by one.
+            let epoch = script.epoch.max(broadcasts);
+            let from = From::Epoch(epoch_of(epoch));
+            for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
                 self.stimulate(&stimulus, from)?;
             }
-            script.epoch += 1;
+            script.epoch = epoch + 1;
         }
         Ok(())
     }
@@ -262,14 +256,15 @@ impl Bench<'_> {
         let options = self.options;
         let name = |bus: usize| options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
         let news: Vec<_> = self.news.try_iter().collect();
+        let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
         for (bus, news) in news {
             match news {
                 News::Notice(Notice::Rival) => return Err(rival(name(bus))),
                 News::Notice(Notice::Dead(cell)) => {
-                    progress.note(&format!("cell {cell} on {} has fallen silent", name(bus)));
+                    changed.entry((bus, "fallen silent")).or_default().push(cell)
                 }
                 News::Notice(Notice::Back(cell)) => {
-                    progress.note(&format!("cell {cell} on {} speaks again", name(bus)));
+                    changed.entry((bus, "spoken again")).or_default().push(cell)
                 }
                 News::Notice(Notice::Restarted(cell)) => {
                     progress.note(&format!("cell {cell} on {} started anew", name(bus)));
@@ -290,6 +285,15 @@ impl Bench<'_> {
                 News::Up => progress.note(&format!("{} works again", name(bus))),
                 News::Lost(why) => return Err(RunError::Failed(why)),
             }
+        }
+        for ((bus, how), cells) in changed {
+            let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
+            let (first, bus) = (first.join(", "), name(bus));
+            progress.note(&match cells.len() {
+                1 => format!("cell {first} on {bus} has {how}"),
+                2..=6 => format!("cells {first} on {bus} have {how}"),
+                count => format!("{count} cells on {bus} have {how} ({first} ...)"),
+            });
         }
         for ended in self.processes.ended() {
             progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.status));
@@ -340,15 +344,15 @@ impl Bench<'_> {
         Ok(())
     }
 
-    fn processor(&self) -> Processor {
-        Processor {
+    fn spent(&self) -> Spent {
+        Spent {
             gateway: usage::own_seconds(),
-            cells: self.processes.pids().map(usage::processor_seconds).sum(),
+            cells: self.processes.pids().map(|pid| (pid, usage::processor_seconds(pid))).collect(),
             buses: self.served.iter().map(|served| usage::processor_seconds(served.pid())).sum(),
         }
     }
 
-    fn loop_summary(&self, measured: &Measured, granted: Granted) -> Loop {
+    fn loop_summary(&self, measured: &Measured, granted: Granted, controller: Counts) -> Loop {
         let count = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
         Loop {
             ticks: measured.ticks,
@@ -356,6 +360,7 @@ impl Bench<'_> {
             broadcasts: count(&self.shared.broadcasts),
             broadcasts_skipped: count(&self.shared.broadcasts_skipped),
             bad_cycles: measured.bad.clone(),
+            controller,
             late_us: Quantiles::of(&measured.late, 1e-3),
             idle_late_us: Quantiles::of(&self.idle, 1e-3),
             took_us: Quantiles::of(&measured.took, 1e-3),
@@ -393,83 +398,27 @@ fn accuracy(received: &[Option<Received>]) -> AccuracySummary {
     all.fold(Accuracy::default(), Accuracy::with).into()
 }
 
-/// A histogram that is made without a bound grows by itself; it cannot refuse.
-fn record(histogram: &mut Histogram<u64>, value: u64) {
-    let _ = histogram.record(value);
-}
-
 /// The epoch of the n-th broadcast.
 fn epoch_of(number: u64) -> Epoch {
     Epoch(number.to_le_bytes()[0])
 }
 
-impl Processor {
-    fn since(self, before: Self, seconds: f64) -> Self {
-        Self {
-            gateway: (self.gateway - before.gateway) / seconds,
-            cells: (self.cells - before.cells) / seconds,
-            buses: (self.buses - before.buses) / seconds,
-        }
-    }
+/// Processor time so far, in s.
+struct Spent {
+    gateway: f64,
+    /// Of each cell's process.
+    cells: HashMap<u32, f64>,
+    buses: f64,
 }
 
-impl Measured {
-    fn new() -> Self {
-        Self {
-            late: histogram(),
-            took: histogram(),
-            took_distributed: histogram(),
-            central: histogram(),
-            ticks: 0,
-            skipped: 0,
-            bad: BTreeMap::new(),
-            last: None,
-            first_broadcast_s: None,
+impl Spent {
+    /// What was spent since, in cores; of processes that are still there.
+    fn since(&self, before: &Self, seconds: f64) -> Processor {
+        let cell = |(pid, spent): (&u32, &f64)| spent - before.cells.get(pid).copied().unwrap_or(0.0);
+        Processor {
+            gateway: (self.gateway - before.gateway) / seconds,
+            cells: self.cells.iter().map(cell).sum::<f64>() / seconds,
+            buses: (self.buses - before.buses) / seconds,
         }
-    }
-
-    fn take(&mut self, records: &mut rtrb::Consumer<Timed>, began: Instant) {
-        while let Ok(timed) = records.pop() {
-            if self.first_broadcast_s.is_none() {
-                self.first_broadcast_s = Some(began.elapsed().as_secs_f64());
-            }
-            self.ticks += 1;
-            self.skipped += timed.record.skipped;
-            record(&mut self.late, timed.late_ns);
-            record(&mut self.took, timed.took_ns);
-            match timed.central {
-                Some((nanos, _)) => record(&mut self.central, nanos),
-                None => record(&mut self.took_distributed, timed.took_ns),
-            }
-            if let Some(bad) = timed.record.bad {
-                *self.bad.entry(bad.to_string()).or_default() += 1;
-            }
-            self.last = Some(timed);
-        }
-    }
-
-    fn halted(&self) -> Option<String> {
-        self.last?.record.halted.map(|halt| match halt {
-            Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
-            Halt::Frame => "somebody sent a halt frame".to_owned(),
-        })
-    }
-
-    fn line(&self, started: Instant, duration_us: u64, cells: usize, comparing: bool) -> String {
-        let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
-        let seconds = started.elapsed().as_secs_f64();
-        let of = Duration::from_micros(duration_us).as_secs_f64();
-        let mode = if comparing { "compare" } else { "distributed" };
-        let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
-        let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
-        format!(
-            "{seconds:5.1} of {of:.1} s  {mode:11}  {:3} of {cells} in contact, {} stale, {} dead  torque {} Nm  \
-             late p99 {:.0} us{halted}",
-            record.contributing,
-            record.stale,
-            record.dead,
-            torque.join(" "),
-            Quantiles::of(&self.late, 1e-3).p99,
-        )
     }
 }

@@ -1,0 +1,90 @@
+//! What the loop's records add up to.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use hdrhistogram::Histogram;
+
+use super::turn::Timed;
+use crate::cycle::Halt;
+use crate::summary::{Quantiles, histogram};
+
+/// What the loop's records add up to.
+#[derive(Debug)]
+pub(super) struct Measured {
+    pub(super) late: Histogram<u64>,
+    pub(super) took: Histogram<u64>,
+    pub(super) took_distributed: Histogram<u64>,
+    pub(super) central: Histogram<u64>,
+    pub(super) ticks: u64,
+    pub(super) skipped: u64,
+    pub(super) bad: BTreeMap<String, u64>,
+    last: Option<Timed>,
+    pub(super) first_broadcast_s: Option<f64>,
+}
+
+impl Measured {
+    pub(super) fn new() -> Self {
+        Self {
+            late: histogram(),
+            took: histogram(),
+            took_distributed: histogram(),
+            central: histogram(),
+            ticks: 0,
+            skipped: 0,
+            bad: BTreeMap::new(),
+            last: None,
+            first_broadcast_s: None,
+        }
+    }
+
+    pub(super) fn take(&mut self, records: &mut rtrb::Consumer<Timed>, began: Instant) {
+        while let Ok(timed) = records.pop() {
+            if self.first_broadcast_s.is_none() {
+                self.first_broadcast_s = Some(began.elapsed().as_secs_f64());
+            }
+            self.ticks += 1;
+            self.skipped += timed.record.skipped;
+            record(&mut self.late, timed.late_ns);
+            record(&mut self.took, timed.took_ns);
+            match timed.central {
+                Some((nanos, _)) => record(&mut self.central, nanos),
+                None => record(&mut self.took_distributed, timed.took_ns),
+            }
+            if let Some(bad) = timed.record.bad {
+                *self.bad.entry(bad.to_string()).or_default() += 1;
+            }
+            self.last = Some(timed);
+        }
+    }
+
+    pub(super) fn halted(&self) -> Option<String> {
+        self.last?.record.halted.map(|halt| match halt {
+            Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
+            Halt::Frame => "somebody sent a halt frame".to_owned(),
+        })
+    }
+
+    pub(super) fn line(&self, started: Instant, duration_us: u64, cells: usize, comparing: bool) -> String {
+        let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
+        let seconds = started.elapsed().as_secs_f64();
+        let of = Duration::from_micros(duration_us).as_secs_f64();
+        let mode = if comparing { "compare" } else { "distributed" };
+        let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
+        let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
+        format!(
+            "{seconds:5.1} of {of:.1} s  {mode:11}  {:3} of {cells} in contact, {} stale, {} dead  torque {} Nm  \
+             late p99 {:.0} us{halted}",
+            record.contributing,
+            record.stale,
+            record.dead,
+            torque.join(" "),
+            Quantiles::of(&self.late, 1e-3).p99,
+        )
+    }
+}
+
+/// A histogram that is made without a bound grows by itself; it cannot refuse.
+fn record(histogram: &mut Histogram<u64>, value: u64) {
+    let _ = histogram.record(value);
+}
