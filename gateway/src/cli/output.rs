@@ -2,7 +2,9 @@
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
+
+use gateway::run::file::WholeFile;
 
 use super::Failure;
 
@@ -29,13 +31,10 @@ pub(crate) fn note(text: impl Display) {
 
 /// Writes a whole file, or leaves what was there.
 pub(crate) fn write_file(path: &Path, text: &str) -> Result<(), Failure> {
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    let part = PathBuf::from(part);
-    let done = std::fs::write(&part, text).and_then(|()| std::fs::rename(&part, path));
-    done.map_err(|error| {
-        // It may not even have been made.
-        let _ = std::fs::remove_file(&part);
-        Failure::run(format!("{}: {error}", path.display()))
-    })
+    let write = || {
+        let (whole, mut file) = WholeFile::create(path)?;
+        file.write_all(text.as_bytes())?;
+        whole.finish()
+    };
+    write().map_err(|error: io::Error| Failure::run(format!("{}: {error}", path.display())))
 }

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::Write;
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -12,6 +13,7 @@ use gateway::summary::Summary;
 use protocol::bus::{BusKind, Choice};
 use protocol::skin::Skin;
 use protocol::time::Span;
+use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::{Failure, print};
 
@@ -102,12 +104,14 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        // The cells read the skin from a file.
-        let directory =
-            tempfile::tempdir().map_err(|error| Failure::run(format!("temporary directory: {error}")))?;
-        let skin_file = directory.path().join("ur5-253.toml");
-        std::fs::write(&skin_file, SKIN)
-            .map_err(|error| Failure::run(format!("{}: {error}", skin_file.display())))?;
+        // The cells read the skin from a file, which is in memory and goes with this program.
+        let in_memory = || -> std::io::Result<File> {
+            let mut file = File::from(memfd_create("ur5-253.toml", MemfdFlags::CLOEXEC)?);
+            file.write_all(SKIN.as_bytes())?;
+            Ok(file)
+        };
+        let file = in_memory().map_err(|error| Failure::run(format!("a file in memory: {error}")))?;
+        let skin_file = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;

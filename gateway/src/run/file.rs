@@ -3,17 +3,31 @@
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
 use std::io;
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 
-/// A file that has its name only when it is whole: until then it is called `NAME.part`, and a run that
-/// does not come to its end takes it away.
+use rustix::fs::{AtFlags, CWD, Mode, OFlags, linkat, open};
+
+/// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
+/// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run
+/// that does not come to its end takes it away.
 ///
 /// What is there and is no regular file (a pipe, a device, a link such as `/dev/stdout`) is written to as
 /// it is.
 #[derive(Debug)]
 pub struct WholeFile {
     path: PathBuf,
-    part: Option<PathBuf>,
+    state: State,
+}
+
+#[derive(Debug)]
+enum State {
+    /// Written to as it is, or finished.
+    Named,
+    /// Without a name, held open by this.
+    Nameless(File),
+    /// Under another name.
+    Part,
 }
 
 impl WholeFile {
@@ -22,17 +36,24 @@ impl WholeFile {
     /// # Errors
     /// When it cannot be written.
     pub fn create(path: &Path) -> io::Result<(Self, File)> {
+        let path = path.to_owned();
         if path.is_dir() {
             return Err(io::ErrorKind::IsADirectory.into());
         }
-        if fs::symlink_metadata(path).is_ok_and(|there| !there.is_file()) {
-            let file = OpenOptions::new().write(true).truncate(true).open(path)?;
-            return Ok((Self { path: path.to_owned(), part: None }, file));
+        if fs::symlink_metadata(&path).is_ok_and(|there| !there.is_file()) {
+            let file = OpenOptions::new().write(true).truncate(true).open(&path)?;
+            return Ok((Self { path, state: State::Named }, file));
         }
-        let mut part = OsString::from(path);
-        part.push(".part");
-        let file = File::create(&part)?;
-        Ok((Self { path: path.to_owned(), part: Some(part.into()) }, file))
+        let folder =
+            path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+        let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+        if let Ok(file) = open(folder, flags, Mode::from_raw_mode(0o666)).map(File::from) {
+            let state = State::Nameless(file.try_clone()?);
+            return Ok((Self { path, state }, file));
+        }
+        let whole = Self { path, state: State::Part };
+        let file = File::create(whole.part())?;
+        Ok((whole, file))
     }
 
     /// Its name, once it is whole.
@@ -46,18 +67,33 @@ impl WholeFile {
     /// # Errors
     /// When the file system refuses.
     pub fn finish(mut self) -> io::Result<()> {
-        let Some(part) = &self.part else { return Ok(()) };
-        fs::rename(part, &self.path)?;
-        self.part = None;
+        if let State::Nameless(file) = &self.state {
+            // A link never takes another file's place, so it gets a name of its own first.
+            let file = format!("/proc/self/fd/{}", file.as_raw_fd());
+            linkat(CWD, file, CWD, self.part(), AtFlags::SYMLINK_FOLLOW)?;
+            self.state = State::Part;
+        }
+        if matches!(self.state, State::Part) {
+            fs::rename(self.part(), &self.path)?;
+            self.state = State::Named;
+        }
         Ok(())
+    }
+
+    /// A name that no other program gives.
+    fn part(&self) -> PathBuf {
+        let mut name = OsString::from(".");
+        name.push(self.path.file_name().unwrap_or_default());
+        name.push(format!(".{}.part", std::process::id()));
+        self.path.with_file_name(name)
     }
 }
 
 impl Drop for WholeFile {
     fn drop(&mut self) {
-        if let Some(part) = &self.part {
+        if matches!(self.state, State::Part) {
             // Nothing more can be done.
-            let _ = fs::remove_file(part);
+            let _ = fs::remove_file(self.part());
         }
     }
 }
@@ -85,6 +121,18 @@ mod tests {
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
         assert_eq!(names(folder.path()), ["run.json"]);
         assert!(WholeFile::create(folder.path()).is_err(), "a directory is no file");
+    }
+
+    #[test]
+    fn two_that_write_to_one_name_do_not_meet() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.log");
+        let (first, mut file) = WholeFile::create(&path).unwrap();
+        assert!(names(folder.path()).is_empty(), "no name yet, or else another run could take it away");
+        drop(WholeFile::create(&path).unwrap());
+        file.write_all(b"first").unwrap();
+        first.finish().unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "first");
     }
 
     #[test]
