@@ -68,7 +68,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
     bench.hears(&format!(
-        "the robot is halted: too many bad cycles in a row: {NOBODY}; `gateway ack skin.toml`"
+        "the robot is halted: too many bad cycles in a row: {NOBODY}; `gateway ack vcan0 --bus-kind embedded`"
     ));
     // What was lost is not had again by somebody saying hello; a person has to say so.
     let second = python(&place);

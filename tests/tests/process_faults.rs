@@ -301,7 +301,7 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     guest.waits_for_motion();
     let sent = place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
-    bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack skin.toml` lets it go on");
+    bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded` lets it go on");
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     let guest = place.guest();

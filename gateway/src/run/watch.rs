@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::Bus;
+use protocol::bus::{Bus, BusKind};
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
@@ -158,7 +158,6 @@ impl Bench<'_> {
         records: &mut rtrb::Consumer<Timed>,
         started: Instant,
     ) -> Result<(), RunError> {
-        let options = self.options;
         self.press(script)?;
         if self.lanes.iter().any(|lane| lane.receiver.as_ref().is_some_and(thread::JoinHandle::is_finished)) {
             // One that lost its bus says so; one that has gone without a word must not be missed.
@@ -171,7 +170,10 @@ impl Bench<'_> {
         measured.take(records, self.began);
         match (before, measured.halted()) {
             (None, Some(why)) => {
-                let remedy = format!("`gateway ack {}` lets it go on", options.skin_file.display());
+                // One bus is enough: what is heard on it is said on the others.
+                let lane = self.lanes.first().map(|lane| (lane.bus.name(), lane.bus.kind()));
+                let (bus, kind) = lane.unwrap_or(("BUS", BusKind::SocketCan));
+                let remedy = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
                 progress.note(&format!("the robot is halted: {why}; {remedy}"));
             }
             (Some(_), None) => progress.note("the robot goes on"),
