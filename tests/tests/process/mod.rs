@@ -284,6 +284,16 @@ impl Guest {
     }
 }
 
+/// Whether a bench has said of a cell, alone or with others, that it has done something.
+pub(crate) fn tells(text: &str, cell: u8, what: &str) -> bool {
+    let names = |line: &str| {
+        let cells = line.strip_prefix("cell ").or_else(|| line.strip_prefix("cells "))?;
+        let (cells, rest) = cells.split_once(" on vcan0 ha")?;
+        rest.ends_with(what).then(|| cells.split(", ").any(|name| name == cell.to_string()))
+    };
+    text.lines().any(|line| names(line) == Some(true))
+}
+
 /// A process whose words are taken as they come; it ends with the test.
 pub(crate) struct Running {
     child: Child,
@@ -345,6 +355,11 @@ impl Running {
     /// Waits until it has said something on standard error.
     pub(crate) fn hears(&self, words: &str) {
         self.err.wait_for(words);
+    }
+
+    /// Waits until a bench has said of a cell that it has done something.
+    pub(crate) fn tells(&self, cell: u8, what: &str) {
+        self.err.wait_until(what, |text| tells(text, cell, what));
     }
 
     /// Waits until a bench's loop runs: then come the lines that say how it goes.
@@ -477,6 +492,20 @@ impl Summary {
     /// The sum of a table of counts.
     pub(crate) fn total(&self, table: &str) -> u64 {
         self.0.pointer(table).unwrap().as_object().unwrap().values().map(|it| it.as_u64().unwrap()).sum()
+    }
+
+    /// What was odd on a bus, without torques that came too late: those tell of the machine.
+    pub(crate) fn odd(&self, bus: usize) -> u64 {
+        let table = format!("/buses/{bus}/events");
+        self.total(&table) - self.count(&table, "stale torque")
+    }
+
+    /// Sees that so many cells owed an answer to every broadcast, unless a machine that was away took some
+    /// for dead.
+    pub(crate) fn all_were_due(&self, cells: u64, stderr: &str) {
+        let (due, all) = (self.of_bus("/replies/due"), cells * self.number("/loop/broadcasts"));
+        let away = stderr.contains("fallen silent");
+        assert!(due == all || (away && due < all && due > 0), "{due} of {all} due: {:#}", self.0);
     }
 
     /// The cells of the first bus that were silent at the end.
