@@ -138,6 +138,11 @@ impl Cycle {
         }
     }
 
+    /// Begins after this epoch: cells that were there before would take its joints for repeated ones.
+    pub const fn start_after(&mut self, epoch: Epoch) {
+        self.epoch = epoch;
+    }
+
     /// Joint positions in rad.
     #[must_use]
     pub fn positions(&self) -> [f64; WORDS] {

@@ -69,6 +69,8 @@ pub struct CellView {
     pub unconfigured: bool,
     /// Whether its configuration is not the skin's.
     pub other: bool,
+    /// The joints that it had taken last.
+    pub last_joints: Epoch,
     /// What it has said since it was asked.
     pub said: Said,
 }
@@ -198,6 +200,7 @@ impl Receiver {
                 halted: ready && !cell.is_ready(),
                 unconfigured: settled.is_some() && !ready,
                 other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+                last_joints: cell.last_joints,
                 said: cell.said(),
             }
         });

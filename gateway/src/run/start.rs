@@ -66,6 +66,8 @@ pub(super) struct Bench<'a> {
     pub(super) news: Inlet<(usize, News)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
+    /// The epoch of the first broadcast.
+    pub(super) first_epoch: Epoch,
     pub(super) log: Option<Log>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
@@ -108,8 +110,22 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         lines.push(line);
     }
     let processes = Processes::default();
-    let mut bench =
-        Bench { options, began, idle, shared, lanes, lines, news, signalled, cycle, log, processes, served };
+    let first_epoch = Epoch(0);
+    let mut bench = Bench {
+        options,
+        began,
+        idle,
+        shared,
+        lanes,
+        lines,
+        news,
+        signalled,
+        cycle,
+        first_epoch,
+        log,
+        processes,
+        served,
+    };
     if let Err(error) = bench.begin() {
         bench.stop_receivers();
         return Err(error);
@@ -259,6 +275,7 @@ impl Bench<'_> {
         }
         self.judge_start()?;
         self.wake_up()?;
+        self.go_on_after_others();
         // What they have counted and feel.
         self.say(&Message::Report)
     }
@@ -294,6 +311,20 @@ impl Bench<'_> {
         Err(RunError::Failed(format!(
             "cells are on the bus already: {there}; use them with --no-spawn, or stop them"
         )))
+    }
+
+    /// Cells that were there before have heard another gateway: its epochs go on.
+    fn go_on_after_others(&mut self) {
+        if self.options.spawn {
+            return;
+        }
+        let last =
+            |_: &str, view: &View| view.cells.iter().find(|cell| cell.ready).map(|cell| cell.last_joints);
+        let last = self.each_view(last).into_iter().flatten().next().unwrap_or_default();
+        self.first_epoch = last.next();
+        if let Some(cycle) = &mut self.cycle {
+            cycle.start_after(last);
+        }
     }
 
     fn judge_start(&self) -> Result<(), RunError> {

@@ -11,7 +11,6 @@ use protocol::bus::{Bus, BusKind};
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
-use protocol::packet::Epoch;
 use protocol::time::Micros;
 
 use super::measured::Measured;
@@ -199,7 +198,7 @@ impl Bench<'_> {
         while script.epoch < broadcasts + LEAD {
             // Epochs that have passed while this thread was away cannot be made good one by one.
             let epoch = script.epoch.max(broadcasts);
-            let from = From::Epoch(epoch_of(epoch));
+            let from = From::Epoch(self.first_epoch.plus(epoch.to_le_bytes()[0]));
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
                 self.stimulate(&stimulus, from)?;
             }
@@ -398,11 +397,6 @@ impl Bench<'_> {
 fn accuracy(received: &[Option<Received>]) -> AccuracySummary {
     let all = received.iter().flatten().map(|received| *received.table.accuracy());
     all.fold(Accuracy::default(), Accuracy::with).into()
-}
-
-/// The epoch of the n-th broadcast.
-fn epoch_of(number: u64) -> Epoch {
-    Epoch(number.to_le_bytes()[0])
 }
 
 /// Processor time so far, in s.

@@ -92,6 +92,8 @@ pub struct Cell {
     pub(super) joint: usize,
     /// The hash that its configuration must have.
     pub configuration: u16,
+    /// The joints that it had taken last when it said so.
+    pub last_joints: Epoch,
     /// Its last heartbeat.
     pub heartbeat: Option<Heartbeat>,
     /// The last page of what it heard, and the first one since it started or we did.
@@ -107,6 +109,8 @@ pub struct Cell {
     pub(super) felt: Felt,
     /// By its last heartbeat, or a command that the bus carried since.
     halted: bool,
+    /// Whether the bus carried a halt or a resume since its last heartbeat.
+    commanded: bool,
     last_word: Option<Micros>,
     dead: bool,
     /// The number of the last broadcast that it answered.
@@ -128,6 +132,7 @@ impl Cell {
             node: described.node,
             joint: described.joint.into(),
             configuration: parameters.hash(),
+            last_joints: Epoch(0),
             heartbeat: None,
             heard: None,
             refused: None,
@@ -136,6 +141,7 @@ impl Cell {
             said: Said::default(),
             felt: Felt::default(),
             halted: false,
+            commanded: false,
             last_word: None,
             dead: false,
             answered: None,
@@ -189,7 +195,11 @@ impl Cell {
             Speaker::Known | Speaker::Anew => {
                 self.uplink.settle(heartbeat.sent, speaker == Speaker::Anew);
                 self.heartbeat = Some(*heartbeat);
-                self.halted = heartbeat.state.has(State::HALTED);
+                // The first one after a halt or a resume may have been said before it.
+                let old = core::mem::take(&mut self.commanded) && speaker == Speaker::Known;
+                if !old {
+                    self.halted = heartbeat.state.has(State::HALTED);
+                }
             }
         }
         if speaker == Speaker::Anew || is_first(heartbeat) {
@@ -318,13 +328,13 @@ impl Cell {
 
     /// The bus carried a halt: it stops answering.
     pub(super) fn halt(&mut self) -> Change {
-        self.halted = true;
+        (self.halted, self.commanded) = (true, true);
         self.let_go()
     }
 
     /// The bus carried a resume: it answers the next broadcast.
     pub(super) const fn resume(&mut self) {
-        self.halted = false;
+        (self.halted, self.commanded) = (false, true);
     }
 
     fn contribute(&mut self, words: [i32; WORDS]) -> Change {
@@ -412,4 +422,32 @@ pub(super) fn to_nm(steps: i64) -> f64 {
 /// A word of Q3.12 in Nm.
 pub(super) fn word_to_nm(word: i32) -> f64 {
     f64::from(word) / 4_096.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_heartbeat_that_was_said_before_a_halt_does_not_end_it() {
+        let skin = crate::testing::skin();
+        let described = skin.cells.first().unwrap();
+        let mut cell = Cell::new(described, &skin.parameters(described));
+        let says = |cell: &mut Cell, sent, state: State| {
+            cell.hear(Micros(0));
+            cell.take_heartbeat(Speaker::Known, &Heartbeat { sent, state, ..Heartbeat::default() });
+        };
+        says(&mut cell, 1, State::CONFIGURED);
+        assert!(cell.is_ready());
+        cell.halt();
+        says(&mut cell, 2, State::CONFIGURED);
+        assert!(!cell.is_ready(), "an old word");
+        says(&mut cell, 3, State::CONFIGURED);
+        assert!(cell.is_ready(), "it has not heard the halt");
+        cell.resume();
+        says(&mut cell, 4, State::CONFIGURED.with(State::HALTED, true));
+        assert!(cell.is_ready(), "an old word again");
+        says(&mut cell, 5, State::CONFIGURED.with(State::HALTED, true));
+        assert!(!cell.is_ready(), "it has not heard the resume");
+    }
 }

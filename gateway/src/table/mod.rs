@@ -334,7 +334,8 @@ impl Table {
         }
         cell.uplink.arrive();
         match *message {
-            Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+            Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                cell.last_joints = epoch;
                 self.take_heartbeat(place, &heartbeat)
             }
             Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
