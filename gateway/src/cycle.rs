@@ -117,12 +117,11 @@ impl Cycle {
     /// A loop that has not begun; the first epoch will be 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
-        let part = |bus| Skin { cells: skin.cells_of(bus).cloned().collect(), ..skin.clone() };
         let in_use = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
         Self {
             controller,
             robot,
-            central: (0..skin.buses.len()).map(|bus| Central::new(&part(bus))).collect(),
+            central: (0..skin.buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
             joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use },
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),

@@ -68,7 +68,7 @@ impl Bench<'_> {
 
     fn drive(&mut self) -> Result<Summary, RunError> {
         let options = self.options;
-        let (records, inlet) = Self::records();
+        let (records, mut inlet) = Self::records();
         let turn = Turn::new(
             self.cycle.take().expect("the loop begins once"),
             std::mem::take(&mut self.lines),
@@ -85,7 +85,6 @@ impl Bench<'_> {
         let control = self.start_loop(turn)?;
         let mut progress = Progress::new(options.quiet);
         let mut measured = Measured::new();
-        let mut inlet = inlet;
         let mut failure = None;
         let mut interrupted = false;
         while !control.is_finished() {
@@ -113,7 +112,6 @@ impl Bench<'_> {
         let processor = self.spent().since(&before, duration_s);
         let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
         self.last_words(interrupted)?;
-        self.write_log()?;
         let received = self.stop_receivers();
         let recording = self.finish_log(&received)?;
         Ok(Summary {

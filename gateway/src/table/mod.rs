@@ -140,7 +140,7 @@ impl Table {
     /// Nothing heard yet on one of a skin's buses.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
-        let part = Skin { cells: skin.cells_of(bus).cloned().collect(), ..skin.clone() };
+        let part = skin.part_on(bus);
         let mut places = [None; CellId::COUNT];
         let mut cells = Vec::with_capacity(part.cells.len());
         for described in &part.cells {

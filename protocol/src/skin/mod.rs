@@ -227,6 +227,12 @@ impl Skin {
         self.cells.iter().filter(move |cell| cell.bus == bus)
     }
 
+    /// The same skin with the cells of one bus only.
+    #[must_use]
+    pub fn part_on(&self, bus: usize) -> Self {
+        Self { cells: self.cells_of(bus).cloned().collect(), ..self.clone() }
+    }
+
     /// The bus of this name, as an index into [`Skin::buses`].
     #[must_use]
     pub fn bus_named(&self, name: &str) -> Option<usize> {
