@@ -215,9 +215,31 @@ fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
                 "classic" => Format::Classic,
                 got => return Err(Fault::new(&at("format"), format!("{got:?}"), "\"fd\" or \"classic\"")),
             };
-            Ok(Bus { name: bus.name.clone(), reply, format })
+            let (bitrate, data_bitrate) = bit_rates(index, bus, format)?;
+            Ok(Bus { name: bus.name.clone(), reply, format, bitrate, data_bitrate })
         })
         .collect()
+}
+
+/// The bit rates of hardware, which need not be said.
+fn bit_rates(index: usize, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
+    let at = |key| [Key("bus"), Index(index), Key(key)];
+    let within = |key, got: i64, least: u32, greatest: u32| match u32::try_from(got) {
+        Ok(rate) if (least..=greatest).contains(&rate) => Ok(rate),
+        _ => Err(Fault::new(&at(key), got, format_args!("{least} to {greatest} bit/s are possible"))),
+    };
+    let bitrate = bus.bitrate.map(|got| within("bitrate", got, 10_000, 1_000_000)).transpose()?;
+    let data_bitrate = match (bus.data_bitrate, format, bitrate) {
+        (None, _, _) => None,
+        (Some(got), Format::Classic, _) => {
+            return Err(Fault::new(&at("data_bitrate"), got, "only with format = \"fd\""));
+        }
+        (Some(got), Format::Fd, None) => {
+            return Err(Fault::new(&at("data_bitrate"), got, "only together with bitrate"));
+        }
+        (Some(got), Format::Fd, Some(least)) => Some(within("data_bitrate", got, least, 8_000_000)?),
+    };
+    Ok((bitrate, data_bitrate))
 }
 
 fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {

@@ -102,6 +102,10 @@ pub struct Bus {
     pub reply: Reply,
     /// One FD frame a packet, or two classic ones.
     pub format: Format,
+    /// Bits in a second, of hardware; of an FD frame's head and tail.
+    pub bitrate: Option<u32>,
+    /// Bits in a second of an FD frame's data, of hardware.
+    pub data_bitrate: Option<u32>,
 }
 
 /// What turns torques into motion.

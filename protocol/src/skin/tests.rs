@@ -137,6 +137,40 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
 }
 
 #[test]
+fn bit_rates_are_optional_and_checked() {
+    let format = "format = \"fd\"";
+    assert_eq!(Skin::parse("skin.toml", GOOD).unwrap().buses[0].bitrate, None);
+    let with = |lines: &str| GOOD.replacen(format, &format!("{format}\n{lines}"), 1);
+    let rates = |lines: &str| {
+        let skin = Skin::parse("skin.toml", &with(lines)).unwrap();
+        (skin.buses[0].bitrate, skin.buses[0].data_bitrate)
+    };
+    assert_eq!(rates("bitrate = 10000"), (Some(10_000), None));
+    let fastest = "bitrate = 1000000\ndata_bitrate = 8_000_000";
+    assert_eq!(rates(fastest), (Some(1_000_000), Some(8_000_000)));
+    assert_eq!(rates("bitrate = 500000\ndata_bitrate = 500000"), (Some(500_000), Some(500_000)));
+
+    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    let range = "10000 to 1000000 bit/s are possible";
+    assert_eq!(fault("bitrate = 9999"), format!("skin.toml:23: bus[0].bitrate = 9999: {range}"));
+    assert_eq!(fault("bitrate = 1000001"), format!("skin.toml:23: bus[0].bitrate = 1000001: {range}"));
+    assert_eq!(fault("bitrate = -1"), format!("skin.toml:23: bus[0].bitrate = -1: {range}"));
+    assert_eq!(
+        fault("bitrate = 500000\ndata_bitrate = 499999"),
+        "skin.toml:24: bus[0].data_bitrate = 499999: 500000 to 8000000 bit/s are possible"
+    );
+    assert_eq!(
+        fault("data_bitrate = 5000000"),
+        "skin.toml:23: bus[0].data_bitrate = 5000000: only together with bitrate"
+    );
+    let classic = with("bitrate = 500000\ndata_bitrate = 500000").replace(format, "format = \"classic\"");
+    assert_eq!(
+        Skin::parse("skin.toml", &classic).unwrap_err().to_string(),
+        "skin.toml:24: bus[0].data_bitrate = 500000: only with format = \"fd\""
+    );
+}
+
+#[test]
 fn a_broken_file_says_where_in_one_line() {
     let error = says("version = 1", "version = = 1");
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
