@@ -27,7 +27,11 @@ impl Log {
             Ok(Line::Frame(record)) => record.frame,
             other => panic!("{line}: {other:?}"),
         };
-        let frames: Vec<Frame> = text.lines().map(frame).collect();
+        Self::of(text.lines().map(frame).collect(), format)
+    }
+
+    /// Reads frames of one bus.
+    pub(crate) fn of(frames: Vec<Frame>, format: Format) -> Self {
         let mut halves = BTreeMap::new();
         let packet = |frame: &Frame| match format {
             Format::Fd => Packet::from_fd(frame).ok(),

@@ -1,4 +1,4 @@
-//! A bench of real processes on an embedded bus of its own: what all tests of this kind share.
+//! A bench of real processes on a bus of its own, embedded or a real kernel's: what all tests of this kind share.
 //!
 //! Nothing here waits for a time to pass: what is waited for is looked at until it is so, or until
 //! [`PATIENCE`] is over, which a slow machine never needs and a hanging program does.
@@ -12,6 +12,7 @@
 )]
 
 pub(crate) mod log;
+pub(crate) mod vcan;
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -88,11 +89,19 @@ pub(crate) fn example(name: &str) -> PathBuf {
 /// A directory of its own for a test, and in it its embedded buses.
 pub(crate) struct Place {
     directory: TempDir,
+    /// What its benches run on.
+    kind: BusKind,
 }
 
 impl Place {
     pub(crate) fn new() -> Self {
-        Self { directory: TempDir::new().unwrap() }
+        Self { directory: TempDir::new().unwrap(), kind: BusKind::Embedded }
+    }
+
+    /// One whose benches run on `vcan0` of a network that is the test's own.
+    pub(crate) fn on_vcan() -> Self {
+        vcan::needs("vcan0");
+        Self { kind: BusKind::SocketCan, ..Self::new() }
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
@@ -152,8 +161,9 @@ impl Place {
         self.start(
             "gateway",
             &format!(
-                "run skin.toml --bus-kind embedded --scenario scenario.toml --duration {seconds} \
-                 --candump run.log --summary run.json {more}"
+                "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
+                 --candump run.log --summary run.json {more}",
+                self.kind
             ),
         )
     }
@@ -173,7 +183,7 @@ impl Place {
     /// Another client of its bus.
     pub(crate) fn guest(&self) -> Guest {
         let options = Options { directory: Some(self.buses()), ..Options::default() };
-        let open = || Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).ok();
+        let open = || Bus::open("vcan0", Choice::Only(self.kind), &options).ok();
         Guest(until("the bus", open))
     }
 
