@@ -31,6 +31,9 @@ pub struct Summary {
     pub control: Loop,
     /// Distributed against central torques.
     pub accuracy: AccuracySummary,
+    /// Packets of the whole machine, any interface's, that the kernel dropped before they came to a socket,
+    /// because a processor's backlog was full; none where it does not say.
+    pub backlog_dropped: Option<u64>,
     /// Each bus.
     pub buses: Vec<BusSummary>,
     /// Processor time while the loop ran, in cores.
@@ -173,7 +176,7 @@ pub struct Recording {
     pub lost: u64,
 }
 
-/// Packets from the cells: sent = delivered + rejected + lost, and lost = dropped + unknown.
+/// Packets from the cells: sent = delivered + rejected + lost, and lost = dropped + backlog + unknown.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct UplinkSummary {
     /// Sent, by the cells' own count, as of their last heartbeats.
@@ -184,6 +187,8 @@ pub struct UplinkSummary {
     pub rejected: u64,
     /// Sent and not arrived, because the bus dropped frames that we did not take in time.
     pub dropped: u64,
+    /// Sent and not arrived, as far as drops of the kernel's backlog explain it.
+    pub backlog: u64,
     /// Sent and not arrived, and nobody knows why.
     pub unknown: u64,
     /// Arrived more often than sent.
@@ -195,6 +200,16 @@ pub struct UplinkSummary {
     pub unsettled: u64,
     /// Cells that started anew.
     pub restarts: u32,
+}
+
+impl UplinkSummary {
+    /// Takes what is unknown for drops of the kernel's backlog, at most so many; how many it took.
+    pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
+        let explained = self.unknown.min(at_most);
+        self.unknown -= explained;
+        self.backlog += explained;
+        explained
+    }
 }
 
 /// Replies: due = in time + late + missing; missing = too late + skipped + not heard + lost + in doubt + unknown.
@@ -310,6 +325,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         delivered: total.delivered,
         rejected: total.rejected,
         dropped,
+        backlog: 0,
         unknown: total.lost - dropped,
         surplus: total.surplus,
         in_doubt: total.in_doubt,

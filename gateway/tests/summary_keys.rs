@@ -54,6 +54,7 @@ fn summary(bus: BusSummary) -> Summary {
             unsent: 0,
         },
         accuracy: AccuracySummary::from(Accuracy::default()),
+        backlog_dropped: Some(0),
         buses: vec![bus],
         processor: Processor::default(),
         cell_private_kib: Some(768),

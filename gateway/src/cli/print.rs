@@ -138,10 +138,11 @@ fn explained(reasons: &[(u64, &str)], unknown: u64) -> String {
 
 fn frames(rows: &mut Rows, bus: &BusSummary) {
     let up = &bus.uplink;
-    let lost = up.dropped + up.unknown;
+    let lost = up.dropped + up.backlog + up.unknown;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.row("  lost", lost, explained(&[(up.dropped, "dropped by the bus")], up.unknown));
+    let reasons = [(up.dropped, "dropped by the bus"), (up.backlog, "by the kernel's backlog")];
+    rows.row("  lost", lost, explained(&reasons, up.unknown));
     for (name, count) in
         [("surplus", up.surplus), ("in doubt", up.in_doubt), ("after the last heartbeat", up.unsettled)]
     {

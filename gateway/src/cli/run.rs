@@ -21,6 +21,9 @@ use super::{Failure, print};
 const SKIN: &str = include_str!("../../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../../examples/demo.toml");
 
+/// Bytes for frames that wait: all cells may answer a report at once.
+const RECEIVE_BUFFER: u32 = 8 << 20;
+
 /// How long a run without a scenario takes, unless it is told.
 const IDLE: Span = Span::from_millis(10_000);
 
@@ -90,6 +93,10 @@ pub(crate) struct Run {
     /// Start no cells: they are on the bus already, or are real
     #[arg(long)]
     no_spawn: bool,
+    /// Ask for so many bytes for frames that wait unread in the gateway's socket of each bus, about 1 KiB a
+    /// frame; the kernel grants the double, or less to those who may not have it
+    #[arg(long, value_name = "BYTES", default_value_t = RECEIVE_BUFFER, value_parser = clap::value_parser!(u32).range(..=1 << 30))]
+    receive_buffer: u32,
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
@@ -134,6 +141,7 @@ impl Run {
         options.candump = self.candump;
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
+        options.receive_buffer = self.receive_buffer as usize;
         bench(&options, self.common.summary.as_deref())
     }
 }
@@ -154,6 +162,7 @@ impl Common {
             flash: None,
             cell_node: self.cell_node.clone(),
             vcan_setup: self.vcan_setup.clone(),
+            receive_buffer: RECEIVE_BUFFER as usize,
             candump: None,
             quiet: self.quiet,
         }

@@ -11,6 +11,7 @@
 //!       └─ progress line, log file, summary
 //! ```
 
+mod backlog;
 pub mod file;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
@@ -56,6 +57,8 @@ pub struct Options {
     pub cell_node: Option<PathBuf>,
     /// The embedded bus' program, when it is not beside this one.
     pub vcan_setup: Option<PathBuf>,
+    /// Bytes that may wait in the gateway's socket of a bus, as the kernel counts them: about 1 KiB a frame.
+    pub receive_buffer: usize,
     /// Where frames are written as candump text, if they are.
     pub candump: Option<PathBuf>,
     /// Whether progress is shown.

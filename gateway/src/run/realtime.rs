@@ -14,8 +14,10 @@ use super::turn::{Shared, Turn};
 use crate::cycle::Tick;
 use crate::summary::histogram;
 
-/// The priority asked for: above ordinary threads, below the kernel's own.
+/// The loop's priority: above ordinary threads, below the kernel's own.
 const PRIORITY: i32 = 40;
+/// A receiver's: simulated cells that share its processor must not keep it from reading what they send.
+const RECEIVER_PRIORITY: i32 = 30;
 
 /// What the machine granted.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -35,6 +37,11 @@ pub fn prepare() -> Granted {
     };
     super::io::set_timer_slack(1);
     granted
+}
+
+/// The same for a receiver's thread, which may be a little late.
+pub(super) fn prepare_receiver() {
+    super::io::set_fifo(RECEIVER_PRIORITY);
 }
 
 /// The monotonic clock in ns.

@@ -117,6 +117,7 @@ impl Receiver {
     /// Receives until someone says stop or the bus is gone.
     #[must_use]
     pub fn run(mut self) -> Received {
+        super::realtime::prepare_receiver();
         let mut inbox = Inbox::new();
         let mut unrecorded = 0;
         let mut looked = Instant::now();

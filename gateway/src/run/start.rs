@@ -20,7 +20,7 @@ use super::log::Log;
 use super::progress::say;
 use super::receiver::{Captured, CellView, News, Received, Receiver, View};
 use super::turn::{Line, Shared, Timed};
-use super::{Options, RunError, realtime};
+use super::{Options, RunError, backlog, realtime};
 use crate::controller;
 use crate::cycle::Cycle;
 use crate::robot::SimulatedArm;
@@ -28,10 +28,10 @@ use crate::scenario::FaultKind;
 use crate::summary::histogram;
 use crate::table::{Notice, Table};
 
-/// Bytes asked for the gateway's socket: all cells may answer a report at once.
-const RECEIVE_BUFFER: usize = 8 << 20;
 /// How long the loop's own sends may wait for a bus.
 const SEND_PATIENCE: Duration = Duration::from_millis(1);
+/// Said when a receive buffer is smaller than it should be.
+const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 /// Two gateways on one bus notice each other in this time.
 const LISTEN: Duration = Duration::from_millis(500);
 /// Cells that make no progress for so long are given up.
@@ -60,6 +60,8 @@ pub(super) struct Bench<'a> {
     pub(super) options: &'a Options,
     pub(super) began: Instant,
     pub(super) idle: Histogram<u64>,
+    /// What the kernel's backlog had dropped before the first bus was opened.
+    pub(super) backlog_dropped: Option<u64>,
     pub(super) shared: Arc<Shared>,
     pub(super) lanes: Vec<Lane>,
     pub(super) lines: Vec<Line>,
@@ -90,6 +92,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     // An external controller can find its socket from now on, so that it is there when the loop begins.
     let cycle = Some(cycle(options)?);
     let idle = idle_lateness(options.skin.timing.tick_nanos());
+    let backlog_dropped = backlog::dropped();
     let mut served = Vec::new();
     let mut buses = Vec::new();
     for described in &options.skin.buses {
@@ -97,7 +100,8 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         if !options.quiet {
             let kib = bus.receive_buffer() / 1_024;
             let (name, kind) = (&described.name, bus.kind());
-            say(&format!("{name} is {kind}, with a receive buffer of {kib} KiB"));
+            let less = if bus.receive_buffer() < options.receive_buffer { LIMITED } else { "" };
+            say(&format!("{name} is {kind}, with a receive buffer of {kib} KiB{less}"));
         }
         buses.push(Arc::new(bus));
     }
@@ -115,6 +119,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         options,
         began,
         idle,
+        backlog_dropped,
         shared,
         lanes,
         lines,
@@ -187,7 +192,7 @@ fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bu
         filters: vec![Filter::ALL],
         own_frames: true,
         error_mask: u32::MAX,
-        receive_buffer: RECEIVE_BUFFER,
+        receive_buffer: options.receive_buffer,
         send_patience: SEND_PATIENCE,
         ..BusOptions::default()
     };

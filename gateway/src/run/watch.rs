@@ -19,7 +19,7 @@ use super::realtime::{self, Granted};
 use super::receiver::{News, Received};
 use super::start::{Bench, rival};
 use super::turn::{Timed, Turn};
-use super::{RunError, usage};
+use super::{RunError, backlog, usage};
 use crate::scenario::{FaultKind, Stimulus, Touches};
 use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Recording, Summary};
 use crate::table::{Accuracy, Notice};
@@ -113,6 +113,8 @@ impl Bench<'_> {
         let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
         self.last_words(interrupted)?;
         let received = self.stop_receivers();
+        let backlog_dropped =
+            backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
         let recording = self.finish_log(&received)?;
         Ok(Summary {
             skin: options.skin.name.clone(),
@@ -123,7 +125,8 @@ impl Bench<'_> {
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
             control: self.loop_summary(&measured, granted, controller),
             accuracy: accuracy(&received),
-            buses: self.bus_summaries(&received),
+            backlog_dropped,
+            buses: self.bus_summaries(&received, backlog_dropped),
             processor,
             cell_private_kib,
             recording,
@@ -372,7 +375,7 @@ impl Bench<'_> {
         }
     }
 
-    fn bus_summaries(&self, received: &[Option<Received>]) -> Vec<BusSummary> {
+    fn bus_summaries(&self, received: &[Option<Received>], backlog_dropped: Option<u64>) -> Vec<BusSummary> {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
         let pairs = self.lanes.iter().zip(received);
@@ -388,7 +391,13 @@ impl Bench<'_> {
                 now,
             ))
         };
-        pairs.filter_map(summary).collect()
+        let mut summaries: Vec<_> = pairs.filter_map(summary).collect();
+        // Nobody knows of which bus they were, but of the kernel's own.
+        let mut backlog = backlog_dropped.unwrap_or(0);
+        for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
+            backlog -= summary.uplink.explain_by_backlog(backlog);
+        }
+        summaries
     }
 }
 

@@ -534,7 +534,7 @@ impl Summary {
             let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
             assert_eq!(replies, of("/replies/due"), "{:#}", self.0);
             let arrived = of("/uplink/delivered") + of("/uplink/rejected");
-            let lost = of("/uplink/dropped") + of("/uplink/unknown");
+            let lost = of("/uplink/dropped") + of("/uplink/backlog") + of("/uplink/unknown");
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);
         }

@@ -1,0 +1,32 @@
+//! Frames that the kernel drops between a sender and the sockets, while it tells the sender that they were sent:
+//! when a processor's queue of arrived packets is full (`net.core.netdev_max_backlog`).
+//!
+//! The kernel counts them for the whole machine, any network and any interface, not for a bus.
+
+use std::fs;
+
+/// How many packets the machine has dropped so; nothing where the kernel does not say.
+pub(super) fn dropped() -> Option<u64> {
+    read(&fs::read_to_string("/proc/net/softnet_stat").ok()?)
+}
+
+/// The sum over processors of the second column, hexadecimal, each modulo 2^32.
+fn read(text: &str) -> Option<u64> {
+    text.lines().map(|line| u64::from_str_radix(line.split_whitespace().nth(1)?, 16).ok()).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn drops_are_summed_over_the_processors() {
+        let text = "\
+0000fc3b 0000000a 00000012 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000000
+00012a07 00000010 0000000b 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000000 00000001
+";
+        assert_eq!(read(text), Some(26));
+        assert_eq!(read("0000fc3b\n"), None);
+        assert_eq!(read("0000fc3b x\n"), None);
+    }
+}
