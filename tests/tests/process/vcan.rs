@@ -3,14 +3,20 @@
 //! `tests/vcan` runs the programs that need it: each alone in a network of its own, where `vcan0` is there with
 //! MTU 72 and up, and nobody else's interfaces are.
 
+use std::cell::RefCell;
+use std::collections::BTreeSet;
 use std::fs::{self, File};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
+use gateway::generate::{Wanted, generate};
 use protocol::can::Frame;
-use protocol::candump::{Line, parse};
+use protocol::candump::{Line, parse, parse_frame};
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, State};
 
-use super::until;
+use super::{Guest, Place, until};
 
 /// Sees that an interface is there and that it is nobody else's.
 pub(crate) fn needs(interface: &str) {
@@ -43,6 +49,92 @@ fn missing(words: &str, error: &std::io::Error) -> ! {
     panic!("{words}: {error}; install can-utils, iproute2 and util-linux")
 }
 
+/// An interface of a test's own, beside `vcan0`; what the kernel routes to and from it goes with it.
+pub(crate) struct Vcan(&'static str);
+
+impl Vcan {
+    pub(crate) fn make(name: &'static str) -> Self {
+        tool(&format!("ip link add {name} type vcan"));
+        tool(&format!("ip link set {name} mtu 72 up"));
+        Self(name)
+    }
+}
+
+impl Drop for Vcan {
+    fn drop(&mut self) {
+        let _ = command(&format!("ip link del {}", self.0)).status();
+    }
+}
+
+/// Frames that the kernel has dropped on their way from senders to sockets, of any interface: the second
+/// column, in hexadecimal, of a line for each processor.
+pub(crate) fn backlog_drops() -> u64 {
+    let text = fs::read_to_string("/proc/net/softnet_stat").unwrap();
+    text.lines().map(|line| u64::from_str_radix(line.split(' ').nth(1).unwrap(), 16).unwrap()).sum()
+}
+
+/// A skin of a few cells at a rate that an emulated machine keeps up.
+pub(crate) fn small_skin(cells: usize) -> String {
+    generate(&Wanted { cells, broadcast_hz: 20.0, ..Wanted::default() }).unwrap()
+}
+
+/// `cansend vcan0 $(gateway frame ...)`, as a person would.
+pub(crate) fn cansend(place: &Place, frame: &str) {
+    let printed = place.start("gateway", &format!("frame {frame}")).end().well().stdout;
+    for line in printed.lines() {
+        tool(&format!("cansend vcan0 {line}"));
+    }
+}
+
+impl Guest {
+    /// Waits until the cells 1 to so many have said that they have their numbers and parameters.
+    pub(crate) fn waits_for_settled_cells(&self, cells: usize) {
+        let settled = RefCell::new(BTreeSet::new());
+        self.waits_for("cells that have their numbers", |message| {
+            if let Message::Network {
+                from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), ..
+            } = message
+                && heartbeat.state.has(State::CONFIGURED)
+                && !heartbeat.state.has(State::CLAIMING)
+            {
+                settled.borrow_mut().insert(cell.get());
+            }
+            settled.borrow().len() == cells
+        });
+    }
+}
+
+/// `vcan0`, which is as it should be again when this is dropped, however a test ends.
+pub(crate) struct Vcan0;
+
+impl Vcan0 {
+    pub(crate) fn down(&self) {
+        tool("ip link set vcan0 down");
+    }
+
+    pub(crate) fn up(&self) {
+        tool("ip link set vcan0 up");
+    }
+
+    /// Lets it take no frame at all: a transmit queue without room, as a real controller's is when nobody
+    /// acknowledges. Senders are told ENOBUFS.
+    pub(crate) fn fill(&self) {
+        tool("tc qdisc add dev vcan0 root pfifo limit 0");
+    }
+
+    pub(crate) fn empty(&self) {
+        tool("tc qdisc del dev vcan0 root");
+    }
+}
+
+impl Drop for Vcan0 {
+    fn drop(&mut self) {
+        // There may be none.
+        let _ = command("tc qdisc del dev vcan0 root").stderr(Stdio::null()).status();
+        let _ = command("ip link set vcan0 mtu 72 up").status();
+    }
+}
+
 /// Another program that runs beside a test, and ends with it.
 pub(crate) struct Beside(pub(crate) Child);
 
@@ -67,37 +159,52 @@ pub(crate) struct Candump {
     child: Beside,
     bus: String,
     log: PathBuf,
+    marks: u32,
 }
 
 impl Candump {
     /// When this returns, it listens.
     pub(crate) fn start(bus: &str, log: &Path) -> Self {
         // -d: what its socket drops is a line of the log, which no test that counts frames lets pass.
-        let words = format!("chrt --idle 0 candump -L -d -r 16000000 {bus}");
+        // The two filters let pass every frame, and every error frame, which are else left out.
+        let words = format!("chrt --idle 0 candump -L -d -r 16000000 {bus},0:0,#FFFFFFFF");
         let mut command = command(&words);
         command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
         let child = Beside(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
         let lists = format!("/proc/{}/net/can/rcvlist_all", child.0.id());
         let listens = || fs::read_to_string(&lists).is_ok_and(|list| list.contains(bus)).then_some(());
         until("candump's socket", listens);
-        Self { child, bus: bus.to_owned(), log: log.to_owned() }
+        Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 }
+    }
+
+    /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, foreign to
+    /// everybody.
+    pub(crate) fn catch_up(&mut self) -> Frame {
+        self.marks += 1;
+        let mark = format!("1BADCAFE#{:08X}", self.marks);
+        tool(&format!("cansend {} {mark}", self.bus));
+        // The log may be long, and what was on the bus since is little.
+        let tail = || {
+            let mut log = File::open(&self.log).unwrap();
+            let len = log.metadata().unwrap().len();
+            log.seek(SeekFrom::Start(len.saturating_sub(16_384))).unwrap();
+            let mut tail = String::new();
+            log.read_to_string(&mut tail).unwrap();
+            tail.contains(&mark).then_some(())
+        };
+        until("candump to see a frame", tail);
+        parse_frame(&mark).unwrap()
     }
 
     /// What was on the bus until now.
-    pub(crate) fn frames(self) -> Vec<Frame> {
-        // When it has seen this one, it has seen all that came before.
-        tool(&format!("cansend {} {LAST}", self.bus));
-        let has_seen_it = || fs::read_to_string(&self.log).unwrap().trim_end().ends_with(LAST).then_some(());
-        until("candump to see the last frame", has_seen_it);
+    pub(crate) fn frames(mut self) -> Vec<Frame> {
+        let last = self.catch_up();
         drop(self.child);
         let mut frames = frames_of(&self.log);
-        frames.pop();
+        frames.truncate(frames.iter().rposition(|frame| *frame == last).unwrap());
         frames
     }
 }
-
-/// A frame that nobody sends.
-const LAST: &str = "1BADCAFE#4C415354";
 
 /// The frames of a log; every other line is a mistake, `DROPCOUNT` too.
 pub(crate) fn frames_of(log: &Path) -> Vec<Frame> {
