@@ -227,7 +227,7 @@ pub struct RepliesSummary {
     pub skipped: u64,
     /// Not heard by the cell.
     pub not_heard: u64,
-    /// Sent by the cell and lost on the way.
+    /// Sent by the cell and lost or damaged on the way.
     pub lost: u64,
     /// Of cells that were dead or started anew.
     pub in_doubt: u64,
@@ -352,7 +352,7 @@ fn replies(table: &Table) -> RepliesSummary {
         summary.too_late += explain(too_late);
         summary.skipped += explain(skipped);
         summary.not_heard += explain(not_heard);
-        summary.lost += explain(cell.uplink.lost);
+        summary.lost += explain(cell.uplink.lost + cell.uplink.rejected);
         summary.in_doubt += in_doubt;
         summary.unknown += rest;
         summary.unasked += unasked;
