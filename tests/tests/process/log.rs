@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use protocol::can::{Format, Frame};
 use protocol::candump::{self, Line};
 use protocol::fixed::Q;
-use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage, SkinSensors};
+use protocol::id::{Kind, Node};
+use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, Half, Packet, Paired, WORDS, data_id};
 use protocol::time::Micros;
 
@@ -47,6 +47,51 @@ impl Log {
         let messages = frames.iter().filter_map(packet);
         let messages = messages.filter_map(|packet| Some((Message::decode(&packet).ok()?, packet)));
         Self { messages: messages.collect(), frames }
+    }
+
+    /// What each sender has said, in its order; of heartbeats, which come when their time has come and not when
+    /// something happens, only what they say of a cell that is new.
+    pub(crate) fn by_sender(&self) -> BTreeMap<(Kind, u8, u8), Vec<String>> {
+        let mut all = BTreeMap::<_, Vec<String>>::new();
+        for (message, packet) in &self.messages {
+            let said = match message {
+                Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                    format!("{:?}", Heartbeat { sent: 0, ..*heartbeat })
+                }
+                // The epoch of these is that of the joints before them, which comes by time.
+                Message::Network { page, .. } => format!("{page:?}"),
+                Message::Sensors { page, .. } => format!("{page:?}"),
+                other => format!("{other:?}"),
+            };
+            let page = if packet.id.kind == Kind::Network { packet.count } else { 0 };
+            let sayings = all.entry((packet.id.kind, page, packet.id.node)).or_default();
+            let heartbeat = packet.id.kind == Kind::Network && page == 0;
+            if !(heartbeat && sayings.last() == Some(&said)) {
+                sayings.push(said);
+            }
+        }
+        all
+    }
+
+    /// Sees that each heartbeat counts exactly the packets of its cell that stand before it in the log, which
+    /// begins before the cells do.
+    pub(crate) fn heartbeats_count_what_came(&self) {
+        let mut sent = BTreeMap::<u8, u16>::new();
+        for (message, packet) in &self.messages {
+            let from_cell = matches!(
+                packet.id.kind,
+                Kind::Torque | Kind::Sum | Kind::Sensors | Kind::Network | Kind::Configured
+            );
+            if !from_cell {
+                continue;
+            }
+            let sent = sent.entry(packet.id.node).or_default();
+            if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
+                assert_eq!(heartbeat.sent, *sent, "packets of cell {}", packet.id.node);
+            }
+            *sent = sent.wrapping_add(1);
+        }
+        assert!(!sent.is_empty());
     }
 
     /// Each broadcast's words.

@@ -13,6 +13,7 @@
 
 pub(crate) mod log;
 pub(crate) mod vcan;
+pub(crate) mod whole;
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -146,7 +147,12 @@ impl Place {
 
     /// A command in this place; words are parted by spaces.
     pub(crate) fn command(&self, name: &str, words: &str) -> Command {
-        let mut command = Command::new(program(name));
+        self.command_of(&program(name), words)
+    }
+
+    /// The same of any program.
+    pub(crate) fn command_of(&self, program: &Path, words: &str) -> Command {
+        let mut command = Command::new(program);
         command.args(words.split(' ').filter(|word| !word.is_empty()));
         command.current_dir(self.directory.path()).env("SKINBUS_DIR", self.buses()).env("NO_COLOR", "1");
         command
@@ -388,8 +394,13 @@ impl Running {
     }
 
     /// Waits until it has ended.
-    pub(crate) fn end(mut self) -> Ended {
-        let give_up = Instant::now() + PATIENCE;
+    pub(crate) fn end(self) -> Ended {
+        self.end_after(Duration::ZERO)
+    }
+
+    /// Waits until it has ended, which takes so long by itself.
+    pub(crate) fn end_after(mut self, run: Duration) -> Ended {
+        let give_up = Instant::now() + run + PATIENCE;
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;

@@ -153,8 +153,8 @@ impl Drop for Beside {
     }
 }
 
-/// `candump -L`, which has room for 16 MB of frames and takes the processor only when nobody else wants it:
-/// on one processor it would else be woken by every single frame.
+/// `candump -L`, which has room for 300 MB of frames and interrupts nobody: on one processor it would else be
+/// woken by every single frame.
 pub(crate) struct Candump {
     child: Beside,
     bus: String,
@@ -167,43 +167,53 @@ impl Candump {
     pub(crate) fn start(bus: &str, log: &Path) -> Self {
         // -d: what its socket drops is a line of the log, which no test that counts frames lets pass.
         // The two filters let pass every frame, and every error frame, which are else left out.
-        let words = format!("chrt --idle 0 candump -L -d -r 16000000 {bus},0:0,#FFFFFFFF");
+        let words = format!("chrt --batch 0 candump -L -d -r 300000000 {bus},0:0,#FFFFFFFF");
         let mut command = command(&words);
         command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
         let child = Beside(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
-        let lists = format!("/proc/{}/net/can/rcvlist_all", child.0.id());
-        let listens = || fs::read_to_string(&lists).is_ok_and(|list| list.contains(bus)).then_some(());
-        until("candump's socket", listens);
-        Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 }
+        let candump = Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 };
+        // The kernel's lists of who listens do not say whose each entry is.
+        until("candump to listen", || {
+            tool(&format!("cansend {bus} {}", mark(0)));
+            candump.tail().contains(&mark(0)).then_some(())
+        });
+        candump
     }
 
-    /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, foreign to
-    /// everybody.
-    pub(crate) fn catch_up(&mut self) -> Frame {
+    /// The end of its log, which may be long.
+    fn tail(&self) -> String {
+        let mut log = File::open(&self.log).unwrap();
+        let len = log.metadata().unwrap().len();
+        log.seek(SeekFrom::Start(len.saturating_sub(16_384))).unwrap();
+        let mut tail = String::new();
+        log.read_to_string(&mut tail).unwrap();
+        tail
+    }
+
+    /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, which is
+    /// foreign to everybody and stays in its log.
+    pub(crate) fn catch_up(&mut self) {
         self.marks += 1;
-        let mark = format!("1BADCAFE#{:08X}", self.marks);
+        let mark = mark(self.marks);
         tool(&format!("cansend {} {mark}", self.bus));
-        // The log may be long, and what was on the bus since is little.
-        let tail = || {
-            let mut log = File::open(&self.log).unwrap();
-            let len = log.metadata().unwrap().len();
-            log.seek(SeekFrom::Start(len.saturating_sub(16_384))).unwrap();
-            let mut tail = String::new();
-            log.read_to_string(&mut tail).unwrap();
-            tail.contains(&mark).then_some(())
-        };
-        until("candump to see a frame", tail);
-        parse_frame(&mark).unwrap()
+        until("candump to see a frame", || self.tail().contains(&mark).then_some(()));
     }
 
-    /// What was on the bus until now.
+    /// What was on the bus from its start until now.
     pub(crate) fn frames(mut self) -> Vec<Frame> {
-        let last = self.catch_up();
+        self.catch_up();
         drop(self.child);
-        let mut frames = frames_of(&self.log);
-        frames.truncate(frames.iter().rposition(|frame| *frame == last).unwrap());
-        frames
+        let frames = frames_of(&self.log);
+        let [first, last] = [0, self.marks].map(|number| parse_frame(&mark(number)).unwrap());
+        let begin = frames.iter().rposition(|frame| *frame == first).unwrap() + 1;
+        let end = frames.iter().rposition(|frame| *frame == last).unwrap();
+        frames[begin..end].to_vec()
     }
+}
+
+/// A frame that nobody else sends.
+fn mark(number: u32) -> String {
+    format!("1BADCAFE#{number:08X}")
 }
 
 /// The frames of a log; every other line is a mistake, `DROPCOUNT` too.

@@ -1,0 +1,84 @@
+//! The whole skin on a real kernel's vcan: 253 processes that all answer every broadcast, and `candump` beside.
+
+use std::fs;
+use std::time::Duration;
+
+use gateway::generate::{Wanted, generate};
+use protocol::can::Frame;
+use protocol::id::{Id, Kind};
+
+use super::vcan::Candump;
+use super::{Place, Running, Summary, program};
+
+const CELLS: u64 = 253;
+const SECONDS: u32 = 30;
+
+/// All are in contact all the time. The central computation is left out: under emulation it would take a fifth
+/// of the only processor.
+const SCENARIO: &str = r#"version = 1
+duration_s = 30.0
+
+[motion]
+kind = "sine"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]
+period_s = 10.0
+
+[[mode]]
+at_s = 0.0
+kind = "distributed"
+
+[[touch]]
+at_s = 0.0
+for_s = 31.0
+all = true
+force_n = 1.5
+profile = "step"
+"#;
+
+/// Runs it for half a minute and sees that every broadcast that was due was sent, that all cells have answered
+/// each, and that no frame was lost: by our count and by candump's.
+pub(crate) fn runs_for_half_a_minute(broadcasts: u32) -> Summary {
+    let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
+    let place = Place::on_vcan();
+    let wanted = Wanted { cells: 253, broadcast_hz, ..Wanted::default() };
+    place.write("skin.toml", &generate(&wanted).unwrap());
+    place.scenario(SCENARIO);
+    // Nothing is to be read from the host's files while it runs: where time is instructions, waiting for them
+    // would let it pass.
+    for name in ["gateway", "cell-node"] {
+        fs::copy(program(name), place.path(name)).unwrap();
+        Running::start(place.command_of(&place.path(name), "--version")).end().well();
+    }
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
+    let run = "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json";
+    let bench = Running::start(place.command_of(&place.path("gateway"), run));
+    let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
+    println!("{}", ended.stdout);
+    let summary = place.summary();
+    summary.adds_up();
+
+    let due = u64::from(broadcasts);
+    assert_eq!((summary.number("/loop/broadcasts"), summary.number("/loop/broadcasts_skipped")), (due, 0));
+    let answered = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
+    assert_eq!((summary.of_bus("/replies/due"), answered), (CELLS * due, CELLS * due), "{:#}", summary.0);
+    for lost in
+        ["/dropped_by_bus", "/uplink/dropped", "/uplink/backlog", "/uplink/unknown", "/uplink/rejected"]
+    {
+        assert_eq!(summary.of_bus(lost), 0, "{lost}");
+    }
+    assert_eq!((summary.odd(0), summary.number("/loop/unsent")), (0, 0), "{:#}", summary.0);
+
+    let seen = candump.frames();
+    let counted = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
+    // Cells that are being ended may still say a heartbeat to nobody.
+    let (ours, later) = seen.split_at(usize::try_from(counted).unwrap());
+    assert!(later.iter().all(|frame| kind_of(frame) == Kind::Network), "{} and {counted}", seen.len());
+    let torques = ours.iter().filter(|frame| kind_of(frame) == Kind::Torque).count();
+    assert_eq!(torques as u64, CELLS * due, "torques that candump saw");
+    summary
+}
+
+fn kind_of(frame: &Frame) -> Kind {
+    Id::from_bits(u16::try_from(frame.raw_id()).unwrap()).kind
+}
