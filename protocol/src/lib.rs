@@ -15,3 +15,5 @@ pub mod parameters;
 #[cfg(feature = "host")]
 pub mod skin;
 pub mod time;
+#[cfg(feature = "host")]
+pub mod usage;

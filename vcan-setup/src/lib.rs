@@ -1,3 +1,10 @@
 #![doc = include_str!("../README.md")]
 
+pub mod doctor;
 pub mod embedded;
+pub mod kernel;
+pub mod link;
+pub mod look;
+pub mod namespace;
+pub mod netlink;
+pub mod plan;

@@ -1,0 +1,113 @@
+//! `vcan-setup doctor`.
+
+use clap::Args;
+use protocol::bus::Choice;
+use serde::Serialize;
+use vcan_setup::doctor::{Facts, Finding, judge, would_run};
+use vcan_setup::look::{self, Asked};
+use vcan_setup::netlink::Netlink;
+
+use super::print::print;
+use super::{Failure, Word, word};
+
+/// Say what a bench still needs on this machine, and what mends it
+///
+/// Looks at the kernel, the interfaces, permissions, buffers and who is on the buses already (it listens for
+/// 600 ms, and sends nothing), and judges what `gateway run` would meet. Changes nothing. Run it as the user
+/// who runs the gateway. Exit code 0: a bench would run; 1: it would not; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vcan-setup doctor                                the machine
+  vcan-setup doctor skin.toml                      all that a skin needs
+  vcan-setup doctor skin.toml --no-spawn           its cells are on the bus already
+  vcan-setup doctor can0 --bus-kind socketcan")]
+pub(crate) struct Doctor {
+    /// Names of buses, or skins: what ends in .toml or holds a '/'
+    #[arg(value_name = "SKIN.toml|NAME")]
+    what: Vec<String>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    bus_kind: Choice,
+    /// The cells are on the bus already, or are real: as with `gateway run --no-spawn`
+    #[arg(long)]
+    no_spawn: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl Doctor {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let mut asked = Vec::new();
+        let mut skin_file = None;
+        for given in &self.what {
+            match word(given)? {
+                Word::File(skin) => {
+                    asked.extend(Asked::of_skin(given, &skin));
+                    skin_file = Some(given.clone());
+                }
+                Word::Name(name) => asked.push(Asked::named(&name)),
+            }
+        }
+        let present = Netlink::open().and_then(|mut netlink| netlink.interfaces()).unwrap_or_default();
+        let facts = look::facts(asked, self.bus_kind, self.no_spawn, skin_file, &present);
+        let findings = judge(&facts);
+        let runs = would_run(&findings);
+        if self.json {
+            print(&json(&facts, &findings, runs)?)?;
+        } else {
+            print(&text(&facts, &findings, runs))?;
+        }
+        if runs { Ok(()) } else { Err(Failure::said()) }
+    }
+}
+
+fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
+    let mut text = String::new();
+    for Finding { level, text: what, remedies } in findings {
+        text += &format!("{:<6}{what}\n", level.name());
+        for remedy in remedies {
+            text += &format!("          {remedy}\n");
+        }
+    }
+    let faults = findings.iter().filter(|finding| !would_run(std::slice::from_ref(finding))).count();
+    let kind = facts.bus_kind();
+    text += "\n";
+    text += &match (runs, faults) {
+        (true, _) => format!("A bench would run, on {}.\n", bus_words(kind)),
+        (false, 1) => "No bench would run: mend the fault first.\n".to_owned(),
+        (false, faults) => format!("No bench would run: mend the {faults} faults first.\n"),
+    };
+    text
+}
+
+const fn bus_words(kind: protocol::bus::BusKind) -> &'static str {
+    match kind {
+        protocol::bus::BusKind::SocketCan => "SocketCAN",
+        protocol::bus::BusKind::Embedded => "the embedded bus",
+    }
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    would_run: bool,
+    bus_kind: &'static str,
+    findings: Vec<Found<'a>>,
+}
+
+#[derive(Serialize)]
+struct Found<'a> {
+    level: &'static str,
+    text: &'a str,
+    remedies: &'a [String],
+}
+
+fn json(facts: &Facts, findings: &[Finding], would_run: bool) -> Result<String, Failure> {
+    let found = findings.iter().map(|finding| Found {
+        level: finding.level.name(),
+        text: &finding.text,
+        remedies: &finding.remedies,
+    });
+    let report = Report { would_run, bus_kind: facts.bus_kind().name(), findings: found.collect() };
+    serde_json::to_string_pretty(&report).map(|text| text + "\n").map_err(Failure::run)
+}

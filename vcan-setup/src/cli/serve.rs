@@ -1,0 +1,58 @@
+//! `vcan-setup serve`.
+
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+
+use anyhow::Context;
+use clap::Args;
+use rustix::process::Signal;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use vcan_setup::embedded::Server;
+
+use super::{Failure, bus_name};
+
+/// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
+///
+/// Prints one line, "serving NAME at PATH", when clients can connect. The bus is private to the user; its
+/// socket lies in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"
+)]
+pub(crate) struct Serve {
+    /// The bus's name, as an interface's: at most 15 bytes
+    #[arg(value_parser = bus_name)]
+    name: String,
+    /// Also stop when standard input ends or the parent process dies
+    #[arg(long)]
+    until_eof: bool,
+}
+
+impl Serve {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        serve(&self.name, self.until_eof).map_err(|error| Failure::run(format!("{error:#}")))
+    }
+}
+
+fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
+    let (stop, stopped) = UnixStream::pair().context("cannot make a handle to stop")?;
+    for signal in [SIGINT, SIGTERM] {
+        let stop = stop.try_clone().context("cannot make a handle to stop")?;
+        signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
+    }
+    if until_eof {
+        // The system counts the thread that started this process as its parent.
+        rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
+            .context("cannot follow the parent process")?;
+        std::thread::spawn(move || {
+            let _ = std::io::copy(&mut std::io::stdin().lock().by_ref(), &mut std::io::sink());
+            let _ = (&stop).write_all(b"end");
+        });
+    }
+    let server = Server::bind(name)?;
+    writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
+        .and_then(|()| std::io::stdout().flush())
+        .context("cannot write to standard output")?;
+    server.run(stopped)?;
+    Ok(())
+}

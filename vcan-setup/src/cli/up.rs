@@ -1,0 +1,244 @@
+//! `vcan-setup up` and `vcan-setup down`.
+
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+
+use clap::Args;
+use rustix::io::Errno;
+use vcan_setup::kernel::Kernel;
+use vcan_setup::namespace::Namespace;
+use vcan_setup::netlink::Netlink;
+use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
+
+use super::print::print;
+use super::{Failure, Word, wanted, word};
+
+/// Make virtual CAN interfaces, and bring them up
+///
+/// Makes what is missing, with MTU 72 for CAN FD, and marks it with the alias "skinbus". What is there
+/// already and fits stays as it is, so it may be called again and again. Nothing is touched that it has not
+/// made: of a real interface in a skin it only checks the bit rates, unless it is told to set them. Needs
+/// root, unless there is nothing to do.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vcan-setup up --dry-run skin.toml                           say what would be done
+  sudo vcan-setup up skin.toml                                all buses of a skin
+  sudo vcan-setup up vcan0 vcan1
+  sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair: its other end is in `ip netns exec blue ...`
+  sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
+pub(crate) struct Up {
+    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    #[arg(required = true, value_name = "SKIN.toml|NAME")]
+    what: Vec<String>,
+    /// Say what would be done, and do nothing
+    #[arg(long)]
+    dry_run: bool,
+    /// Make a vxcan pair: NAME is one end, PEER the other
+    #[arg(long, value_name = "PEER")]
+    peer: Option<String>,
+    /// The network namespace of the other end: a name, a path, or the number of a process
+    #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
+    namespace: Option<String>,
+    /// Set the bit rates of CAN hardware to those of the skin, for which it is taken down for a moment
+    #[arg(long, conflicts_with = "peer")]
+    set_bit_rates: bool,
+}
+
+/// Remove the virtual CAN interfaces that `up` has made
+///
+/// Removes only what bears the mark "skinbus". Of a skin's buses it leaves alone what it has not made; a
+/// name of such an interface is an error.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  sudo vcan-setup down skin.toml
+  vcan-setup down --dry-run vcan0")]
+pub(crate) struct Down {
+    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    #[arg(required = true, value_name = "SKIN.toml|NAME")]
+    what: Vec<String>,
+    /// Say what would be done, and do nothing
+    #[arg(long)]
+    dry_run: bool,
+}
+
+impl Up {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        if let Some(peer) = &self.peer {
+            return self.pair(peer);
+        }
+        let wanted = wanted(&self.what)?;
+        for name in wanted.iter().map(|wanted| &wanted.name) {
+            plain(name)?;
+        }
+        let (mut netlink, present) = look()?;
+        let plan = plan::up(&wanted, &present, self.set_bit_rates)?;
+        Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+    }
+
+    fn pair(&self, peer: &str) -> Result<(), Failure> {
+        let [given] = self.what.as_slice() else {
+            return Err(Failure::usage("--peer makes one pair: give one NAME with it"));
+        };
+        let Word::Name(name) = word(given)? else {
+            return Err(Failure::usage(format!(
+                "--peer goes with the NAME of an interface, and {given} is a skin"
+            )));
+        };
+        plain(&name)?;
+        plain(peer)?;
+        let (mut netlink, present) = look()?;
+        let mut other = self.namespace.as_deref().map(enter).transpose()?.flatten();
+        let there = match &mut other {
+            Some((namespace, file, inside)) => {
+                let id = netlink.namespace_id(file).map_err(unreadable)?;
+                let present = inside.interfaces().map_err(unreadable)?;
+                Some(There { name: namespace.clone(), id, present })
+            }
+            None => None,
+        };
+        let plan = plan::up_pair(&WantedPair { name: &name, peer, there: there.as_ref() }, &present)?;
+        let there = other.as_mut().map(|(_, file, inside)| (&*file, inside));
+        Worker { netlink: &mut netlink, there }.finish(&plan, self.dry_run)
+    }
+}
+
+impl Down {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let wanted = wanted(&self.what)?;
+        let (mut netlink, present) = look()?;
+        let plan = plan::down(&wanted, &present)?;
+        Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+    }
+}
+
+/// Names that the kernel takes as they are, and a shell too.
+fn plain(name: &str) -> Result<(), Failure> {
+    let odd = |c: char| !(c.is_ascii_alphanumeric() || "-_.".contains(c));
+    super::bus_name(name).map_err(Failure::usage)?;
+    if name.contains(odd) || name.starts_with(['-', '.']) {
+        return Err(Failure::usage(format!(
+            "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
+        )));
+    }
+    Ok(())
+}
+
+fn look() -> Result<(Netlink, Vec<vcan_setup::link::Interface>), Failure> {
+    let mut netlink = Netlink::open().map_err(unreadable)?;
+    let present = netlink.interfaces().map_err(unreadable)?;
+    Ok((netlink, present))
+}
+
+fn unreadable(error: io::Error) -> Failure {
+    Failure::run(format!("cannot ask the kernel for its interfaces: {error}"))
+}
+
+/// Opens a namespace; `None` when it is the one where we are.
+fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
+    let namespace = Namespace::named(word);
+    let file = namespace.open().map_err(Failure::run)?;
+    let same = |file: &File| {
+        let (there, here) = (file.metadata()?, std::fs::metadata("/proc/thread-self/ns/net")?);
+        Ok::<_, io::Error>((there.dev(), there.ino()) == (here.dev(), here.ino()))
+    };
+    if same(&file).unwrap_or(false) {
+        return Ok(None);
+    }
+    let inside = Netlink::open_in(&file).map_err(|error| {
+        let path = namespace.path();
+        match Errno::from_io_error(&error) {
+            Some(Errno::PERM) => not_allowed(&format!("enter the network namespace {namespace}")),
+            Some(Errno::INVAL) => Failure::usage(format!(
+                "{} is no network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
+                path.display()
+            )),
+            _ => Failure::run(format!("cannot enter the network namespace {}: {error}", path.display())),
+        }
+    })?;
+    Ok(Some((namespace, file, inside)))
+}
+
+fn not_allowed(what: &str) -> Failure {
+    let arguments: Vec<_> = std::env::args().skip(1).collect();
+    Failure::run(format!(
+        "not allowed to {what}: that needs root (CAP_NET_ADMIN); try `sudo vcan-setup {}`",
+        arguments.join(" ")
+    ))
+}
+
+/// Carries out plans.
+struct Worker<'a> {
+    netlink: &'a mut Netlink,
+    there: Option<(&'a File, &'a mut Netlink)>,
+}
+
+impl Worker<'_> {
+    /// Says what is left alone, and does the rest or says what it would do.
+    fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
+        let mut text = String::new();
+        for line in &plan.left {
+            text += &format!("{line}\n");
+        }
+        if dry_run {
+            for step in &plan.steps {
+                text += &format!("would {step}\n    {}\n", step.command());
+            }
+            if plan.steps.is_empty() {
+                text += "nothing would be done\n";
+            }
+            return print(&text);
+        }
+        print(&text)?;
+        let mut undo = Vec::new();
+        for step in &plan.steps {
+            let there = self.there.as_mut().map(|(file, inside)| (*file, &mut **inside));
+            match self.netlink.carry_out(step, there) {
+                Ok(done) => undo.extend(done),
+                Err(error) => {
+                    let mut failure = explain(step, &error);
+                    for done in undo.iter().rev() {
+                        if let Err(error) = self.netlink.undo(done) {
+                            failure.text += &format!("; and taking back what was done fails: {error}");
+                        }
+                    }
+                    return Err(failure);
+                }
+            }
+        }
+        // Said when all is done: what is said before a failure has been taken back.
+        print(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
+    }
+}
+
+/// Why a step fails, and what mends it.
+fn explain(step: &Step, error: &io::Error) -> Failure {
+    let kind = match step {
+        Step::MakeVcan { .. } => Some("vcan"),
+        Step::MakePair { .. } => Some("vxcan"),
+        Step::BringUp { .. } | Step::Widen { .. } | Step::SetRates { .. } | Step::Remove { .. } => None,
+    };
+    match (Errno::from_io_error(error), kind) {
+        (Some(Errno::PERM | Errno::ACCESS), _) => not_allowed(&step.to_string()),
+        (Some(Errno::OPNOTSUPP), Some(kind)) => {
+            let kernel = Kernel::look();
+            let remedies = kernel.remedies(kernel.module(kind));
+            let embedded = "or leave SocketCAN out and use the embedded bus, which needs no interface";
+            Failure::run(format!(
+                "cannot {step}: the kernel ({}) knows no {kind}; {}, {embedded}",
+                kernel.release,
+                remedies.join(", or ")
+            ))
+        }
+        (Some(Errno::OPNOTSUPP), None) => {
+            Failure::run(format!("cannot {step}: this hardware cannot do that ({error})"))
+        }
+        (Some(Errno::INVAL), None) => {
+            Failure::run(format!("cannot {step}: its driver does not take these values ({error})"))
+        }
+        (Some(Errno::EXIST), Some(_)) => Failure::run(format!(
+            "cannot {step}: an interface of that name has appeared meanwhile; try again"
+        )),
+        _ => Failure::run(format!("cannot {step}: {error}")),
+    }
+}

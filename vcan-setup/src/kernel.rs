@@ -1,0 +1,206 @@
+//! What this machine's kernel can do about CAN, and where what is missing can be had.
+
+use std::fs;
+use std::path::Path;
+
+use protocol::bus::{BusKind, Choice};
+
+/// Where a module of the kernel is.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Module {
+    /// In the kernel: built in, or loaded.
+    There,
+    /// On the disk: it can be loaded.
+    Loadable,
+    /// Not among the modules of this kernel.
+    Missing,
+    /// Nobody can tell: the modules of this kernel are not on this disk.
+    Unknown,
+}
+
+/// What a kernel is, as far as CAN is concerned.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Kernel {
+    /// Its release, as `uname -r` says it.
+    pub release: String,
+    /// The machine, as `uname -m` says it.
+    pub machine: String,
+    /// The distribution's names, from os-release: `ID` and `ID_LIKE`.
+    pub distribution: String,
+    /// Whether `CAN_RAW` sockets can be opened.
+    pub has_can: bool,
+    /// `CAN_RAW` sockets.
+    pub can_raw: Module,
+    /// Virtual buses.
+    pub vcan: Module,
+    /// Pairs.
+    pub vxcan: Module,
+}
+
+impl Kernel {
+    /// Looks at the kernel that runs.
+    #[must_use]
+    pub fn look() -> Self {
+        let uname = rustix::system::uname();
+        let release = uname.release().to_string_lossy().into_owned();
+        let lists = Lists::read(&release);
+        // Asking for such a socket makes the kernel load the module if it has it.
+        let has_can = Choice::Auto.resolve() == BusKind::SocketCan;
+        let loaded = |name: &str| Path::new("/sys/module").join(name).exists();
+        let os_release = fs::read_to_string("/etc/os-release").unwrap_or_default();
+        Self {
+            machine: uname.machine().to_string_lossy().into_owned(),
+            distribution: distribution(&os_release),
+            has_can,
+            can_raw: lists.module("can_raw", has_can),
+            vcan: lists.module("vcan", loaded("vcan")),
+            vxcan: lists.module("vxcan", loaded("vxcan")),
+            release,
+        }
+    }
+
+    /// Where one of the virtual kinds, `vcan` or `vxcan`, is.
+    #[must_use]
+    pub fn module(&self, kind: &str) -> Module {
+        if kind == "vxcan" { self.vxcan } else { self.vcan }
+    }
+
+    /// What mends that there is no CAN, or no `vcan`: one command a line, the nearest first.
+    #[must_use]
+    pub fn remedies(&self, module: Module) -> Vec<String> {
+        let modprobe = "sudo modprobe -a can_raw vcan vxcan".to_owned();
+        let here = match module {
+            Module::There => Vec::new(),
+            Module::Loadable => vec![modprobe],
+            Module::Missing => self.other_kernel(modprobe),
+            Module::Unknown => vec![format!(
+                "{modprobe}    (on the machine below, when this is a container: the modules of {} are not here)",
+                self.release
+            )],
+        };
+        let lab =
+            "tests/lab/run COMMAND    (from the project's folder: boots a machine that has it)".to_owned();
+        here.into_iter().chain([lab]).collect()
+    }
+
+    fn other_kernel(&self, modprobe: String) -> Vec<String> {
+        let is = |name: &str| self.distribution.split_whitespace().any(|word| word == name);
+        let architecture = match self.machine.as_str() {
+            "x86_64" => "amd64",
+            "aarch64" => "arm64",
+            other => other,
+        };
+        if is("ubuntu") {
+            return vec![format!("sudo apt install linux-modules-extra-{} && {modprobe}", self.release)];
+        }
+        if is("debian") {
+            let cloud = if self.release.contains("cloud") { "this one is a cloud kernel; " } else { "" };
+            return vec![format!(
+                "sudo apt install linux-image-{architecture}    ({cloud}then boot the new one, and `{modprobe}`)"
+            )];
+        }
+        vec![format!("a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN    ({} has none)", self.release)]
+    }
+}
+
+/// The kernel's own lists of its modules.
+struct Lists {
+    built_in: Option<String>,
+    on_disk: Option<String>,
+}
+
+impl Lists {
+    fn read(release: &str) -> Self {
+        let directory = Path::new("/lib/modules").join(release);
+        let read = |name| fs::read_to_string(directory.join(name)).ok();
+        Self { built_in: read("modules.builtin"), on_disk: read("modules.dep") }
+    }
+
+    fn module(&self, name: &str, works: bool) -> Module {
+        let lists = |list: &Option<String>| list.as_deref().is_some_and(|list| names(list, name));
+        if works || lists(&self.built_in) {
+            Module::There
+        } else if lists(&self.on_disk) {
+            Module::Loadable
+        } else if self.on_disk.is_some() {
+            Module::Missing
+        } else {
+            Module::Unknown
+        }
+    }
+}
+
+/// Whether a list of paths has this module: `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
+fn names(list: &str, module: &str) -> bool {
+    list.lines().any(|line| {
+        let path = line.split(':').next().unwrap_or_default();
+        let file = path.rsplit('/').next().unwrap_or_default();
+        file.split_once(".ko").is_some_and(|(name, _)| name.replace('-', "_") == module)
+    })
+}
+
+/// The names that a distribution gives itself.
+fn distribution(os_release: &str) -> String {
+    let values = os_release.lines().filter_map(|line| {
+        let (key, value) = line.split_once('=')?;
+        ["ID", "ID_LIKE"].contains(&key).then(|| value.trim_matches('"'))
+    });
+    values.collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DEP: &str = "kernel/drivers/net/can/vcan.ko: kernel/drivers/net/can/dev/can-dev.ko\n\
+                       kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz\n";
+
+    #[test]
+    fn a_module_is_found_by_its_own_file_and_not_by_what_needs_it() {
+        assert!(names(DEP, "vcan") && names(DEP, "can_raw"));
+        assert!(!names(DEP, "can") && !names(DEP, "can_dev") && !names(DEP, "vxcan"));
+    }
+
+    #[test]
+    fn where_a_module_is() {
+        let lists = Lists { built_in: Some("kernel/net/can/can.ko\n".into()), on_disk: Some(DEP.into()) };
+        assert_eq!(lists.module("can", false), Module::There);
+        assert_eq!(lists.module("vcan", false), Module::Loadable);
+        assert_eq!(lists.module("vcan", true), Module::There);
+        assert_eq!(lists.module("vxcan", false), Module::Missing);
+        let none = Lists { built_in: None, on_disk: None };
+        assert_eq!(none.module("vcan", false), Module::Unknown);
+    }
+
+    fn kernel(release: &str, os_release: &str) -> Kernel {
+        Kernel {
+            release: release.into(),
+            machine: "x86_64".into(),
+            distribution: distribution(os_release),
+            has_can: false,
+            can_raw: Module::Missing,
+            vcan: Module::Missing,
+            vxcan: Module::Missing,
+        }
+    }
+
+    #[test]
+    fn the_remedy_fits_the_distribution() {
+        let first = |kernel: Kernel| kernel.remedies(Module::Missing).remove(0);
+        let debian = first(kernel("6.1.0-30-cloud-amd64", "ID=debian\nVERSION_ID=\"12\"\n"));
+        assert!(debian.starts_with("sudo apt install linux-image-amd64 "), "{debian}");
+        assert!(debian.contains("cloud kernel"), "{debian}");
+        let mint = first(kernel(
+            "6.8.0-50-generic",
+            "NAME=\"Linux Mint\"\nID=linuxmint\nID_LIKE=\"ubuntu debian\"\n",
+        ));
+        assert!(
+            mint.starts_with("sudo apt install linux-modules-extra-6.8.0-50-generic && sudo modprobe"),
+            "{mint}"
+        );
+        let other = first(kernel("6.12.1", "ID=arch\n"));
+        assert_eq!(other, "a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN    (6.12.1 has none)");
+        let loadable = kernel("6.1.0", "ID=debian\n").remedies(Module::Loadable);
+        assert_eq!(loadable[0], "sudo modprobe -a can_raw vcan vxcan");
+    }
+}

@@ -1,0 +1,233 @@
+//! Looks at this machine for the [`doctor`](crate::doctor), and changes nothing.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::bus::embedded::{DirectoryError, address, open_directory, socket_name, usual_directory};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Inbox, Options};
+use protocol::can::Format;
+use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::skin::{Reply, Skin};
+use rustix::fs::Access;
+use rustix::net::{AddressFamily, SocketFlags, SocketType, sockopt};
+use rustix::thread::{CapabilitySet, capabilities};
+
+use crate::doctor::{self, Facts, Heard, Program, User};
+use crate::kernel::Kernel;
+use crate::link::Interface;
+use crate::plan::Wanted;
+
+/// How long a bus is listened to: a gateway sends joints much more often, a cell says that it is there at
+/// least every half second.
+const LISTEN: Duration = Duration::from_millis(600);
+/// What the gateway asks for.
+const RECEIVE_BUFFER: usize = 8 << 20;
+
+/// A bus that is to be judged.
+#[derive(Clone, Debug)]
+pub struct Asked {
+    /// What is wanted of it.
+    pub wanted: Wanted,
+    /// Its cells; `None` when no skin says.
+    pub cells: Option<BTreeSet<CellId>>,
+    /// Whether its cells are to answer with sums.
+    pub sums: bool,
+}
+
+impl Asked {
+    /// The buses of a skin.
+    #[must_use]
+    pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
+        let of = |(index, wanted): (usize, Wanted)| Self {
+            wanted,
+            cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
+            sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),
+        };
+        Wanted::of_skin(file, skin).into_iter().enumerate().map(of).collect()
+    }
+
+    /// A bus that was named.
+    #[must_use]
+    pub fn named(name: &str) -> Self {
+        Self { wanted: Wanted::named(name), cells: None, sums: false }
+    }
+}
+
+/// Looks at everything that a bench on these buses would meet.
+#[must_use]
+pub fn facts(
+    asked: Vec<Asked>,
+    choice: Choice,
+    no_spawn: bool,
+    skin: Option<String>,
+    present: &[Interface],
+) -> Facts {
+    let kind = choice.resolve();
+    let heard = thread::scope(|scope| {
+        let listening: Vec<_> = asked
+            .iter()
+            .map(|bus| {
+                let there = present.iter().find(|interface| interface.name == bus.wanted.name);
+                let open = kind == BusKind::Embedded || there.is_some_and(|it| usable(&bus.wanted, it));
+                open.then(|| scope.spawn(|| listen(&bus.wanted, kind)))
+            })
+            .collect();
+        listening.into_iter().map(|thread| thread.map(thread::ScopedJoinHandle::join)).collect::<Vec<_>>()
+    });
+    let buses = asked.into_iter().zip(heard).map(|(asked, heard)| doctor::Bus {
+        interface: present.iter().find(|interface| interface.name == asked.wanted.name).cloned(),
+        heard: match heard {
+            None => Ok(None),
+            Some(Ok(heard)) => heard,
+            Some(Err(_)) => Err(format!("cannot listen on {}", asked.wanted.name)),
+        },
+        wanted: asked.wanted,
+        cells: asked.cells,
+        sums: asked.sums,
+    });
+    Facts {
+        choice,
+        no_spawn,
+        kernel: Kernel::look(),
+        user: User { root: rustix::process::geteuid().is_root(), admin: is_admin() },
+        receive_buffer: receive_buffer().ok(),
+        backlog: fs::read_to_string("/proc/sys/net/core/netdev_max_backlog")
+            .ok()
+            .and_then(|text| text.trim().parse().ok()),
+        cell_node: beside("cell-node"),
+        embedded: embedded(),
+        skin,
+        buses: buses.collect(),
+        present: present.iter().filter(|interface| interface.is_can()).cloned().collect(),
+    }
+}
+
+fn usable(wanted: &Wanted, interface: &Interface) -> bool {
+    interface.is_can() && interface.up && wanted.carried_by(interface.mtu)
+}
+
+/// Listens for other gateways and for cells; nothing when nobody serves the bus.
+fn listen(wanted: &Wanted, kind: BusKind) -> Result<Option<Heard>, String> {
+    let options = Options { fd: wanted.format == Format::Fd, ..Options::default() };
+    let until = Instant::now() + LISTEN;
+    let hear = || {
+        let bus = Bus::open(&wanted.name, Choice::Only(kind), &options)?;
+        let (mut inbox, mut heard) = (Inbox::new(), Heard::default());
+        while let Some(left) = until.checked_duration_since(Instant::now()) {
+            if bus.wait(Some(left))? {
+                bus.receive(&mut inbox)?;
+                let data = inbox.frames().filter(|it| !it.frame.is_extended() && !it.frame.is_error());
+                for id in data.filter_map(|it| u16::try_from(it.frame.id()).ok()).map(Id::from_bits) {
+                    heard.take(id);
+                }
+            }
+        }
+        Ok(heard)
+    };
+    match hear() {
+        Ok(heard) => Ok(Some(heard)),
+        Err(BusError::NotServed { .. }) => Ok(None),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+impl Heard {
+    /// Takes note of who sends a frame with this identifier.
+    pub fn take(&mut self, id: Id) {
+        let node = Node::from_byte(id.node);
+        match id.kind {
+            // The rest of the gateway's side may come from somebody at a shell.
+            Kind::Command => self.gateway |= Command::from_byte(id.node) == Some(Command::Joints),
+            Kind::Network if node == Node::Gateway => self.gateway = true,
+            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => {
+                self.cells.extend(CellId::new(i64::from(id.node)));
+            }
+            Kind::Configure | Kind::Stimulus => {}
+        }
+    }
+}
+
+fn is_admin() -> bool {
+    capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
+}
+
+/// What the kernel grants to whom asks as the gateway does; it is the same for every sort of socket.
+fn receive_buffer() -> io::Result<usize> {
+    let socket =
+        rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
+    if sockopt::set_socket_recv_buffer_size_force(&socket, RECEIVE_BUFFER).is_err() {
+        sockopt::set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER)?;
+    }
+    Ok(sockopt::socket_recv_buffer_size(&socket)?)
+}
+
+/// A program of this project, which should be beside this one.
+fn beside(name: &str) -> Program {
+    let own = std::env::current_exe().ok();
+    let path = own.as_deref().and_then(Path::parent).unwrap_or_else(|| Path::new(".")).join(name);
+    Program { there: path.is_file(), path }
+}
+
+/// Where embedded buses can be served, or why not.
+fn embedded() -> Result<PathBuf, String> {
+    let directory = usual_directory();
+    address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
+    match open_directory(&directory) {
+        Ok(_) => {}
+        // It is made when a bus is served.
+        Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+            let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
+            rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
+                let (directory, why) = (directory.display(), io::Error::from(errno));
+                format!("cannot make {directory} for embedded buses: {why}; set SKINBUS_DIR to a directory of your own")
+            })?;
+        }
+        Err(error) => return Err(error.to_string()),
+    }
+    Ok(directory)
+}
+
+/// An embedded bus of this user.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Embedded {
+    /// Its name.
+    pub name: String,
+    /// Its socket.
+    pub path: PathBuf,
+    /// Whether somebody serves it: a killed server leaves its socket behind.
+    pub served: bool,
+}
+
+/// The embedded buses of this user.
+#[must_use]
+pub fn embedded_buses() -> Vec<Embedded> {
+    let directory = usual_directory();
+    if open_directory(&directory).is_err() {
+        return Vec::new();
+    }
+    let names = fs::read_dir(&directory).into_iter().flatten().flatten().filter_map(|entry| {
+        let name = entry.file_name().into_string().ok()?;
+        name.strip_suffix(".bus").map(str::to_owned)
+    });
+    let mut buses: Vec<_> = names
+        .map(|name| Embedded {
+            path: directory.join(socket_name(&name)),
+            served: is_served(&directory, &name),
+            name,
+        })
+        .collect();
+    buses.sort_by(|a, b| a.name.cmp(&b.name));
+    buses
+}
+
+/// Only a socket that nobody listens on refuses.
+fn is_served(directory: &Path, name: &str) -> bool {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None);
+    let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };
+    matches!(rustix::net::connect(&socket, &address), Ok(()) | Err(rustix::io::Errno::AGAIN))
+}

@@ -1,0 +1,529 @@
+//! What the kernel says of its interfaces, and what it is told to do with them: rtnetlink.
+//!
+//! Decides nothing: [`plan`](crate::plan) does. A link that is made is given its number here, so that what
+//! follows is done to that one and to no other of the same name.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
+
+use netlink_packet_core::{
+    ErrorBuffer, NLM_F_ACK, NLM_F_CREATE, NLM_F_DUMP, NLM_F_DUMP_INTR, NLM_F_EXCL, NLM_F_REQUEST, NLMSG_DONE,
+    NLMSG_ERROR, NetlinkBuffer, NetlinkHeader, NetlinkMessage, NetlinkPayload, NlasIterator, Parseable,
+    ParseableParametrized,
+};
+use netlink_packet_route::link::{
+    CanBitTiming, CanCtrlMode, CanCtrlModeFlags, InfoCan, InfoData, InfoKind, InfoVxcan, LinkAttribute,
+    LinkFlags, LinkHeader, LinkInfo, LinkLayerType, LinkMessage,
+};
+use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
+use netlink_packet_route::{AddressFamily, RouteNetlinkMessage};
+use rustix::io::Errno;
+use rustix::net::netlink::SocketAddrNetlink;
+use rustix::net::sockopt::{Timeout, set_socket_timeout};
+use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
+use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
+
+use crate::link::{Counters, FD_MTU, Hardware, Interface, Kind, MARK, Peer, Place, State};
+use crate::namespace::NAMED;
+use crate::plan::{Rates, Step};
+
+/// How long the kernel may take to answer; it answers at once.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often a list that changed while it was read is read again.
+const RETRIES: usize = 8;
+/// Bytes of the two headers before attributes begin.
+const LINK_HEADER: usize = 16;
+const NSID_HEADER: usize = 4;
+
+/// Speaks to the kernel about the interfaces of one network namespace.
+#[derive(Debug)]
+pub struct Netlink {
+    socket: OwnedFd,
+    sequence: u32,
+}
+
+impl Netlink {
+    /// For the namespace of the calling thread.
+    ///
+    /// # Errors
+    /// When the system gives no such socket.
+    pub fn open() -> io::Result<Self> {
+        let socket = rustix::net::socket_with(
+            rustix::net::AddressFamily::NETLINK,
+            SocketType::RAW,
+            SocketFlags::CLOEXEC,
+            // NETLINK_ROUTE is protocol 0.
+            None,
+        )?;
+        set_socket_timeout(&socket, Timeout::Recv, Some(PATIENCE))?;
+        rustix::net::connect(&socket, &SocketAddrNetlink::new(0, 0))?;
+        Ok(Self { socket, sequence: 0 })
+    }
+
+    /// For another namespace. A socket stays in the namespace where it was opened, and a thread opens it.
+    ///
+    /// # Errors
+    /// When the namespace may not be entered, or is none.
+    pub fn open_in(namespace: &File) -> io::Result<Self> {
+        let enter = || {
+            move_into_link_name_space(namespace.as_fd(), Some(LinkNameSpaceType::Network))?;
+            Self::open()
+        };
+        thread::scope(|scope| scope.spawn(enter).join())
+            .unwrap_or_else(|_| Err(io::Error::other("the thread that entered it panicked")))
+    }
+
+    /// All interfaces, by number.
+    ///
+    /// # Errors
+    /// When the kernel does not answer.
+    pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
+        let links = self.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
+        let mut interfaces: Vec<_> = links.iter().filter_map(|link| interface(link)).collect();
+        interfaces.sort_by_key(|interface| interface.index);
+        let names: HashMap<_, _> =
+            interfaces.iter().map(|interface| (interface.index, interface.name.clone())).collect();
+        let mut namespaces = None;
+        for interface in &mut interfaces {
+            match &mut interface.kind {
+                Kind::Vxcan(Some(Peer { index, name, place: Place::Here })) => {
+                    *name = names.get(index).cloned();
+                }
+                Kind::Vxcan(Some(Peer { index, name, place: Place::Namespace { id, name: space } })) => {
+                    let known = namespaces.get_or_insert_with(|| self.named_namespaces());
+                    *space = known.get(id).cloned();
+                    // Only who may look into that namespace is told.
+                    *name = self.name_in(*id, *index).ok().flatten();
+                }
+                Kind::Hardware(hardware) => hardware.driver = driver(&interface.name),
+                Kind::Vcan | Kind::Vxcan(None) | Kind::Other(_) => {}
+            }
+        }
+        Ok(interfaces)
+    }
+
+    /// The number that another namespace has in this one, if it has one.
+    ///
+    /// # Errors
+    /// When the kernel refuses.
+    pub fn namespace_id(&mut self, namespace: &File) -> io::Result<Option<i32>> {
+        let fd = u32::try_from(namespace.as_raw_fd()).map_err(io::Error::other)?;
+        let mut message = NsidMessage::default();
+        message.attributes.push(NsidAttribute::Fd(fd));
+        let answers = self.request(RouteNetlinkMessage::GetNsId(message), 0)?;
+        let attributes = answers.iter().filter_map(|answer| answer.get(NSID_HEADER..));
+        let mut ids =
+            attributes.flat_map(NlasIterator::new).flatten().filter_map(|it| NsidAttribute::parse(&it).ok());
+        Ok(ids
+            .find_map(|it| if let NsidAttribute::Id(id) = it { Some(id) } else { None })
+            .filter(|&id| id >= 0))
+    }
+
+    /// The namespaces that have both a number here and a name.
+    fn named_namespaces(&mut self) -> HashMap<i32, String> {
+        let mut names = HashMap::new();
+        for entry in std::fs::read_dir(NAMED).into_iter().flatten().flatten() {
+            let id = File::open(entry.path()).and_then(|file| self.namespace_id(&file));
+            if let Ok(Some(id)) = id {
+                names.insert(id, entry.file_name().to_string_lossy().into_owned());
+            }
+        }
+        names
+    }
+
+    fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
+        let mut message = link(index);
+        message.attributes.push(LinkAttribute::IfNetnsId(namespace));
+        let answers = self.request(RouteNetlinkMessage::GetLink(message), 0)?;
+        Ok(answers.iter().find_map(|answer| interface(answer)).map(|interface| interface.name))
+    }
+
+    /// Makes a vcan of this name, marks it and brings it up; its number.
+    ///
+    /// # Errors
+    /// What the kernel says; then nothing was made, or it was removed again.
+    pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
+        let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
+        let marked = self.mark(index);
+        self.or_remove(index, marked)
+    }
+
+    /// Makes a pair, marks both ends and brings them up; the number of the end that is here.
+    ///
+    /// # Errors
+    /// What the kernel says; then nothing was made, or it was removed again.
+    pub fn make_pair(
+        &mut self,
+        name: &str,
+        peer: &str,
+        mut there: Option<(&File, &mut Self)>,
+    ) -> io::Result<u32> {
+        let mut peer_index = 0;
+        let index = self.add(name, |attempt| {
+            let mut end = LinkMessage::default();
+            end.attributes = vec![LinkAttribute::IfName(peer.to_owned()), LinkAttribute::Mtu(FD_MTU)];
+            if let Some((namespace, there)) = &mut there {
+                end.attributes.push(LinkAttribute::NetNsFd(namespace.as_raw_fd()));
+                peer_index = there.free_index()? + attempt.number;
+            } else {
+                peer_index = attempt.index + 1;
+            }
+            end.header.index = peer_index;
+            let data = InfoData::Vxcan(InfoVxcan::Peer(end));
+            Ok(vec![LinkInfo::Kind(InfoKind::Vxcan), LinkInfo::Data(data)])
+        })?;
+        let marked = self.mark(index).and_then(|()| match there {
+            Some((_, there)) => there.mark(peer_index),
+            None => self.mark(peer_index),
+        });
+        self.or_remove(index, marked)
+    }
+
+    /// A number that no interface has, one above all.
+    fn free_index(&mut self) -> io::Result<u32> {
+        let links = self.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
+        let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
+        Ok(indices.max().unwrap_or(0) + 1)
+    }
+
+    /// Makes a link, which is down and has MTU 72; its number. It is chosen here: the kernel does not say
+    /// which one it would have taken, and a name can have changed hands before it is asked about.
+    fn add(
+        &mut self,
+        name: &str,
+        mut info: impl FnMut(Attempt) -> io::Result<Vec<LinkInfo>>,
+    ) -> io::Result<u32> {
+        let first = self.free_index()?;
+        let mut number = 0;
+        loop {
+            let index = first + number;
+            let mut message = link(index);
+            message.attributes = vec![
+                LinkAttribute::IfName(name.to_owned()),
+                LinkAttribute::Mtu(FD_MTU),
+                LinkAttribute::LinkInfo(info(Attempt { index, number })?),
+            ];
+            let flags = NLM_F_CREATE | NLM_F_EXCL;
+            match self.request(RouteNetlinkMessage::NewLink(message), flags) {
+                Ok(_) => return Ok(index),
+                // Somebody else took the number meanwhile.
+                Err(error) if is(&error, Errno::BUSY) && number < 64 => number += 2,
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    fn mark(&mut self, index: u32) -> io::Result<()> {
+        // First the mark: a link that bears it can be removed by whoever comes next.
+        let mut message = link(index);
+        message.attributes.push(LinkAttribute::IfAlias(MARK.to_owned()));
+        self.change(message)?;
+        self.set_up(index, true)
+    }
+
+    fn or_remove(&mut self, index: u32, done: io::Result<()>) -> io::Result<u32> {
+        match done {
+            Ok(()) => Ok(index),
+            Err(error) => {
+                // The first error is the one to tell.
+                let _ = self.remove(index);
+                Err(error)
+            }
+        }
+    }
+
+    fn change(&mut self, message: LinkMessage) -> io::Result<()> {
+        self.request(RouteNetlinkMessage::NewLink(message), 0).map(|_| ())
+    }
+
+    /// Brings an interface up or down.
+    ///
+    /// # Errors
+    /// What the kernel says.
+    pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
+        let mut message = link(index);
+        message.header.change_mask = LinkFlags::Up;
+        message.header.flags = if up { LinkFlags::Up } else { LinkFlags::empty() };
+        self.change(message)
+    }
+
+    /// Sets the MTU of an interface, which has to be down.
+    ///
+    /// # Errors
+    /// What the kernel says.
+    pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
+        let mut message = link(index);
+        message.attributes.push(LinkAttribute::Mtu(mtu));
+        self.change(message)
+    }
+
+    /// Sets the bit rates of CAN hardware, which has to be down. Without a rate for data it is classic.
+    ///
+    /// # Errors
+    /// What the driver says.
+    pub fn set_rates(&mut self, index: u32, rates: Rates) -> io::Result<()> {
+        let fd = if rates.data_bitrate.is_some() { CanCtrlModeFlags::Fd } else { CanCtrlModeFlags::empty() };
+        let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
+        data.extend(rates.bitrate.map(|rate| InfoCan::BitTiming(CanBitTiming::new(rate))));
+        data.extend(rates.data_bitrate.map(|rate| InfoCan::DataBitTiming(CanBitTiming::new(rate))));
+        let mut message = link(index);
+        let info = vec![LinkInfo::Kind(InfoKind::Can), LinkInfo::Data(InfoData::Can(data))];
+        message.attributes.push(LinkAttribute::LinkInfo(info));
+        self.change(message)
+    }
+
+    /// Removes an interface, and the other end of its pair with it.
+    ///
+    /// # Errors
+    /// What the kernel says.
+    pub fn remove(&mut self, index: u32) -> io::Result<()> {
+        self.request(RouteNetlinkMessage::DelLink(link(index)), 0).map(|_| ())
+    }
+
+    /// Does one step; what undoes it, if there is anything to be undone.
+    ///
+    /// # Errors
+    /// What the kernel says; then what the step has done so far was undone.
+    pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
+        let back = |index, mtu, up| Some(Undo::Restore { index, mtu, rates: None, up });
+        match *step {
+            Step::MakeVcan { ref name } => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
+            Step::MakePair { ref name, ref peer, .. } => {
+                self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
+            }
+            Step::BringUp { index, .. } => self.set_up(index, true).map(|()| back(index, None, false)),
+            Step::Widen { index, from, was_up, .. } => {
+                let undo = back(index, Some(from), was_up);
+                let done = self
+                    .set_up(index, false)
+                    .and_then(|()| self.set_mtu(index, FD_MTU))
+                    .and_then(|()| self.set_up(index, true));
+                self.or_undo(done, undo)
+            }
+            Step::SetRates { index, rates, before, was_up, .. } => {
+                let undo = Some(Undo::Restore { index, mtu: None, rates: Some(before), up: was_up });
+                let down = if was_up { self.set_up(index, false) } else { Ok(()) };
+                let done =
+                    down.and_then(|()| self.set_rates(index, rates)).and_then(|()| self.set_up(index, true));
+                self.or_undo(done, undo)
+            }
+            Step::Remove { index, .. } => self.remove(index).map(|()| None),
+        }
+    }
+
+    fn or_undo(&mut self, done: io::Result<()>, undo: Option<Undo>) -> io::Result<Option<Undo>> {
+        if let (Err(_), Some(undo)) = (&done, &undo) {
+            // The first error is the one to tell.
+            let _ = self.undo(undo);
+        }
+        done.map(|()| undo)
+    }
+
+    /// Takes back what a step has done.
+    ///
+    /// # Errors
+    /// What the kernel says.
+    pub fn undo(&mut self, undo: &Undo) -> io::Result<()> {
+        match *undo {
+            Undo::Remove { index } => self.remove(index),
+            Undo::Restore { index, mtu, rates, up } => {
+                self.set_up(index, false)?;
+                if let Some(mtu) = mtu {
+                    self.set_mtu(index, mtu)?;
+                }
+                // No kernel takes back that a rate was set at all.
+                if let Some(rates @ Rates { bitrate: Some(_), .. }) = rates {
+                    self.set_rates(index, rates)?;
+                }
+                if up { self.set_up(index, true) } else { Ok(()) }
+            }
+        }
+    }
+
+    /// Sends one request and takes all that answers it.
+    fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
+        for _ in 0..RETRIES {
+            let (answers, interrupted) = self.ask(payload.clone(), flags)?;
+            if !interrupted {
+                return Ok(answers);
+            }
+        }
+        Err(io::Error::other("the interfaces change faster than they can be read"))
+    }
+
+    fn ask(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {
+        self.sequence += 1;
+        let mut header = NetlinkHeader::default();
+        header.flags = NLM_F_REQUEST | NLM_F_ACK | flags;
+        header.sequence_number = self.sequence;
+        let mut message = NetlinkMessage::new(header, NetlinkPayload::InnerMessage(payload));
+        message.finalize();
+        let mut bytes = vec![0; message.buffer_len()];
+        message.serialize(&mut bytes);
+        rustix::net::send(&self.socket, &bytes, SendFlags::empty())?;
+
+        let (mut answers, mut interrupted) = (Vec::new(), false);
+        let mut buffer = vec![0; 1 << 17];
+        loop {
+            let (len, _) = rustix::io::retry_on_intr(|| {
+                rustix::net::recv(&self.socket, &mut buffer[..], RecvFlags::empty())
+            })?;
+            let mut rest = buffer.get(..len).unwrap_or_default();
+            while let Ok(answer) = NetlinkBuffer::new_checked(rest) {
+                let len = (answer.length() as usize).next_multiple_of(4);
+                rest = rest.get(len..).unwrap_or_default();
+                if answer.sequence_number() != self.sequence {
+                    continue;
+                }
+                interrupted |= answer.flags() & NLM_F_DUMP_INTR != 0;
+                match answer.message_type() {
+                    NLMSG_DONE => return Ok((answers, interrupted)),
+                    NLMSG_ERROR => {
+                        let error = ErrorBuffer::new_checked(answer.payload()).map_err(io::Error::other)?;
+                        return match error.code() {
+                            None => Ok((answers, interrupted)),
+                            Some(code) => Err(io::Error::from_raw_os_error(code.get().abs())),
+                        };
+                    }
+                    _ => answers.push(answer.payload().to_vec()),
+                }
+            }
+        }
+    }
+}
+
+/// What takes a step back.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Undo {
+    /// Removes what was made.
+    Remove {
+        /// Its number.
+        index: u32,
+    },
+    /// Gives an interface back what it had.
+    Restore {
+        /// Its number.
+        index: u32,
+        /// Its MTU, if that was changed.
+        mtu: Option<u32>,
+        /// Its bit rates, if those were.
+        rates: Option<Rates>,
+        /// Whether it was up.
+        up: bool,
+    },
+}
+
+/// One try at making a link.
+#[derive(Clone, Copy)]
+struct Attempt {
+    index: u32,
+    number: u32,
+}
+
+fn is(error: &io::Error, errno: Errno) -> bool {
+    error.raw_os_error() == Some(errno.raw_os_error())
+}
+
+/// The beginning of a message about the interface of this number.
+fn link(index: u32) -> LinkMessage {
+    let mut message = LinkMessage::default();
+    message.header.index = index;
+    message
+}
+
+/// Reads what the kernel says of one interface. What is not understood is left out: a strange interface
+/// must not hide the others.
+fn interface(bytes: &[u8]) -> Option<Interface> {
+    let header = LinkHeader::parse(bytes).ok()?;
+    let is_can = header.link_layer_type == LinkLayerType::Can;
+    let mut interface = Interface {
+        index: header.index,
+        name: String::new(),
+        kind: Kind::Other(words(header.link_layer_type, None)),
+        ours: false,
+        up: header.flags.contains(LinkFlags::Up),
+        mtu: 0,
+        counters: Counters::default(),
+    };
+    let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
+    for attribute in NlasIterator::new(bytes.get(LINK_HEADER..)?).flatten() {
+        let Ok(attribute) = LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec) else {
+            continue;
+        };
+        if let LinkAttribute::IfName(name) = attribute {
+            interface.name = name;
+        } else if let LinkAttribute::IfAlias(alias) = attribute {
+            interface.ours = alias == MARK;
+        } else if let LinkAttribute::Mtu(mtu) = attribute {
+            interface.mtu = mtu;
+        } else if let LinkAttribute::Link(index) = attribute {
+            peer = Some(index);
+        } else if let LinkAttribute::LinkNetNsId(id) = attribute {
+            namespace = Some(id);
+        } else if let LinkAttribute::LinkInfo(given) = attribute {
+            info = given;
+        } else if let LinkAttribute::Stats64(stats) = attribute {
+            interface.counters = Counters {
+                received: stats.rx_packets,
+                sent: stats.tx_packets,
+                dropped: stats.rx_dropped + stats.tx_dropped,
+                errors: stats.rx_errors + stats.tx_errors,
+            };
+        }
+    }
+    let kind = info.iter().find_map(|it| if let LinkInfo::Kind(kind) = it { Some(kind) } else { None });
+    let data = info.iter().find_map(|it| if let LinkInfo::Data(data) = it { Some(data) } else { None });
+    interface.kind = match (is_can, kind) {
+        (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
+        (true, Some(InfoKind::Vcan)) => Kind::Vcan,
+        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| {
+            let place = namespace.map_or(Place::Here, |id| Place::Namespace { id, name: None });
+            Peer { index, name: None, place }
+        })),
+        (true, _) => {
+            let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
+            Kind::Hardware(hardware(data))
+        }
+    };
+    Some(interface)
+}
+
+fn hardware(data: &[InfoCan]) -> Hardware {
+    let mut hardware = Hardware::default();
+    let set = |timing: &CanBitTiming| Some(timing.bitrate).filter(|&rate| rate > 0);
+    for attribute in data {
+        if let InfoCan::BitTiming(timing) = attribute {
+            hardware.bitrate = set(timing);
+        } else if let InfoCan::DataBitTiming(timing) = attribute {
+            hardware.data_bitrate = set(timing);
+        } else if let InfoCan::State(state) = attribute {
+            hardware.state = State::from_number(*state);
+        } else if let InfoCan::CtrlMode(mode) = attribute {
+            hardware.fd = mode.flags.contains(CanCtrlModeFlags::Fd);
+            hardware.listen_only = mode.flags.contains(CanCtrlModeFlags::ListenOnly);
+        }
+    }
+    hardware
+}
+
+/// What an interface is that is no CAN.
+fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
+    if layer == LinkLayerType::Loopback {
+        return "the loopback interface".to_owned();
+    }
+    match kind {
+        Some(kind) => format!("a network interface ({kind})"),
+        None => format!("a network interface ({})", layer.to_string().to_lowercase()),
+    }
+}
+
+/// The driver of hardware, by sysfs.
+fn driver(name: &str) -> Option<String> {
+    let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
+    Some(link.file_name()?.to_string_lossy().into_owned())
+}
