@@ -41,7 +41,10 @@ impl Parted {
         place.scenario(PRESSED);
         let vcan1 = Vcan::make("vcan1");
         let cells = ["1-4", "5-8"].map(|nodes| {
-            place.start("cell-node", &format!("--bus vcan0 --bus-kind socketcan --nodes {nodes} --skin cells.toml"))
+            place.start(
+                "cell-node",
+                &format!("--bus vcan0 --bus-kind socketcan --nodes {nodes} --skin cells.toml"),
+            )
         });
         Self { place, _cells: cells.into(), _rules: Rules, _vcan1: vcan1 }
     }
@@ -63,7 +66,8 @@ fn passed(filter: &str) -> usize {
     // Its exit code says how much it was told.
     let rules = command("cangw -L").output().unwrap().stdout;
     let rules = String::from_utf8(rules).unwrap();
-    let rule = rules.lines().find(|rule| rule.contains(filter)).unwrap_or_else(|| panic!("{filter}: {rules}"));
+    let rule =
+        rules.lines().find(|rule| rule.contains(filter)).unwrap_or_else(|| panic!("{filter}: {rules}"));
     let (_, counts) = rule.split_once("# ").unwrap();
     let &[handled, "handled", "0", "dropped", ..] = &counts.split(' ').collect::<Vec<_>>()[..] else {
         panic!("{counts}")
@@ -108,7 +112,10 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
     summary.all_were_due(CELLS as u64, &ended.stderr);
 
     let wrong = damaged(&theirs);
-    assert!(wrong.len() > 50 && wrong.iter().all(|frame| [0x202, 0x203].contains(&frame.raw_id())), "{wrong:?}");
+    assert!(
+        wrong.len() > 50 && wrong.iter().all(|frame| [0x202, 0x203].contains(&frame.raw_id())),
+        "{wrong:?}"
+    );
     assert_eq!(wrong.len(), under(&theirs, 0x202) + under(&theirs, 0x203), "every one of theirs");
     assert_eq!(damaged(&ours), wrong, "the log has them as they came");
     assert_eq!(passed("202:C00007FE"), wrong.len());
@@ -210,7 +217,8 @@ fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_ide
     let (rejected, surplus, unknown) = (of("/uplink/rejected"), of("/uplink/surplus"), of("/uplink/unknown"));
     assert_eq!((rejected, surplus, unknown), (wrong, wrong, wrong), "{:#}", summary.0);
     assert_eq!((of("/replies/lost"), of("/replies/unknown")), (wrong, 0), "{:#}", summary.0);
-    let used = of("/replies/in_time") + of("/replies/late") + summary.count("/buses/0/events", "stale torque");
+    let used =
+        of("/replies/in_time") + of("/replies/late") + summary.count("/buses/0/events", "stale torque");
     assert_eq!(used, torques(&Log::of(theirs, Format::Fd)), "{:#}", summary.0);
     assert_eq!(summary.0["buses"][0]["cells"], serde_json::json!({"active": CELLS - 1, "quiet": 1}));
     assert!(summary.figure("/accuracy/single/max_nm") < 0.002, "{:#}", summary.0["accuracy"]);

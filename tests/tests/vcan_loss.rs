@@ -6,12 +6,14 @@
 
 mod process;
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use process::vcan::{backlog_drops, needs};
-use process::{PATIENCE, Place, until};
+use process::vcan::{Candump, backlog_drops, frames_of, needs, small_skin, tool};
+use process::{PATIENCE, PRESSED, Place, is_stopped, until};
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{EXTENDED, Frame};
+use rustix::process::Signal;
 
 /// About 16 frames, of which the kernel makes 32 and more.
 const SMALL: usize = 16 * 1024;
@@ -160,4 +162,54 @@ fn what_is_lost_is_counted_on_the_embedded_bus() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
     what_is_lost_is_counted(BusKind::Embedded, &place);
+}
+
+/// Frames by identifier.
+fn counts(frames: &[Frame]) -> BTreeMap<u32, usize> {
+    let mut counts = BTreeMap::new();
+    for frame in frames {
+        *counts.entry(frame.raw_id()).or_default() += 1;
+    }
+    counts
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
+    const FOREIGN: u32 = 600;
+    let place = Place::on_vcan();
+    place.write("skin.toml", &small_skin(8));
+    place.scenario(PRESSED);
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
+    let backlog = backlog_drops();
+    let bench = place.running_bench(4.0, &format!("--receive-buffer {SMALL}"));
+    place.guest().waits_for_epoch(10);
+    bench.signal(Signal::STOP);
+    until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
+    // For more than a second; cells say what they have to say meanwhile.
+    tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
+    bench.signal(Signal::CONT);
+    let ended = bench.end().well();
+    let (ours, mut theirs) = (frames_of(&place.path("run.log")), candump.frames());
+    // What cells said when the gateway listened no more is nobody's loss.
+    let last = ours.last().unwrap();
+    theirs.truncate(1 + theirs.iter().rposition(|frame| frame == last).unwrap());
+
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.of_bus("/receive_buffer"), 2 * SMALL as u64);
+    let dropped = summary.of_bus("/dropped_by_bus");
+    assert_eq!((theirs.len() - ours.len()) as u64, dropped, "{}", ended.stderr);
+    let (ours, theirs) = (counts(&ours), counts(&theirs));
+    assert!(ours.iter().all(|(id, count)| theirs[id] >= *count), "{ours:?} {theirs:?}");
+    let foreign = FOREIGN as usize - ours[&(0x0123_4567 | EXTENDED)];
+    assert!(foreign > 400 && (foreign as u64) < dropped, "{foreign} of {dropped} were foreign");
+    // Of the rest, those of cells are missed in their accounts, and nothing else is.
+    let by_cells = |counts: &BTreeMap<u32, usize>| -> usize {
+        counts.iter().filter(|(id, _)| (0x200..0x500).contains(*id)).map(|(_, count)| count).sum()
+    };
+    let missed = (by_cells(&theirs) - by_cells(&ours)) as u64;
+    assert!(missed > 8, "{missed} missed of the cells");
+    assert_eq!((summary.of_bus("/uplink/dropped"), summary.of_bus("/uplink/surplus")), (missed, 0));
+    assert_eq!((summary.number("/recording/lost"), backlog_drops()), (0, backlog));
 }

@@ -181,6 +181,24 @@ pub fn cases() -> Vec<Case> {
             classic(1),
             true,
         ),
+        case(
+            "an inverted filter and an exact one for the same receive everything",
+            &[exact(0x123).inverted(), exact(0x123)],
+            classic(0x123),
+            true,
+        ),
+        case(
+            "what an inverted filter and another both let pass comes once",
+            &[exact(1).inverted(), exact(0x123), Filter::ALL],
+            fd(0x123),
+            true,
+        ),
+        case(
+            "an inverted exact filter of 11 bits lets the same number in 29 pass",
+            &[exact(0x123).inverted()],
+            classic(0x123 | EXTENDED),
+            true,
+        ),
         Case { error_mask: 0x1, ..case("the error mask receives its class", &[], classic(ERROR | 1), true) },
         Case {
             error_mask: 0x1,
@@ -202,7 +220,79 @@ pub fn cases() -> Vec<Case> {
                 true,
             )
         },
+        Case {
+            error_mask: EXTENDED_MASK,
+            ..case(
+                "the full error mask receives an error frame of several classes",
+                &[],
+                classic(ERROR | 0x8C),
+                true,
+            )
+        },
+        Case {
+            error_mask: EXTENDED_MASK,
+            ..case("an error frame of no class is received by nobody", &all, classic(ERROR), false)
+        },
+        case("an exact filter receives no error frame", &[exact(0x4)], classic(ERROR | 0x4), false),
+        case("the error flag in a filter's identifier inverts it", &[exact(0x4 | ERROR)], classic(0x5), true),
+        case(
+            "a filter of error classes cannot be inverted",
+            &[masked(ERROR, ERROR | 0x4)],
+            classic(ERROR | 0x8),
+            false,
+        ),
+        case(
+            "a filter of error classes receives no data frame",
+            &[masked(0, ERROR | 0x4)],
+            classic(0x4),
+            false,
+        ),
+        Case {
+            error_mask: 0x4,
+            fd: false,
+            ..case("a classic socket receives error frames", &all, classic(ERROR | 0x4), true)
+        },
+        Case {
+            error_mask: 0x4,
+            from_self: true,
+            ..case("own error frames are not received", &all, classic(ERROR | 0x4), false)
+        },
+        Case {
+            error_mask: 0x4,
+            from_self: true,
+            own_frames: true,
+            ..case("own error frames are received when asked for", &[], classic(ERROR | 0x4), true)
+        },
         Case { from_self: true, ..case("own frames are not received", &all, classic(0x123), false) },
+        Case {
+            from_self: true,
+            ..case(
+                "own frames are not received through an exact filter",
+                &[exact(0x123)],
+                classic(0x123),
+                false,
+            )
+        },
+        Case {
+            from_self: true,
+            own_frames: true,
+            ..case(
+                "own frames that several filters match come once",
+                &[exact(2), Filter::ALL, exact(2)],
+                fd(2),
+                true,
+            )
+        },
+        Case {
+            from_self: true,
+            own_frames: true,
+            ..case("own frames pass inverted filters too", &[exact(2).inverted()], fd(2), false)
+        },
+        Case {
+            from_self: true,
+            own_frames: true,
+            ..case("who wants nothing gets no own frames", &[], classic(2), false)
+        },
         Case {
             from_self: true,
             own_frames: true,
@@ -219,6 +309,24 @@ pub fn cases() -> Vec<Case> {
         },
         Case { fd: false, ..case("a classic socket receives a classic frame", &all, classic(0x123), true) },
         Case { fd: false, ..case("a classic socket receives no FD frame", &all, fd(0x123), false) },
+        Case {
+            fd: false,
+            ..case(
+                "a classic socket receives no FD frame through an exact filter",
+                &[exact(0x123)],
+                fd(0x123),
+                false,
+            )
+        },
+        Case {
+            fd: false,
+            ..case(
+                "a classic socket receives no FD frame, however short",
+                &all,
+                Frame::fd(0x123, 0, &[]).expect("nothing fits"),
+                false,
+            )
+        },
     ]
 }
 
