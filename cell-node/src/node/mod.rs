@@ -35,6 +35,8 @@ pub use stimuli::PENDING;
 
 /// From one heartbeat to the next.
 pub const HEARTBEAT: Span = Span::from_millis(250);
+/// So much earlier at most is a heartbeat said together with an answer, which spares a wake-up.
+pub const EARLY: Span = Span::from_millis(50);
 /// How long a new cell listens at least for another one under its number.
 pub const CLAIM: Span = Span::from_millis(250);
 /// First words are spread over this time by serial number: two cells under one number that are switched
@@ -198,6 +200,10 @@ impl Node {
             return self.push_heartbeat();
         }
         self.claim = Claim::Settled;
+        self.regular_heartbeat(now);
+    }
+
+    fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
         // After a hang the missed ones are skipped, and the phase is kept.
         let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
@@ -255,7 +261,10 @@ impl Node {
             return;
         };
         match message {
-            Message::Joints { epoch, joints } => self.take_joints(age, epoch, &joints),
+            Message::Joints { epoch, joints } => {
+                self.take_joints(age, epoch, &joints);
+                self.heartbeat_before_the_next_joints(now);
+            }
             Message::Halt => {
                 self.flags = self.flags.with(State::HALTED, true);
                 self.active = false;
@@ -315,6 +324,15 @@ impl Node {
         self.flags = self.flags.with(State::SATURATED, saturated);
         self.active = true;
         self.push_torque(epoch, torque.words());
+    }
+
+    /// A heartbeat that is due before the next joints is said now, while the cell is awake.
+    fn heartbeat_before_the_next_joints(&mut self, now: Micros) {
+        let Some(in_use) = self.configuration.in_use() else { return };
+        let early = Span(u64::from(in_use.parameters.period_us).min(EARLY.0));
+        if self.claim == Claim::Settled && now + early > self.next_heartbeat {
+            self.regular_heartbeat(now);
+        }
     }
 
     /// One zero torque says that a contact has ended.

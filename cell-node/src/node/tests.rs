@@ -160,6 +160,36 @@ fn a_halted_cell_is_silent_until_a_resume() {
 }
 
 #[test]
+fn a_heartbeat_that_is_due_before_the_next_joints_comes_with_the_answer_and_shifts_no_other() {
+    let mut node = settled(Flash::Sound(wheel()));
+    let due = node.poll_timeout();
+    let mut epoch = Epoch(0);
+    let mut joints_at = |node: &mut Node, at: u64| {
+        epoch = epoch.next();
+        let joints = Message::Joints { epoch, joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 } };
+        for frame in joints.encode().frames(Format::Fd) {
+            node.handle_frame(Micros(at), Span(0), &frame);
+        }
+        drain(node).len()
+    };
+    assert_eq!(joints_at(&mut node, due.0 - 16_000), 0, "the next joints come in time for it");
+    assert_eq!(node.poll_timeout(), due);
+    assert_eq!(joints_at(&mut node, due.0 - 15_999), 1);
+    assert_eq!(node.poll_timeout(), due + HEARTBEAT, "neither drifts nor comes twice");
+    node.handle_timeout(due);
+    assert_eq!(drain(&mut node), []);
+    // With nobody to answer it comes when it is due.
+    node.handle_timeout(due + HEARTBEAT);
+    assert_eq!(drain(&mut node).len(), 1);
+
+    let slow = Parameters { period_us: 200_000, ..wheel() };
+    let mut node = settled(Flash::Sound(slow));
+    let due = node.poll_timeout();
+    assert_eq!(joints_at(&mut node, due.0 - EARLY.0), 0, "a long period does not make it much too early");
+    assert_eq!(joints_at(&mut node, due.0 - EARLY.0 + 1), 1);
+}
+
+#[test]
 fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
     let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
     assert_eq!(drain(&mut node), [], "nothing yet");
