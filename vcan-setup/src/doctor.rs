@@ -19,8 +19,8 @@ use crate::plan::{SkinBus, Wanted, agrees, set_rates, wanted_rates};
 
 /// What one frame takes in a receive buffer, as the kernel counts it.
 const FRAME: usize = 1_024;
-/// How many answers of every cell should fit into a receive buffer.
-const ANSWERS: usize = 4;
+/// How many times an answer of every cell should fit into a receive buffer.
+const TIMES: usize = 4;
 
 /// All that the judgement rests on.
 #[derive(Clone, Debug)]
@@ -29,6 +29,8 @@ pub struct Facts {
     pub choice: Choice,
     /// Whether the cells are there already, as `gateway run --no-spawn` has it.
     pub no_spawn: bool,
+    /// How this program is called so that `sudo` finds it.
+    pub program: String,
     /// The kernel.
     pub kernel: Kernel,
     /// Who asks.
@@ -41,8 +43,6 @@ pub struct Facts {
     pub cell_node: Program,
     /// Where the embedded buses of this user are, or why none can be used.
     pub embedded: Result<PathBuf, String>,
-    /// The skin's file, if there is one.
-    pub skin: Option<String>,
     /// The buses that were asked about.
     pub buses: Vec<Bus>,
     /// The CAN interfaces that there are.
@@ -180,6 +180,11 @@ impl Facts {
         }
     }
 
+    /// A command of this program, as root.
+    fn own(&self, command: &str) -> String {
+        self.sudo(&format!("{} {command}", self.program))
+    }
+
     fn sudo(&self, command: &str) -> String {
         if self.user.admin { command.to_owned() } else { format!("sudo {command}") }
     }
@@ -187,7 +192,7 @@ impl Facts {
     /// What `vcan-setup up` is told to mean a bus: its skin, or its name.
     fn up(&self, wanted: &Wanted) -> String {
         let what = wanted.skin.as_ref().map_or(&wanted.name, |skin| &skin.file);
-        self.sudo(&format!("vcan-setup up {what}"))
+        self.own(&format!("up {what}"))
     }
 
     fn kind(&self) -> Finding {
@@ -202,8 +207,8 @@ impl Facts {
             }
             (Choice::Auto, false) => Finding::note(
                 format!(
-                    "the kernel ({release}) has no CAN: the bench runs on the embedded bus, where candump \
-                     cannot listen, and without real interfaces; this would give it CAN:"
+                    "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no \
+                     real cell; for a kernel with CAN:"
                 ),
                 remedies(),
             ),
@@ -211,7 +216,7 @@ impl Facts {
                 format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"),
                 remedies()
                     .into_iter()
-                    .chain(["leave out --bus-kind socketcan    (the bench then runs on the embedded bus)"
+                    .chain(["# leave out --bus-kind socketcan: the bench then runs on the embedded bus"
                         .to_owned()]),
             ),
         }
@@ -242,7 +247,7 @@ impl Facts {
             }
             User { root: true, .. } => findings.push(Finding::fault(
                 "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
-                ["docker run --cap-add NET_ADMIN ...    (or make the interface outside, in this network)"
+                ["docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network"
                     .to_owned()],
             )),
         }
@@ -261,7 +266,7 @@ impl Facts {
             )),
             None => Finding::fault(
                 "there is no CAN interface that is up and carries CAN FD",
-                [self.sudo("vcan-setup up vcan0")],
+                [self.own("up vcan0")],
             ),
         })
     }
@@ -275,11 +280,9 @@ impl Facts {
                         "there is no interface {name}, and the skin gives it a bitrate, so it is hardware"
                     ),
                     [
-                        "plug it in, load its driver, and see `vcan-setup status`".to_owned(),
-                        format!(
-                            "{}    (once bitrate is taken out of the skin: a vcan)",
-                            self.up(&bus.wanted)
-                        ),
+                        "# plug it in and load its driver; `vcan-setup status` shows when it is there"
+                            .to_owned(),
+                        format!("{}  # once bitrate is taken out of the skin: a vcan", self.up(&bus.wanted)),
                     ],
                 )
             } else {
@@ -290,7 +293,7 @@ impl Facts {
             Kind::Other(what) => {
                 return vec![Finding::fault(
                     format!("{name} is {what}, which carries no CAN"),
-                    ["name another bus".to_owned()],
+                    ["# name another bus".to_owned()],
                 )];
             }
             Kind::Vcan | Kind::Vxcan(_) => self.virtual_faults(bus, interface),
@@ -330,16 +333,14 @@ impl Facts {
         let skin = bus.wanted.skin.as_ref();
         // What sets the bit rates, or would if they were known.
         let set = || match skin {
-            Some(SkinBus { file, bitrate: Some(_), .. }) => {
-                self.sudo(&format!("vcan-setup up {file} --set-bit-rates"))
-            }
+            Some(SkinBus { file, bitrate: Some(_), .. }) => self.own(&format!("up {file} --set-bit-rates")),
             Some(_) | None => {
                 let rates = match bus.wanted.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
                     Format::Classic => "bitrate 1000000",
                 };
                 self.sudo(&format!(
-                    "sh -c 'ip link set {name} down; ip link set {name} up type can {rates}'    (or the rates of your bus)"
+                    "sh -c 'ip link set {name} down; ip link set {name} up type can {rates}'  # or the rates of your bus"
                 ))
             }
         };
@@ -350,7 +351,7 @@ impl Facts {
             findings.push(Finding::fault(text, [set()]));
         } else if !bus.wanted.carried_by(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
-            findings.push(Finding::fault(text, [set(), "format = \"classic\" in the skin".to_owned()]));
+            findings.push(Finding::fault(text, [set(), "format = \"classic\"  # in the skin".to_owned()]));
         } else if !up {
             findings.push(Finding::fault(format!("{name} is {what}, and down"), [set()]));
         }
@@ -375,10 +376,12 @@ impl Facts {
         }
         if would_run(&findings) && skin.is_some_and(|skin| skin.bitrate.is_some()) {
             findings.push(Finding::ok(format!("{name} is at {}, as the skin says", set_rates(hardware))));
+        } else if would_run(&findings) && skin.is_none() {
+            findings.push(Finding::ok(format!("{name} is at {}", set_rates(hardware))));
         } else if would_run(&findings) {
             findings.push(Finding::note(
                 format!("{name} is at {}; the skin does not say whether that is right", set_rates(hardware)),
-                ["bitrate = ... under its [[bus]] in the skin".to_owned()],
+                ["bitrate = ...  # under its [[bus]] in the skin".to_owned()],
             ));
         }
         findings
@@ -397,7 +400,7 @@ impl Facts {
         if heard.gateway {
             findings.push(Finding::fault(
                 format!("another gateway sends joints on {on}{name}"),
-                ["pgrep -a gateway    (and stop it, or take another bus)".to_owned()],
+                ["pgrep -a gateway  # and stop it, or take another bus".to_owned()],
             ));
         }
         let count = heard.cells.len();
@@ -405,13 +408,13 @@ impl Facts {
             (false, 0) | (true, 1..) => {}
             (false, _) => findings.push(Finding::fault(
                 format!("cells are on {on}{name} already: {}", nodes(&heard.cells)),
-                ["gateway run ... --no-spawn    (and doctor ... --no-spawn, to use them; or stop them)"
+                ["gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them"
                     .to_owned()],
             )),
             (true, 0) => findings.push(Finding::fault(
                 format!("no cell is heard on {on}{name}, and with --no-spawn they have to be there"),
                 [format!(
-                    "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &    (or leave out --no-spawn)"
+                    "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
                 )],
             )),
         }
@@ -440,23 +443,25 @@ impl Facts {
             Some(cells) => cells.len() * frames_of(&bus.wanted),
             None => usize::from(CellId::MAX.get()),
         });
-        let cells = most.max().unwrap_or_else(|| usize::from(CellId::MAX.get()));
-        let (one, needed) = (cells * FRAME, ANSWERS * cells * FRAME);
-        let [has, wants] = [granted, needed].map(|bytes| bytes.div_ceil(1_024));
+        let frames = most.max().unwrap_or_else(|| usize::from(CellId::MAX.get()));
+        let (once, needed) = (frames * FRAME, TIMES * frames * FRAME);
+        let (has, wants) = (granted >> 10, needed >> 10);
         let remedy = || [self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"))];
         Some(if granted >= needed {
-            Finding::ok(format!("receive buffers of {has} KiB hold {ANSWERS} answers of {cells} frames"))
-        } else if granted >= one {
+            Finding::ok(format!(
+                "receive buffers of {has} KiB hold all answers, {frames} frames, {TIMES} times over"
+            ))
+        } else if granted >= once {
             Finding::note(
                 format!(
-                    "receive buffers are limited to {has} KiB, and {ANSWERS} answers of {cells} frames need {wants} KiB: a gateway that is held up loses some"
+                    "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {TIMES} times over takes {wants} KiB, and a gateway that is held up loses some"
                 ),
                 remedy(),
             )
         } else {
             Finding::fault(
                 format!(
-                    "receive buffers are limited to {has} KiB, which do not hold one answer of {cells} frames: {wants} KiB are needed"
+                    "receive buffers are limited to {has} KiB and do not hold all answers, {frames} frames, even once; {wants} KiB are right"
                 ),
                 remedy(),
             )
@@ -476,7 +481,7 @@ impl Facts {
         let Some(backlog) = self.backlog else {
             return Some(Finding::note(
                 "the kernel's backlog cannot be seen from this network namespace",
-                ["sysctl net.core.netdev_max_backlog    (in the first one)".to_owned()],
+                ["sysctl net.core.netdev_max_backlog  # in the first one".to_owned()],
             ));
         };
         Some(if backlog >= frames {
@@ -506,7 +511,7 @@ impl Facts {
         let fault = |name| {
             Finding::fault(
                 format!("bus {name} has reply = \"sum\", which this version cannot run"),
-                ["reply = \"torque\" in the skin".to_owned()],
+                ["reply = \"torque\"  # in the skin".to_owned()],
             )
         };
         sums.map(fault).collect()
@@ -519,7 +524,8 @@ impl Facts {
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
             (false, false) => Some(Finding::fault(
                 format!("cell-node is not at {}: the gateway starts it from beside itself", path.display()),
-                ["cargo build --release    (in the project's folder; or name it with gateway run --cell-node)".to_owned()],
+                ["cargo build --release  # in the project's folder; or name it with gateway run --cell-node"
+                    .to_owned()],
             )),
         }
     }
@@ -543,3 +549,6 @@ fn nodes(cells: &BTreeSet<CellId>) -> String {
     };
     first.join(", ") + &more
 }
+
+#[cfg(test)]
+mod tests;

@@ -65,41 +65,49 @@ impl Kernel {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
-    /// What mends that there is no CAN, or no `vcan`: one command a line, the nearest first.
+    /// What mends that there is no CAN, or no `vcan`: one command each, with a comment as in a shell, the
+    /// nearest first.
     #[must_use]
     pub fn remedies(&self, module: Module) -> Vec<String> {
-        let modprobe = "sudo modprobe -a can_raw vcan vxcan".to_owned();
+        let modprobe = "sudo modprobe -a can_raw vcan vxcan";
         let here = match module {
-            Module::There => Vec::new(),
-            Module::Loadable => vec![modprobe],
-            Module::Missing => self.other_kernel(modprobe),
-            Module::Unknown => vec![format!(
-                "{modprobe}    (on the machine below, when this is a container: the modules of {} are not here)",
-                self.release
-            )],
+            Module::There => None,
+            Module::Loadable => Some(modprobe.to_owned()),
+            Module::Missing => Some(self.other_kernel(modprobe)),
+            Module::Unknown => {
+                Some(format!("{modprobe}  # on the host, if this is a container: its modules are not here"))
+            }
         };
-        let lab =
-            "tests/lab/run COMMAND    (from the project's folder: boots a machine that has it)".to_owned();
-        here.into_iter().chain([lab]).collect()
+        let lab = "tests/lab/run COMMAND  # in the project's folder: runs it in a machine that has vcan";
+        here.into_iter().chain([lab.to_owned()]).collect()
     }
 
-    fn other_kernel(&self, modprobe: String) -> Vec<String> {
+    fn other_kernel(&self, modprobe: &str) -> String {
         let is = |name: &str| self.distribution.split_whitespace().any(|word| word == name);
         let architecture = match self.machine.as_str() {
             "x86_64" => "amd64",
             "aarch64" => "arm64",
             other => other,
         };
-        if is("ubuntu") {
-            return vec![format!("sudo apt install linux-modules-extra-{} && {modprobe}", self.release)];
+        let release = &self.release;
+        // Elsewhere than on the distribution's own kernel its packages do not help.
+        if is("ubuntu")
+            && ["-generic", "-virtual", "-kvm", "-aws", "-azure", "-gcp"]
+                .iter()
+                .any(|end| release.ends_with(end))
+        {
+            return format!("sudo apt install linux-modules-extra-{release} && {modprobe}");
         }
-        if is("debian") {
-            let cloud = if self.release.contains("cloud") { "this one is a cloud kernel; " } else { "" };
-            return vec![format!(
-                "sudo apt install linux-image-{architecture}    ({cloud}then boot the new one, and `{modprobe}`)"
-            )];
+        if is("debian") && release.ends_with(architecture) {
+            let cloud =
+                if release.contains("cloud") { "a generic kernel, not a cloud one" } else { "a newer one" };
+            return format!(
+                "sudo apt install linux-image-{architecture}  # {cloud}: boot it, then {modprobe}"
+            );
         }
-        vec![format!("a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN    ({} has none)", self.release)]
+        format!(
+            "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN: {release} has neither, nor modules for them"
+        )
     }
 }
 
@@ -107,13 +115,16 @@ impl Kernel {
 struct Lists {
     built_in: Option<String>,
     on_disk: Option<String>,
+    /// Whether the kernel can load modules at all.
+    takes_modules: bool,
 }
 
 impl Lists {
     fn read(release: &str) -> Self {
         let directory = Path::new("/lib/modules").join(release);
         let read = |name| fs::read_to_string(directory.join(name)).ok();
-        Self { built_in: read("modules.builtin"), on_disk: read("modules.dep") }
+        let takes_modules = Path::new("/proc/modules").exists();
+        Self { built_in: read("modules.builtin"), on_disk: read("modules.dep"), takes_modules }
     }
 
     fn module(&self, name: &str, works: bool) -> Module {
@@ -122,7 +133,7 @@ impl Lists {
             Module::There
         } else if lists(&self.on_disk) {
             Module::Loadable
-        } else if self.on_disk.is_some() {
+        } else if self.on_disk.is_some() || !self.takes_modules {
             Module::Missing
         } else {
             Module::Unknown
@@ -163,44 +174,50 @@ mod tests {
 
     #[test]
     fn where_a_module_is() {
-        let lists = Lists { built_in: Some("kernel/net/can/can.ko\n".into()), on_disk: Some(DEP.into()) };
+        let lists = Lists {
+            built_in: Some("kernel/net/can/can.ko\n".into()),
+            on_disk: Some(DEP.into()),
+            takes_modules: true,
+        };
         assert_eq!(lists.module("can", false), Module::There);
         assert_eq!(lists.module("vcan", false), Module::Loadable);
         assert_eq!(lists.module("vcan", true), Module::There);
         assert_eq!(lists.module("vxcan", false), Module::Missing);
-        let none = Lists { built_in: None, on_disk: None };
-        assert_eq!(none.module("vcan", false), Module::Unknown);
+        let none = |takes_modules| Lists { built_in: None, on_disk: None, takes_modules };
+        assert_eq!(none(true).module("vcan", false), Module::Unknown);
+        assert_eq!(none(false).module("vcan", false), Module::Missing);
     }
 
-    fn kernel(release: &str, os_release: &str) -> Kernel {
-        Kernel {
+    fn first(release: &str, os_release: &str, module: Module) -> String {
+        let kernel = Kernel {
             release: release.into(),
             machine: "x86_64".into(),
             distribution: distribution(os_release),
             has_can: false,
-            can_raw: Module::Missing,
-            vcan: Module::Missing,
-            vxcan: Module::Missing,
-        }
+            can_raw: module,
+            vcan: module,
+            vxcan: module,
+        };
+        kernel.remedies(module).remove(0)
     }
 
     #[test]
-    fn the_remedy_fits_the_distribution() {
-        let first = |kernel: Kernel| kernel.remedies(Module::Missing).remove(0);
-        let debian = first(kernel("6.1.0-30-cloud-amd64", "ID=debian\nVERSION_ID=\"12\"\n"));
-        assert!(debian.starts_with("sudo apt install linux-image-amd64 "), "{debian}");
-        assert!(debian.contains("cloud kernel"), "{debian}");
-        let mint = first(kernel(
-            "6.8.0-50-generic",
-            "NAME=\"Linux Mint\"\nID=linuxmint\nID_LIKE=\"ubuntu debian\"\n",
-        ));
-        assert!(
-            mint.starts_with("sudo apt install linux-modules-extra-6.8.0-50-generic && sudo modprobe"),
-            "{mint}"
+    fn the_remedy_fits_the_kernel_and_the_distribution() {
+        let debian = "PRETTY_NAME=\"Debian\"\nID=debian\nVERSION_ID=\"12\"\n";
+        assert_eq!(
+            first("6.1.0-30-cloud-amd64", debian, Module::Missing),
+            "sudo apt install linux-image-amd64  # a generic kernel, not a cloud one: boot it, then sudo modprobe \
+             -a can_raw vcan vxcan"
         );
-        let other = first(kernel("6.12.1", "ID=arch\n"));
-        assert_eq!(other, "a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN    (6.12.1 has none)");
-        let loadable = kernel("6.1.0", "ID=debian\n").remedies(Module::Loadable);
-        assert_eq!(loadable[0], "sudo modprobe -a can_raw vcan vxcan");
+        let mint = "NAME=\"Linux Mint\"\nID=linuxmint\nID_LIKE=\"ubuntu debian\"\n";
+        assert_eq!(
+            first("6.8.0-50-generic", mint, Module::Missing),
+            "sudo apt install linux-modules-extra-6.8.0-50-generic && sudo modprobe -a can_raw vcan vxcan"
+        );
+        let strange = "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN: ";
+        assert!(first("6.12.1", "ID=arch\n", Module::Missing).starts_with(strange));
+        assert!(first("5.15.0-microsoft-WSL2", debian, Module::Missing).starts_with(strange));
+        assert_eq!(first("6.1.0", debian, Module::Loadable), "sudo modprobe -a can_raw vcan vxcan");
+        assert!(first("6.1.0", debian, Module::There).starts_with("tests/lab/run "));
     }
 }

@@ -59,13 +59,7 @@ impl Asked {
 
 /// Looks at everything that a bench on these buses would meet.
 #[must_use]
-pub fn facts(
-    asked: Vec<Asked>,
-    choice: Choice,
-    no_spawn: bool,
-    skin: Option<String>,
-    present: &[Interface],
-) -> Facts {
+pub fn facts(asked: Vec<Asked>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
     let kind = choice.resolve();
     let heard = thread::scope(|scope| {
         let listening: Vec<_> = asked
@@ -92,6 +86,7 @@ pub fn facts(
     Facts {
         choice,
         no_spawn,
+        program: program(),
         kernel: Kernel::look(),
         user: User { root: rustix::process::geteuid().is_root(), admin: is_admin() },
         receive_buffer: receive_buffer().ok(),
@@ -100,7 +95,6 @@ pub fn facts(
             .and_then(|text| text.trim().parse().ok()),
         cell_node: beside("cell-node"),
         embedded: embedded(),
-        skin,
         buses: buses.collect(),
         present: present.iter().filter(|interface| interface.is_can()).cloned().collect(),
     }
@@ -151,10 +145,6 @@ impl Heard {
     }
 }
 
-fn is_admin() -> bool {
-    capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
-}
-
 /// What the kernel grants to whom asks as the gateway does; it is the same for every sort of socket.
 fn receive_buffer() -> io::Result<usize> {
     let socket =
@@ -163,6 +153,25 @@ fn receive_buffer() -> io::Result<usize> {
         sockopt::set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER)?;
     }
     Ok(sockopt::socket_recv_buffer_size(&socket)?)
+}
+
+/// How this program is called so that `sudo`, which looks in the system's own directories only, finds it.
+#[must_use]
+pub fn program() -> String {
+    let own = std::env::current_exe().unwrap_or_default();
+    let system = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
+    if own.as_os_str().is_empty() || system.iter().any(|directory| own.parent() == Some(Path::new(directory)))
+    {
+        return "vcan-setup".to_owned();
+    }
+    let called = std::env::args().next().filter(|called| called.contains('/'));
+    called.unwrap_or_else(|| own.display().to_string())
+}
+
+/// Whether this process may change interfaces.
+#[must_use]
+pub fn is_admin() -> bool {
+    capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
 }
 
 /// A program of this project, which should be beside this one.

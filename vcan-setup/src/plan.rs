@@ -63,6 +63,14 @@ impl Wanted {
         skin.buses.iter().map(wanted).collect()
     }
 
+    /// Of hardware that was named nobody knows which frames are wanted: those that it carries.
+    pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
+        let there = find(present, &self.name).filter(|it| matches!(it.kind, Kind::Hardware(_)));
+        if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
+            self.format = Format::Classic;
+        }
+    }
+
     /// Whether it can only be hardware: a skin gives it a bit rate.
     #[must_use]
     pub fn is_hardware(&self) -> bool {
@@ -191,6 +199,19 @@ impl Step {
             | Self::Widen { name, .. }
             | Self::SetRates { name, .. }
             | Self::Remove { name, .. } => name,
+        }
+    }
+
+    /// What it does, in few words: `make vcan0`.
+    #[must_use]
+    pub fn doing(&self) -> String {
+        match self {
+            Self::MakeVcan { name } => format!("make {name}"),
+            Self::MakePair { name, peer, .. } => format!("make {name} and its other end {peer}"),
+            Self::BringUp { name, .. } => format!("bring {name} up"),
+            Self::Widen { name, .. } => format!("change the MTU of {name}"),
+            Self::SetRates { name, rates, .. } => format!("set {name} to {rates}"),
+            Self::Remove { name, .. } => format!("remove {name}"),
         }
     }
 
@@ -343,6 +364,22 @@ pub enum Refusal {
         /// What to do.
         remedy: String,
     },
+    /// A pair that is there, and whose other end does not work.
+    #[error(
+        "the other end of {name}, {peer} in {there}, is {what}, and vcan-setup changes nothing there: `sudo {command}` mends it"
+    )]
+    OtherEnd {
+        /// Its name.
+        name: String,
+        /// The other end.
+        peer: String,
+        /// The namespace of the other end.
+        there: Namespace,
+        /// What is wrong with it.
+        what: String,
+        /// What to do.
+        command: String,
+    },
     /// A pair of one name in one namespace.
     #[error(
         "{name} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
@@ -438,6 +475,7 @@ impl Refusal {
             Self::Narrow { .. }
             | Self::Down { .. }
             | Self::OtherPair { .. }
+            | Self::OtherEnd { .. }
             | Self::Absent { .. }
             | Self::Rates { .. }
             | Self::HardwareDown { .. }
@@ -510,23 +548,23 @@ pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, R
         (None, Some(in_the_way)) => return Err(not_a_pair(in_the_way, name, there)),
     };
     plan.fit(&Wanted::named(name), here)?;
-    // The other end may be in a namespace that steps do not reach: it is only looked at.
-    let fits = other.up && other.mtu >= FD_MTU;
-    if there.is_none() {
+    let Some(there) = there else {
         plan.fit(&Wanted::named(peer), other)?;
-    } else if !fits {
-        let what = if other.up { format!("of MTU {}", other.mtu) } else { "down".to_owned() };
-        let namespace = there.map(|there| there.name.to_string()).unwrap_or_default();
-        return Err(Refusal::OtherPair {
-            name: name.to_owned(),
-            what: format!("the end of a pair whose other end, {peer} in {namespace}, is {what}"),
-            peer: format!("{peer} that can be used"),
-            remedy: format!(
-                "`sudo vcan-setup down {name}` removes the pair if vcan-setup has made it, then try again"
-            ),
-        });
-    }
-    Ok(plan)
+        return Ok(plan);
+    };
+    // Steps do not reach into the other namespace, but for making what is not there.
+    let peer = peer.to_owned();
+    let ip = there.name.ip();
+    let (what, command) = match (other.up, other.mtu >= FD_MTU) {
+        (true, true) => return Ok(plan),
+        (false, true) => ("down".to_owned(), format!("{ip} link set {peer} up")),
+        (_, false) => (
+            format!("of MTU {}", other.mtu),
+            format!("sh -c '{ip} link set {peer} down && {ip} link set {peer} mtu {FD_MTU} up'"),
+        ),
+    };
+    let (name, there) = (name.to_owned(), there.name.clone());
+    Err(Refusal::OtherEnd { name, peer, there, what, command })
 }
 
 fn are_a_pair(here: &Interface, other: &Interface, there: Option<&There>) -> bool {
@@ -684,3 +722,6 @@ fn removed_with(plan: &Plan, interface: &Interface, present: &[Interface]) -> bo
     let peer = present.iter().find(|other| other.index == *index);
     peer.is_some_and(|peer| plan.steps.iter().any(|step| step.name() == peer.name))
 }
+
+#[cfg(test)]
+mod tests;

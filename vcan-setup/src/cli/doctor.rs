@@ -1,9 +1,9 @@
 //! `vcan-setup doctor`.
 
 use clap::Args;
-use protocol::bus::Choice;
+use protocol::bus::{BusKind, Choice};
 use serde::Serialize;
-use vcan_setup::doctor::{Facts, Finding, judge, would_run};
+use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
 use vcan_setup::look::{self, Asked};
 use vcan_setup::netlink::Netlink;
 
@@ -39,18 +39,17 @@ pub(crate) struct Doctor {
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let mut asked = Vec::new();
-        let mut skin_file = None;
         for given in &self.what {
             match word(given)? {
-                Word::File(skin) => {
-                    asked.extend(Asked::of_skin(given, &skin));
-                    skin_file = Some(given.clone());
-                }
+                Word::File(skin) => asked.extend(Asked::of_skin(given, &skin)),
                 Word::Name(name) => asked.push(Asked::named(&name)),
             }
         }
         let present = Netlink::open().and_then(|mut netlink| netlink.interfaces()).unwrap_or_default();
-        let facts = look::facts(asked, self.bus_kind, self.no_spawn, skin_file, &present);
+        for Asked { wanted, .. } in asked.iter_mut().filter(|asked| asked.cells.is_none()) {
+            wanted.take_format_of_hardware(&present);
+        }
+        let facts = look::facts(asked, self.bus_kind, self.no_spawn, &present);
         let findings = judge(&facts);
         let runs = would_run(&findings);
         if self.json {
@@ -67,24 +66,21 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     for Finding { level, text: what, remedies } in findings {
         text += &format!("{:<6}{what}\n", level.name());
         for remedy in remedies {
-            text += &format!("          {remedy}\n");
+            text += &format!("        {remedy}\n");
         }
     }
-    let faults = findings.iter().filter(|finding| !would_run(std::slice::from_ref(finding))).count();
-    let kind = facts.bus_kind();
-    text += "\n";
-    text += &match (runs, faults) {
-        (true, _) => format!("A bench would run, on {}.\n", bus_words(kind)),
-        (false, 1) => "No bench would run: mend the fault first.\n".to_owned(),
-        (false, faults) => format!("No bench would run: mend the {faults} faults first.\n"),
-    };
-    text
+    let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
+    text + &match (runs, faults) {
+        (true, _) => format!("\nA bench would run, on {}.\n", words(facts.bus_kind())),
+        (false, 1) => "\nNo bench would run: mend the fault first.\n".to_owned(),
+        (false, faults) => format!("\nNo bench would run: mend the {faults} faults first.\n"),
+    }
 }
 
-const fn bus_words(kind: protocol::bus::BusKind) -> &'static str {
+const fn words(kind: BusKind) -> &'static str {
     match kind {
-        protocol::bus::BusKind::SocketCan => "SocketCAN",
-        protocol::bus::BusKind::Embedded => "the embedded bus",
+        BusKind::SocketCan => "SocketCAN",
+        BusKind::Embedded => "the embedded bus",
     }
 }
 

@@ -6,8 +6,9 @@ use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
 use rustix::io::Errno;
-use vcan_setup::kernel::Kernel;
-use vcan_setup::namespace::Namespace;
+use vcan_setup::kernel::{Kernel, Module};
+use vcan_setup::look;
+use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
 
@@ -25,7 +26,7 @@ use super::{Failure, Word, wanted, word};
   vcan-setup up --dry-run skin.toml                           say what would be done
   sudo vcan-setup up skin.toml                                all buses of a skin
   sudo vcan-setup up vcan0 vcan1
-  sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair: its other end is in `ip netns exec blue ...`
+  sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
   sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
 pub(crate) struct Up {
     /// Names of interfaces, or skins: what ends in .toml or holds a '/'
@@ -71,7 +72,7 @@ impl Up {
         for name in wanted.iter().map(|wanted| &wanted.name) {
             plain(name)?;
         }
-        let (mut netlink, present) = look()?;
+        let (mut netlink, present) = ask()?;
         let plan = plan::up(&wanted, &present, self.set_bit_rates)?;
         Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
@@ -87,7 +88,7 @@ impl Up {
         };
         plain(&name)?;
         plain(peer)?;
-        let (mut netlink, present) = look()?;
+        let (mut netlink, present) = ask()?;
         let mut other = self.namespace.as_deref().map(enter).transpose()?.flatten();
         let there = match &mut other {
             Some((namespace, file, inside)) => {
@@ -106,7 +107,7 @@ impl Up {
 impl Down {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let wanted = wanted(&self.what)?;
-        let (mut netlink, present) = look()?;
+        let (mut netlink, present) = ask()?;
         let plan = plan::down(&wanted, &present)?;
         Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
@@ -124,7 +125,7 @@ fn plain(name: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-fn look() -> Result<(Netlink, Vec<vcan_setup::link::Interface>), Failure> {
+fn ask() -> Result<(Netlink, Vec<vcan_setup::link::Interface>), Failure> {
     let mut netlink = Netlink::open().map_err(unreadable)?;
     let present = netlink.interfaces().map_err(unreadable)?;
     Ok((netlink, present))
@@ -137,7 +138,13 @@ fn unreadable(error: io::Error) -> Failure {
 /// Opens a namespace; `None` when it is the one where we are.
 fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
-    let file = namespace.open().map_err(Failure::run)?;
+    let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
+    let file = namespace.open().map_err(|error| match error {
+        NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
+            not_allowed()
+        }
+        error => Failure::usage(error),
+    })?;
     let same = |file: &File| {
         let (there, here) = (file.metadata()?, std::fs::metadata("/proc/thread-self/ns/net")?);
         Ok::<_, io::Error>((there.dev(), there.ino()) == (here.dev(), here.ino()))
@@ -148,7 +155,7 @@ fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let inside = Netlink::open_in(&file).map_err(|error| {
         let path = namespace.path();
         match Errno::from_io_error(&error) {
-            Some(Errno::PERM) => not_allowed(&format!("enter the network namespace {namespace}")),
+            Some(Errno::PERM) => not_allowed(),
             Some(Errno::INVAL) => Failure::usage(format!(
                 "{} is no network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
                 path.display()
@@ -160,11 +167,15 @@ fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
 }
 
 fn not_allowed(what: &str) -> Failure {
+    if rustix::process::geteuid().is_root() {
+        return Failure::run(format!(
+            "not allowed to {what}: this root has no CAP_NET_ADMIN; in a container, start that with `--cap-add \
+             NET_ADMIN`"
+        ));
+    }
     let arguments: Vec<_> = std::env::args().skip(1).collect();
-    Failure::run(format!(
-        "not allowed to {what}: that needs root (CAP_NET_ADMIN); try `sudo vcan-setup {}`",
-        arguments.join(" ")
-    ))
+    let again = format!("{} {}", look::program(), arguments.join(" "));
+    Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
 /// Carries out plans.
@@ -218,27 +229,32 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         Step::MakePair { .. } => Some("vxcan"),
         Step::BringUp { .. } | Step::Widen { .. } | Step::SetRates { .. } | Step::Remove { .. } => None,
     };
+    let doing = step.doing();
+    let unknown = |kind: &str, kernel: &Kernel| {
+        let remedies = kernel.remedies(kernel.module(kind)).join("`, or `");
+        let release = &kernel.release;
+        Failure::run(format!(
+            "cannot {doing}: the kernel ({release}) has no {kind}: `{remedies}`; the embedded bus needs none: \
+             `gateway run ... --bus-kind embedded`"
+        ))
+    };
     match (Errno::from_io_error(error), kind) {
-        (Some(Errno::PERM | Errno::ACCESS), _) => not_allowed(&step.to_string()),
-        (Some(Errno::OPNOTSUPP), Some(kind)) => {
+        (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
+        (Some(Errno::PERM | Errno::ACCESS), kind) => {
+            // Root would only be told this.
             let kernel = Kernel::look();
-            let remedies = kernel.remedies(kernel.module(kind));
-            let embedded = "or leave SocketCAN out and use the embedded bus, which needs no interface";
-            Failure::run(format!(
-                "cannot {step}: the kernel ({}) knows no {kind}; {}, {embedded}",
-                kernel.release,
-                remedies.join(", or ")
-            ))
+            let missing = kind.filter(|kind| kernel.module(kind) == Module::Missing);
+            missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))
         }
         (Some(Errno::OPNOTSUPP), None) => {
-            Failure::run(format!("cannot {step}: this hardware cannot do that ({error})"))
+            Failure::run(format!("cannot {doing}: this hardware cannot ({error})"))
         }
         (Some(Errno::INVAL), None) => {
-            Failure::run(format!("cannot {step}: its driver does not take these values ({error})"))
+            Failure::run(format!("cannot {doing}: its driver does not take that ({error})"))
         }
         (Some(Errno::EXIST), Some(_)) => Failure::run(format!(
-            "cannot {step}: an interface of that name has appeared meanwhile; try again"
+            "cannot {doing}: an interface of that name has appeared meanwhile; try again"
         )),
-        _ => Failure::run(format!("cannot {step}: {error}")),
+        _ => Failure::run(format!("cannot {doing}: {error}")),
     }
 }

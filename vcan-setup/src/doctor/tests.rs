@@ -1,0 +1,372 @@
+use super::*;
+use crate::link::{CLASSIC_MTU, Counters};
+
+fn interface(name: &str, kind: Kind) -> Interface {
+    let counters = Counters::default();
+    Interface { index: 2, name: name.to_owned(), kind, ours: true, up: true, mtu: FD_MTU, counters }
+}
+
+fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
+}
+
+/// A bus of a skin, with 100 cells.
+fn bus(interface: Option<Interface>) -> Bus {
+    let name = interface.as_ref().map_or("vcan0", |it| it.name.as_str()).to_owned();
+    let skin = Some(SkinBus { file: "skin.toml".into(), bitrate: None, data_bitrate: None });
+    Bus {
+        wanted: Wanted { name, format: Format::Fd, skin },
+        cells: Some((1..=100).map(cell).collect()),
+        sums: false,
+        heard: Ok(interface.as_ref().map(|_| Heard::default())),
+        interface,
+    }
+}
+
+/// A machine on which all is well.
+fn good() -> Facts {
+    Facts {
+        choice: Choice::Auto,
+        no_spawn: false,
+        program: "vcan-setup".into(),
+        kernel: Kernel {
+            release: "6.1.0".into(),
+            machine: "x86_64".into(),
+            distribution: "debian".into(),
+            has_can: true,
+            can_raw: Module::There,
+            vcan: Module::There,
+            vxcan: Module::There,
+        },
+        user: User { root: false, admin: false },
+        receive_buffer: Some(2 << 20),
+        backlog: Some(1_000),
+        cell_node: Program { path: "/bin/cell-node".into(), there: true },
+        embedded: Ok("/run/skinbus".into()),
+        buses: vec![bus(Some(interface("vcan0", Kind::Vcan)))],
+        present: vec![interface("vcan0", Kind::Vcan)],
+    }
+}
+
+fn no_can(choice: Choice) -> Facts {
+    let mut facts = Facts { choice, ..good() };
+    facts.kernel.has_can = false;
+    facts.kernel.can_raw = Module::Loadable;
+    facts.buses = vec![bus(None)];
+    facts
+}
+
+/// All findings as they are printed, but for those that are ok.
+fn complaints(facts: &Facts) -> Vec<String> {
+    let bad = |finding: Finding| {
+        let remedies = finding.remedies.iter().map(|remedy| format!(" | {remedy}")).collect::<String>();
+        (finding.level != Level::Ok).then(|| format!("{}: {}{remedies}", finding.level.name(), finding.text))
+    };
+    judge(facts).into_iter().filter_map(bad).collect()
+}
+
+/// What is said when the bus, its interface or the machine is changed.
+fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
+    let mut facts = good();
+    change(&mut facts);
+    let said = complaints(&facts);
+    assert_eq!(would_run(&judge(&facts)), !said.iter().any(|line| line.starts_with("fault")), "{said:?}");
+    said
+}
+
+fn about_interface(change: impl FnOnce(&mut Interface)) -> Vec<String> {
+    about(|facts| change(facts.buses[0].interface.as_mut().unwrap()))
+}
+
+fn about_hardware(
+    wanted: impl FnOnce(&mut Wanted),
+    change: impl FnOnce(&mut Interface, &mut Hardware),
+) -> Vec<String> {
+    about(|facts| {
+        let mut hardware = Hardware {
+            driver: Some("kvaser_pci".into()),
+            bitrate: Some(1_000_000),
+            data_bitrate: Some(5_000_000),
+            fd: true,
+            listen_only: false,
+            state: Some(State::ErrorActive),
+        };
+        let mut can0 = interface("can0", Kind::Vcan);
+        can0.ours = false;
+        change(&mut can0, &mut hardware);
+        can0.kind = Kind::Hardware(hardware);
+        let mut can0 = bus(Some(can0));
+        if let Some(skin) = &mut can0.wanted.skin {
+            (skin.bitrate, skin.data_bitrate) = (Some(1_000_000), Some(5_000_000));
+        }
+        wanted(&mut can0.wanted);
+        facts.buses = vec![can0];
+    })
+}
+
+fn listens(heard: Heard, no_spawn: bool) -> Vec<String> {
+    about(|facts| {
+        facts.no_spawn = no_spawn;
+        facts.buses[0].heard = Ok(Some(heard));
+    })
+}
+
+fn cells(nodes: impl IntoIterator<Item = i64>) -> Heard {
+    Heard { gateway: false, cells: nodes.into_iter().map(cell).collect() }
+}
+
+#[test]
+fn a_machine_on_which_all_is_well() {
+    assert_eq!(complaints(&good()), Vec::<String>::new());
+    assert!(judge(&good()).len() > 4, "and says what it looked at");
+}
+
+#[test]
+fn no_can_in_the_kernel_matters_by_what_was_chosen() {
+    assert_eq!(
+        complaints(&no_can(Choice::Auto)),
+        [
+            "note: the kernel (6.1.0) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
+          for a kernel with CAN: | sudo modprobe -a can_raw vcan vxcan | tests/lab/run COMMAND  # in the project's \
+          folder: runs it in a machine that has vcan"
+        ]
+    );
+    assert_eq!(no_can(Choice::Auto).bus_kind(), BusKind::Embedded);
+    assert_eq!(complaints(&no_can(Choice::Only(BusKind::Embedded))), Vec::<String>::new());
+    let only = complaints(&no_can(Choice::Only(BusKind::SocketCan)));
+    assert!(
+        only[0].starts_with("fault: the kernel (6.1.0) has no CAN, and --bus-kind socketcan needs it | sudo")
+    );
+    assert_eq!(only.len(), 1, "nothing is said of interfaces: {only:?}");
+    let mut facts = no_can(Choice::Auto);
+    facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
+    assert!(complaints(&facts).contains(&"fault: /tmp/skinbus-1 has mode 0755".to_owned()));
+    assert!(!would_run(&judge(&facts)));
+}
+
+#[test]
+fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
+    let missing = |user: User, vcan: Module| {
+        about(|facts| {
+            facts.buses = vec![bus(None)];
+            facts.user = user;
+            facts.kernel.vcan = vcan;
+        })
+    };
+    let anybody = User { root: false, admin: false };
+    let admin = User { root: true, admin: true };
+    assert_eq!(
+        missing(anybody, Module::There),
+        [
+            "note: this user may not make interfaces, hence the sudo below",
+            "fault: there is no interface vcan0 | sudo vcan-setup up skin.toml",
+        ]
+    );
+    assert_eq!(
+        missing(admin, Module::There),
+        ["fault: there is no interface vcan0 | vcan-setup up skin.toml"]
+    );
+    let loadable =
+        "note: the kernel's module vcan is not loaded; making an interface loads it | modprobe vcan";
+    assert_eq!(missing(admin, Module::Loadable)[0], loadable);
+    assert!(
+        missing(admin, Module::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
+    );
+    let contained = missing(User { root: true, admin: false }, Module::There);
+    assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
+    let named = about(|facts| {
+        facts.buses = vec![Bus { wanted: Wanted::named("vcan9"), cells: None, ..bus(None) }];
+        facts.user = admin;
+    });
+    assert_eq!(named, ["fault: there is no interface vcan9 | vcan-setup up vcan9"]);
+    let hardware = about(|facts| {
+        facts.buses = vec![bus(None)];
+        facts.buses[0].wanted.skin.as_mut().unwrap().bitrate = Some(500_000);
+        facts.user = admin;
+    });
+    assert!(hardware[0].starts_with(
+        "fault: there is no interface vcan0, and the skin gives it a bitrate, so it is hardware | # plug it in"
+    ));
+}
+
+#[test]
+fn an_interface_that_does_not_fit_is_mended_by_who_made_it() {
+    let narrow = "fault: vcan0 has MTU 16 and CAN FD needs 72";
+    assert_eq!(about_interface(|it| it.mtu = 16), [format!("{narrow} | sudo vcan-setup up skin.toml")]);
+    assert_eq!(
+        about_interface(|it| (it.mtu, it.ours) = (16, false)),
+        [format!("{narrow} | sudo sh -c 'ip link set vcan0 down && ip link set vcan0 mtu 72 up'")]
+    );
+    assert_eq!(about_interface(|it| it.up = false), ["fault: vcan0 is down | sudo vcan-setup up skin.toml"]);
+    assert_eq!(
+        about_interface(|it| (it.up, it.ours) = (false, false)),
+        ["fault: vcan0 is down | sudo sh -c 'ip link set vcan0 up'"]
+    );
+    assert_eq!(
+        about_interface(|it| it.kind = Kind::Other("a network interface (ether)".into())),
+        ["fault: vcan0 is a network interface (ether), which carries no CAN | # name another bus"]
+    );
+    let classic = about(|facts| {
+        facts.buses[0].wanted.format = Format::Classic;
+        facts.buses[0].interface.as_mut().unwrap().mtu = CLASSIC_MTU;
+    });
+    assert_eq!(classic, Vec::<String>::new());
+}
+
+#[test]
+fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
+    let same = |_: &mut Wanted| ();
+    let fine = |_: &mut Interface, _: &mut Hardware| ();
+    assert_eq!(about_hardware(same, fine), Vec::<String>::new());
+    let set = "sudo vcan-setup up skin.toml --set-bit-rates";
+    assert_eq!(
+        about_hardware(same, |_, hardware| hardware.data_bitrate = Some(2_000_000)),
+        [format!(
+            "fault: can0 is CAN hardware (kvaser_pci) at 1000 kbit/s, data 2000 kbit/s, and the skin says 1000 \
+             kbit/s, data 5000 kbit/s | {set}"
+        )]
+    );
+    assert_eq!(
+        about_hardware(same, |can0, _| can0.up = false),
+        [format!("fault: can0 is CAN hardware (kvaser_pci), and down | {set}")]
+    );
+    let open = |wanted: &mut Wanted| {
+        let skin = wanted.skin.as_mut().unwrap();
+        (skin.bitrate, skin.data_bitrate) = (None, None);
+    };
+    let unsaid = about_hardware(open, fine);
+    assert_eq!(unsaid.len(), 1);
+    assert!(unsaid[0].starts_with("note: can0 is at 1000 kbit/s, data 5000 kbit/s; the skin does not say"));
+    let narrow = about_hardware(open, |can0, _| can0.mtu = CLASSIC_MTU);
+    assert!(
+        narrow[0].starts_with("fault: can0 is CAN hardware (kvaser_pci) with MTU 16, and CAN FD needs 72")
+    );
+    let state = |state| about_hardware(same, move |_, hardware| hardware.state = Some(state));
+    let bus_off = state(State::BusOff);
+    assert!(
+        bus_off[0].starts_with("fault: can0 is BUS-OFF")
+            && bus_off[0].contains("sudo ip link set can0 type can restart")
+    );
+    assert!(state(State::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors"));
+    let deaf = about_hardware(same, |_, hardware| hardware.listen_only = true);
+    assert!(deaf[0].starts_with("fault: can0 only listens"));
+}
+
+#[test]
+fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
+    assert_eq!(
+        listens(Heard { gateway: true, ..Heard::default() }, false),
+        [
+            "fault: another gateway sends joints on vcan0 | pgrep -a gateway  # and stop it, or take another bus"
+        ]
+    );
+    let there = listens(cells(1..=14), false);
+    assert!(there[0].starts_with(
+        "fault: cells are on vcan0 already: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 and 2 more | gateway run ... --no-spawn"
+    ));
+    assert_eq!(listens(cells(1..=100), true), Vec::<String>::new());
+    assert_eq!(
+        listens(cells(2..=100), true),
+        ["note: 99 cells are on vcan0; of the skin's these were not heard: 1"]
+    );
+    assert!(listens(cells([]), true)[0].starts_with("fault: no cell is heard on vcan0"));
+    let embedded = |heard| {
+        let mut facts = no_can(Choice::Auto);
+        facts.buses[0].heard = Ok(heard);
+        complaints(&facts).split_off(1)
+    };
+    assert_eq!(embedded(None), Vec::<String>::new(), "the gateway will serve it");
+    let rival = Some(Heard { gateway: true, ..Heard::default() });
+    assert!(embedded(rival)[0].starts_with("fault: another gateway sends joints on the embedded bus vcan0"));
+}
+
+#[test]
+fn a_bus_that_does_not_open_says_why() {
+    let said = about(|facts| facts.buses[0].heard = Err("not allowed to open vcan0".into()));
+    assert_eq!(said, ["fault: not allowed to open vcan0"]);
+}
+
+#[test]
+fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
+    let granted = |bytes| about(|facts| facts.receive_buffer = Some(bytes));
+    let remedy = "sudo sysctl -w net.core.rmem_max=409600";
+    assert_eq!(granted(400 << 10), Vec::<String>::new());
+    assert_eq!(
+        granted((400 << 10) - 1),
+        [format!(
+            "note: receive buffers are limited to 399 KiB; to hold all answers, 100 frames, 4 times over takes 400 \
+             KiB, and a gateway that is held up loses some | {remedy}"
+        )]
+    );
+    assert!(granted(100 << 10)[0].starts_with("note"));
+    assert_eq!(
+        granted((100 << 10) - 1),
+        [format!(
+            "fault: receive buffers are limited to 99 KiB and do not hold all answers, 100 frames, even once; 400 \
+             KiB are right | {remedy}"
+        )]
+    );
+    let classic = about(|facts| {
+        facts.receive_buffer = Some(400 << 10);
+        facts.buses[0].wanted.format = Format::Classic;
+    });
+    assert!(
+        classic[0].contains("to hold all answers, 200 frames, 4 times over takes 800 KiB"),
+        "{classic:?}"
+    );
+}
+
+#[test]
+fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
+    let backlog = |frames| about(|facts| facts.backlog = frames);
+    assert_eq!(backlog(Some(100)), Vec::<String>::new());
+    assert_eq!(
+        backlog(Some(99)),
+        [
+            "fault: the kernel's backlog of 99 does not hold an answer of all cells, 100 frames: some would be lost \
+          without a word | sudo sysctl -w net.core.netdev_max_backlog=200"
+        ]
+    );
+    assert!(backlog(None)[0].starts_with("note: the kernel's backlog cannot be seen"));
+    let two = about(|facts| {
+        facts.backlog = Some(150);
+        facts.buses.push(bus(Some(interface("vcan1", Kind::Vcan))));
+    });
+    assert!(two[0].starts_with("fault: the kernel's backlog of 150"), "{two:?}");
+}
+
+#[test]
+fn without_a_skin_some_interface_has_to_be_of_use() {
+    let machine = |present: Vec<Interface>| {
+        about(|facts| (facts.buses, facts.present, facts.user.admin) = (Vec::new(), present, true))
+    };
+    assert_eq!(machine(vec![interface("vcan3", Kind::Vcan)]), Vec::<String>::new());
+    let down = Interface { up: false, ..interface("vcan3", Kind::Vcan) };
+    let expected = "fault: there is no CAN interface that is up and carries CAN FD | vcan-setup up vcan0";
+    for present in [vec![], vec![down]] {
+        assert_eq!(machine(present)[0], expected);
+    }
+}
+
+#[test]
+fn the_cells_program_is_needed_unless_the_cells_are_there() {
+    let without = |no_spawn| {
+        about(|facts| {
+            (facts.cell_node.there, facts.no_spawn) = (false, no_spawn);
+            facts.buses[0].heard = Ok(Some(cells(1..=100)));
+        })
+    };
+    assert!(without(false)[1].starts_with("fault: cell-node is not at /bin/cell-node"));
+    assert_eq!(without(true), Vec::<String>::new());
+}
+
+#[test]
+fn sums_cannot_be_run_yet() {
+    let said = about(|facts| facts.buses[0].sums = true);
+    assert_eq!(
+        said,
+        [
+            "fault: bus vcan0 has reply = \"sum\", which this version cannot run | reply = \"torque\"  # in the skin"
+        ]
+    );
+}

@@ -1,0 +1,454 @@
+use proptest::prelude::*;
+
+use super::*;
+use crate::link::{CLASSIC_MTU, Counters};
+
+fn interface(name: &str, index: u32, kind: Kind) -> Interface {
+    let mtu = if matches!(kind, Kind::Other(_)) { 1_500 } else { FD_MTU };
+    let (ours, up) = (false, true);
+    Interface { index, name: name.to_owned(), kind, ours, up, mtu, counters: Counters::default() }
+}
+
+fn ours(name: &str, index: u32) -> Interface {
+    Interface { ours: true, ..interface(name, index, Kind::Vcan) }
+}
+
+fn kvaser(bitrate: Option<u32>, data_bitrate: Option<u32>) -> Hardware {
+    let driver = Some("kvaser_pci".to_owned());
+    Hardware { driver, bitrate, data_bitrate, fd: data_bitrate.is_some(), ..Hardware::default() }
+}
+
+fn can0(hardware: Hardware, up: bool) -> Interface {
+    let mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
+    Interface { up, mtu, ..interface("can0", 4, Kind::Hardware(hardware)) }
+}
+
+fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> Wanted {
+    let skin = Some(SkinBus { file: "skin.toml".to_owned(), bitrate, data_bitrate });
+    Wanted { name: name.to_owned(), format, skin }
+}
+
+fn refused(wanted: &Wanted, present: &[Interface]) -> String {
+    up(std::slice::from_ref(wanted), present, false).unwrap_err().to_string()
+}
+
+/// What steps do, as far as the kernel is concerned. A step on what is not ours stops the test.
+#[derive(Clone, Debug, Eq, PartialEq)]
+struct World {
+    here: Vec<Interface>,
+    there: Vec<Interface>,
+}
+
+const THERE: i32 = 7;
+
+impl World {
+    fn of(here: Vec<Interface>) -> Self {
+        Self { here, there: Vec::new() }
+    }
+
+    fn named(&self, name: &str) -> &Interface {
+        find(&self.here, name).unwrap_or_else(|| panic!("{name} is there: {self:?}"))
+    }
+
+    fn by_number(&mut self, index: u32, name: &str) -> &mut Interface {
+        let found = self.here.iter_mut().find(|it| it.index == index).expect("a number that is there");
+        assert_eq!(found.name, name);
+        found
+    }
+
+    fn ours(&mut self, index: u32, name: &str) -> &mut Interface {
+        let found = self.by_number(index, name);
+        assert!(found.ours && found.is_virtual(), "not ours: {found:?}");
+        found
+    }
+
+    fn carry_out(&mut self, step: &Step) {
+        let next = |all: &[Interface]| all.iter().map(|it| it.index).max().unwrap_or(0) + 1;
+        match step {
+            Step::MakeVcan { name } => {
+                assert!(find(&self.here, name).is_none(), "{name} is there already");
+                self.here.push(ours(name, next(&self.here)));
+            }
+            Step::MakePair { name, peer, namespace } => {
+                let first = next(&self.here);
+                let (place, back, second) = match namespace {
+                    None => (Place::Here, Place::Here, first + 1),
+                    Some(_) => (elsewhere(THERE), elsewhere(0), next(&self.there)),
+                };
+                let end = |name: &str, index, peer_index, peer: &str, place| {
+                    let kind =
+                        Kind::Vxcan(Some(Peer { index: peer_index, name: Some(peer.to_owned()), place }));
+                    Interface { ours: true, ..interface(name, index, kind) }
+                };
+                assert!(find(&self.here, name).is_none(), "{name} is there already");
+                self.here.push(end(name, first, second, peer, place));
+                let others = if namespace.is_some() { &mut self.there } else { &mut self.here };
+                assert!(find(others, peer).is_none(), "{peer} is there already");
+                others.push(end(peer, second, first, name, back));
+            }
+            Step::BringUp { name, index } => self.ours(*index, name).up = true,
+            Step::Widen { name, index, from, was_up } => {
+                let found = self.ours(*index, name);
+                assert_eq!((found.mtu, found.up), (*from, *was_up));
+                (found.mtu, found.up) = (FD_MTU, true);
+            }
+            Step::SetRates { name, index, rates, before, was_up } => {
+                let found = self.by_number(*index, name);
+                assert_eq!(found.up, *was_up);
+                let Kind::Hardware(hardware) = &mut found.kind else { panic!("no hardware: {found:?}") };
+                assert_eq!(Rates::of(hardware), *before);
+                (hardware.bitrate, hardware.data_bitrate) = (rates.bitrate, rates.data_bitrate);
+                hardware.fd = rates.data_bitrate.is_some();
+                found.mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
+                found.up = true;
+            }
+            Step::Remove { name, index } => {
+                let removed = self.ours(*index, name).clone();
+                let peer = match &removed.kind {
+                    Kind::Vxcan(Some(Peer { index, place: Place::Here, .. })) => Some(*index),
+                    _ => None,
+                };
+                self.here.retain(|it| it.index != *index && Some(it.index) != peer);
+            }
+        }
+    }
+
+    fn carry_out_all(&self, plan: &Plan) -> Self {
+        let mut after = self.clone();
+        plan.steps.iter().for_each(|step| after.carry_out(step));
+        after
+    }
+}
+
+fn elsewhere(id: i32) -> Place {
+    Place::Namespace { id, name: None }
+}
+
+#[test]
+fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
+    let wanted = ["vcan0", "vcan1"].map(Wanted::named);
+    let world = World::of(vec![interface("vcan0", 2, Kind::Vcan)]);
+    let plan = up(&wanted, &world.here, false).unwrap();
+    assert_eq!(plan.steps, [Step::MakeVcan { name: "vcan1".into() }]);
+    assert_eq!(plan.left, ["vcan0 is there already, and fits (a vcan, made by somebody else)"]);
+    let again = up(&wanted, &world.carry_out_all(&plan).here, false).unwrap();
+    assert_eq!(again.steps, []);
+}
+
+#[test]
+fn what_is_ours_is_mended() {
+    let narrow = Interface { mtu: CLASSIC_MTU, ..ours("vcan0", 2) };
+    let down = Interface { up: false, ..ours("vcan1", 3) };
+    let wanted = ["vcan0", "vcan1"].map(Wanted::named);
+    let plan = up(&wanted, &[narrow.clone(), down], false).unwrap();
+    let said: Vec<_> = plan.steps.iter().map(ToString::to_string).collect();
+    let expected = ["take vcan0 down, give it MTU 72 instead of 16, and bring it up", "bring vcan1 up"];
+    assert_eq!(said, expected);
+    assert_eq!(plan.steps[0].command(), "ip link set vcan0 down && ip link set vcan0 mtu 72 up");
+    let classic = in_skin("vcan0", Format::Classic, None, None);
+    assert_eq!(up(&[classic], &[narrow], false).unwrap().steps, [], "classic frames fit MTU 16");
+}
+
+#[test]
+fn a_real_bus_is_never_touched_because_it_was_named() {
+    let present = [
+        can0(kvaser(Some(500_000), None), false),
+        interface("eth0", 2, Kind::Other("a network interface (ether)".into())),
+    ];
+    assert_eq!(
+        refused(&Wanted::named("can0"), &present),
+        "can0 is real, CAN hardware (kvaser_pci), and is left alone: to check its bit rates put it into a \
+         skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status can0`"
+    );
+    assert_eq!(
+        refused(&Wanted::named("eth0"), &present),
+        "eth0 is real, a network interface (ether), and is left alone: choose another name, as `vcan-setup \
+         up vcan0` does"
+    );
+    assert!(up(&[Wanted::named("can0")], &present, true).is_err(), "whatever else was asked for");
+}
+
+#[test]
+fn what_somebody_else_made_is_left_alone_and_the_remedy_is_told() {
+    let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, Kind::Vcan) };
+    assert_eq!(
+        refused(&Wanted::named("vcan0"), &[foreign(16, true)]),
+        "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `sudo sh -c \
+         'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` mends it"
+    );
+    assert_eq!(
+        refused(&Wanted::named("vcan0"), &[foreign(72, false)]),
+        "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` mends it"
+    );
+}
+
+#[test]
+fn one_bus_that_cannot_be_had_keeps_the_others_from_being_made() {
+    let present = [interface("lo", 1, Kind::Other("the loopback interface".into()))];
+    let wanted = ["vcan0", "lo", "vcan1"].map(Wanted::named);
+    assert!(matches!(up(&wanted, &present, false), Err(Refusal::NotCan { .. })));
+}
+
+#[test]
+fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
+    let wanted = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
+    let right = can0(kvaser(Some(1_000_000), Some(5_000_000)), true);
+    let plan = up(std::slice::from_ref(&wanted), std::slice::from_ref(&right), false).unwrap();
+    assert_eq!(plan.steps, []);
+    let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin says, and is \
+                left as it is";
+    assert_eq!(plan.left, [line]);
+    assert_eq!(up(std::slice::from_ref(&wanted), &[right], true).unwrap().steps, [], "nor set again");
+
+    let other = [can0(kvaser(Some(500_000), None), true)];
+    assert_eq!(
+        refused(&wanted, &other),
+        "can0 is at 500 kbit/s and skin.toml says 1000 kbit/s, data 5000 kbit/s: `sudo vcan-setup up skin.toml \
+         --set-bit-rates` sets them, or change skin.toml"
+    );
+    let unset = [can0(kvaser(None, None), false)];
+    assert!(refused(&wanted, &unset).starts_with("can0 is at no bit rate and skin.toml says 1000 kbit/s"));
+    let open = in_skin("can0", Format::Fd, None, None);
+    assert_eq!(
+        refused(&open, &other),
+        "can0 is CAN hardware (kvaser_pci) with MTU 16, and skin.toml says format = \"fd\", which needs 72: \
+         `sudo vcan-setup up skin.toml --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
+    );
+    let down = [can0(kvaser(Some(1_000_000), Some(5_000_000)), false)];
+    assert_eq!(
+        refused(&wanted, &down),
+        "can0 is CAN hardware (kvaser_pci), and down: `sudo vcan-setup up skin.toml --set-bit-rates` sets its \
+         bit rates and brings it up"
+    );
+}
+
+#[test]
+fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
+    let wanted = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
+    let present = [can0(kvaser(Some(500_000), None), true)];
+    let plan = up(&[wanted], &present, true).unwrap();
+    let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
+    assert_eq!(
+        step.to_string(),
+        "take can0 down, set can0 to 1000 kbit/s, data 5000 kbit/s instead of 500 kbit/s, and bring it up"
+    );
+    assert_eq!(
+        step.command(),
+        "ip link set can0 down && ip link set can0 type can bitrate 1000000 dbitrate 5000000 fd on && ip link \
+         set can0 up"
+    );
+    let set = |wanted| up(&[wanted], &present, true).unwrap_err().to_string();
+    assert_eq!(
+        set(in_skin("can0", Format::Fd, None, None)),
+        "skin.toml has no bitrate for can0: put `bitrate = 1000000` under its [[bus]], then try again"
+    );
+    assert_eq!(
+        set(in_skin("can0", Format::Fd, Some(250_000), None)),
+        "skin.toml has no data_bitrate for can0: put `data_bitrate = 5000000` under its [[bus]], then try again"
+    );
+}
+
+#[test]
+fn a_bus_with_a_bit_rate_is_never_made_of_software() {
+    let wanted = in_skin("can0", Format::Classic, Some(500_000), None);
+    assert_eq!(
+        refused(&wanted, &[]),
+        "there is no interface can0, and skin.toml gives it a bitrate, so it is hardware: plug it in and load \
+         its driver, or leave out bitrate and it will be a vcan"
+    );
+}
+
+#[test]
+fn a_pair_is_made_once_and_told_from_other_pairs() {
+    let mut world = World::of(vec![ours("vcan0", 2)]);
+    let named =
+        |there: &World, id| There { name: Namespace::Name("blue".into()), id, present: there.there.clone() };
+    let there = named(&world, None);
+    let wanted = WantedPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
+    let plan = up_pair(&wanted, &world.here).unwrap();
+    let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
+    assert_eq!(
+        step.command(),
+        "ip link add vcan1 mtu 72 type vxcan peer name vcan1 mtu 72 netns blue && ip link set vcan1 alias \
+         skinbus up && ip -n blue link set vcan1 alias skinbus up"
+    );
+    world = world.carry_out_all(&plan);
+    let there = named(&world, Some(THERE));
+    let again = WantedPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
+    assert_eq!(up_pair(&again, &world.here).unwrap().steps, []);
+
+    let elsewhere = named(&world, Some(THERE + 1));
+    let other = WantedPair { there: Some(&elsewhere), ..again };
+    let error = up_pair(&other, &world.here).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "vcan1 is there already and is a vxcan, not one end of a pair with vcan1: `sudo vcan-setup down vcan1` \
+         removes it, or choose another name"
+    );
+    let error = up_pair(&WantedPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "vcan1 is there already and is a vxcan in blue, not one end of a pair with vcan5: `sudo ip -n blue link \
+         del vcan1` removes it, or choose another name"
+    );
+    world.there[0].up = false;
+    let there = named(&world, Some(THERE));
+    let error = up_pair(&WantedPair { there: Some(&there), ..again }, &world.here).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "the other end of vcan1, vcan1 in blue, is down, and vcan-setup changes nothing there: `sudo ip -n blue \
+         link set vcan1 up` mends it"
+    );
+    let same = WantedPair { name: "vcan3", peer: "vcan3", there: None };
+    assert!(matches!(up_pair(&same, &world.here), Err(Refusal::OneName { .. })));
+}
+
+#[test]
+fn only_what_is_ours_is_removed() {
+    let present = [ours("vcan0", 2), interface("vcan1", 3, Kind::Vcan), can0(kvaser(None, None), true)];
+    let names = ["vcan0", "vcan1", "can0", "vcan9"];
+    let skin = names.map(|name| in_skin(name, Format::Fd, None, None));
+    let plan = down(&skin, &present).unwrap();
+    assert_eq!(plan.steps, [Step::Remove { name: "vcan0".into(), index: 2 }]);
+    assert_eq!(
+        plan.left,
+        [
+            "vcan1 is a vcan that vcan-setup has not made, and is left alone",
+            "can0 is CAN hardware (kvaser_pci) that vcan-setup has not made, and is left alone",
+            "vcan9 is not there",
+        ]
+    );
+    let named = |name| down(&[Wanted::named(name)], &present);
+    assert_eq!(
+        named("vcan1").unwrap_err().to_string(),
+        "vcan1 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
+         vcan1` removes it"
+    );
+    assert_eq!(
+        named("can0").unwrap_err().to_string(),
+        "can0 is CAN hardware (kvaser_pci) that vcan-setup has not made, and is left alone"
+    );
+    assert_eq!(named("vcan9").unwrap().steps, [], "what is not there is removed already");
+}
+
+#[test]
+fn the_mark_on_something_real_is_not_believed() {
+    let mut present = [
+        can0(kvaser(None, None), true),
+        interface("eth0", 2, Kind::Other("a network interface (ether)".into())),
+    ];
+    present.iter_mut().for_each(|it| it.ours = true);
+    for name in ["can0", "eth0"] {
+        assert!(up(&[Wanted::named(name)], &present, true).is_err(), "{name}");
+        assert!(down(&[Wanted::named(name)], &present).is_err(), "{name}");
+    }
+}
+
+const NAMES: [&str; 5] = ["vcan0", "vcan1", "vcan2", "can0", "eth0"];
+
+/// Interfaces of distinct names, two of which may be the ends of a pair.
+fn any_world() -> impl Strategy<Value = World> {
+    let one = (0..5_u8, any::<bool>(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
+    (proptest::collection::vec(proptest::option::of(one), NAMES.len()), any::<bool>()).prop_map(
+        |(given, pair)| {
+            let mut here = Vec::new();
+            for ((name, given), index) in NAMES.into_iter().zip(given).zip(2..) {
+                let Some((kind, ours, up, wide, rate, data)) = given else { continue };
+                let kind = match kind {
+                    0 | 1 => Kind::Vcan,
+                    2 => Kind::Vxcan(None),
+                    3 => Kind::Hardware(kvaser(
+                        (rate > 0).then_some(rate * 250_000),
+                        (rate > 0 && data > 0).then_some(data * 1_000_000),
+                    )),
+                    _ => Kind::Other("a network interface (ether)".to_owned()),
+                };
+                let mtu = if wide { FD_MTU } else { CLASSIC_MTU };
+                here.push(Interface { ours, up, mtu, ..interface(name, index, kind) });
+            }
+            if let (true, [first, second, ..]) = (pair, here.as_mut_slice()) {
+                let to = |it: &Interface| Peer { index: it.index, name: None, place: Place::Here };
+                let kinds = (Kind::Vxcan(Some(to(second))), Kind::Vxcan(Some(to(first))));
+                (first.kind, second.kind) = kinds;
+            }
+            World::of(here)
+        },
+    )
+}
+
+fn any_wanted() -> impl Strategy<Value = Vec<Wanted>> {
+    let one = (0..NAMES.len(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
+    let wanted = one.prop_map(|(name, skin, fd, rate, data)| {
+        let name = NAMES[name];
+        if !skin {
+            return Wanted::named(name);
+        }
+        let format = if fd { Format::Fd } else { Format::Classic };
+        let bitrate = (rate > 0).then_some(rate * 250_000);
+        let data = (rate > 0 && data > 0 && fd).then_some(data * 1_000_000);
+        in_skin(name, format, bitrate, data)
+    });
+    // A name once: two skins may want different things of one bus.
+    proptest::collection::vec(wanted, 0..5).prop_map(|mut all| {
+        let mut seen = std::collections::HashSet::new();
+        all.retain(|wanted| seen.insert(wanted.name.clone()));
+        all
+    })
+}
+
+proptest! {
+    #[test]
+    fn a_plan_leads_to_what_is_wanted_and_touches_nothing_else(
+        world in any_world(), wanted in any_wanted(), set: bool,
+    ) {
+        let Ok(plan) = up(&wanted, &world.here, set) else {
+            let harmless = |wanted: &Wanted| find(&world.here, &wanted.name)
+                .map_or(!wanted.is_hardware(), |it| it.is_virtual() && it.ours);
+            prop_assert!(!wanted.iter().all(harmless), "refused, and all could have been had");
+            return Ok(());
+        };
+        let after = world.carry_out_all(&plan);
+        for wanted in &wanted {
+            let it = after.named(&wanted.name);
+            prop_assert!(it.is_can() && it.up && wanted.carried_by(it.mtu), "{it:?}");
+        }
+        for before in &world.here {
+            let hardware = matches!(before.kind, Kind::Hardware(_));
+            let may_change = wanted.iter().any(|it| it.name == before.name)
+                && (before.is_virtual() && before.ours || hardware && set);
+            prop_assert!(may_change || after.named(&before.name) == before, "{before:?}");
+        }
+        prop_assert_eq!(up(&wanted, &after.here, set).unwrap().steps, []);
+        prop_assert_eq!(up(&wanted, &after.here, false).unwrap().steps, []);
+    }
+
+    #[test]
+    fn down_takes_back_what_up_made(world in any_world(), wanted in any_wanted()) {
+        let Ok(plan) = up(&wanted, &world.here, false) else { return Ok(()) };
+        let after = world.carry_out_all(&plan);
+        let made: Vec<_> = plan.steps.iter().map(|step| Wanted::named(step.name())).collect();
+        let end = after.carry_out_all(&down(&made, &after.here).unwrap());
+        let kept = |it: &&Interface| plan.steps.iter().all(|step| step.name() != it.name);
+        for before in world.here.iter().filter(kept) {
+            let taken_along = matches!(&before.kind, Kind::Vxcan(Some(Peer { place: Place::Here, .. })));
+            prop_assert!(taken_along || end.named(&before.name) == before);
+        }
+        prop_assert!(made.iter().all(|wanted| find(&end.here, &wanted.name).is_none()));
+    }
+
+    #[test]
+    fn down_removes_what_is_ours_and_only_that(world in any_world(), wanted in any_wanted()) {
+        let Ok(plan) = down(&wanted, &world.here) else {
+            let foreign = |wanted: &Wanted| find(&world.here, &wanted.name)
+                .is_some_and(|it| !it.ours || !it.is_virtual());
+            prop_assert!(wanted.iter().any(|wanted| wanted.skin.is_none() && foreign(wanted)));
+            return Ok(());
+        };
+        let after = world.carry_out_all(&plan);
+        for wanted in &wanted {
+            let left = find(&after.here, &wanted.name);
+            prop_assert!(left.is_none_or(|it| !it.ours || !it.is_virtual()), "{left:?}");
+        }
+        prop_assert_eq!(down(&wanted, &after.here).unwrap().steps, []);
+    }
+}
