@@ -35,8 +35,6 @@ pub use stimuli::PENDING;
 
 /// From one heartbeat to the next.
 pub const HEARTBEAT: Span = Span::from_millis(250);
-/// So much earlier at most is a heartbeat said together with an answer, which spares a wake-up.
-pub const EARLY: Span = Span::from_millis(50);
 /// How long a new cell listens at least for another one under its number.
 pub const CLAIM: Span = Span::from_millis(250);
 /// First words are spread over this time by serial number: two cells under one number that are switched
@@ -329,8 +327,8 @@ impl Node {
     /// A heartbeat that is due before the next joints is said now, while the cell is awake.
     fn heartbeat_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
-        let early = Span(u64::from(in_use.parameters.period_us).min(EARLY.0));
-        if self.claim == Claim::Settled && now + early > self.next_heartbeat {
+        let next_joints = now + Span(in_use.parameters.period_us.into());
+        if self.claim == Claim::Settled && next_joints > self.next_heartbeat {
             self.regular_heartbeat(now);
         }
     }
