@@ -464,8 +464,7 @@ mod tests {
         let error =
             Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
         if kernel::has_socketcan() {
-            let expected = "there is no interface nosuchcan0: make it with \
-                            `ip link add nosuchcan0 type vcan && ip link set nosuchcan0 mtu 72 up`";
+            let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`";
             assert_eq!(error.to_string(), expected);
         } else {
             assert!(matches!(error, BusError::NoSocketCan { .. }), "{error}");

@@ -1,6 +1,6 @@
 //! The table of `CAN_RAW`'s rules, held against a real kernel.
 //!
-//! Needs `vcan0` with MTU 72, up: `ip link add vcan0 type vcan && ip link set vcan0 mtu 72 up`.
+//! Needs `vcan0` with MTU 72, up: `vcan-setup up vcan0`.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::time::Duration;
@@ -96,7 +96,7 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
     assert_eq!(bus.kind(), BusKind::SocketCan);
     assert!(bus.receive_buffer() >= Options::default().receive_buffer, "{}", bus.receive_buffer());
     let error = Bus::open("vcan77", Choice::Auto, &Options::default()).unwrap_err();
-    let expected = "there is no interface vcan77: make it with `ip link add vcan77 type vcan && ip link set vcan77 mtu 72 up`";
+    let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`";
     assert_eq!(error.to_string(), expected);
     let error = Bus::open("lo", Choice::Auto, &Options::default()).unwrap_err();
     assert!(matches!(error, BusError::NotCan { .. }), "{error}");

@@ -37,9 +37,7 @@ pub enum BusError {
         name: String,
     },
     /// The kernel has SocketCAN and no such interface.
-    #[error(
-        "there is no interface {name}: make it with `ip link add {name} type vcan && ip link set {name} mtu 72 up`"
-    )]
+    #[error("there is no interface {name}: make it with `vcan-setup up {name}`")]
     NoInterface {
         /// The bus.
         name: String,
@@ -55,7 +53,7 @@ pub enum BusError {
     /// A classic interface where CAN FD is wanted.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
-         {name} mtu 72 up`, or use the classic format"
+         {name} mtu 72 up`, or use the classic format (`vcan-setup doctor {name}` knows hardware)"
     )]
     ClassicOnly {
         /// The interface.
