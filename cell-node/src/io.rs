@@ -18,6 +18,9 @@ use crate::node::{Flash, Identity, Node};
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
+/// From one comparison with the wall's clock to the next.
+const MEASURE: Span = Span::from_millis(250);
+
 /// Where a cell keeps its parameters; without a directory, in memory only.
 #[derive(Debug)]
 pub struct FlashFile {
@@ -97,9 +100,11 @@ pub struct Cells {
 #[derive(Debug)]
 struct Clock {
     start: Instant,
-    /// The wall's time at the start, in µs since 1970; measured again at each heartbeat, because somebody
-    /// may set the wall's clock.
+    /// The wall's time at the start, in µs since 1970; measured again now and then, because somebody may set
+    /// the wall's clock.
     wall: u64,
+    /// When it was measured.
+    measured: Micros,
 }
 
 /// Why cells stop.
@@ -128,8 +133,8 @@ impl Cells {
     #[must_use]
     pub fn new(format: Format) -> Self {
         let (cells, outbox) = (Vec::new(), Vec::new());
-        let mut clock = Clock { start: Instant::now(), wall: 0 };
-        clock.set();
+        let mut clock = Clock { start: Instant::now(), wall: 0, measured: Micros(0) };
+        clock.set(Micros(0));
         Self { cells, places: [None; 256], format, clock, outbox }
     }
 
@@ -172,9 +177,11 @@ impl Cells {
             if node.poll_timeout() <= now {
                 node.handle_timeout(now);
                 collect(node, file, self.format, &mut self.outbox);
-                self.clock.set();
             }
             next = next.min(node.poll_timeout());
+        }
+        if now.since(self.clock.measured) >= MEASURE {
+            self.clock.set(now);
         }
         self.flush(bus)?;
         let wait = Duration::from_micros(next.since(now).0);
@@ -235,9 +242,10 @@ impl Clock {
     }
 
     /// Compares itself with the wall's clock.
-    fn set(&mut self) {
+    fn set(&mut self, now: Micros) {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_micros();
         self.wall = u64::try_from(wall).unwrap_or(0).saturating_sub(self.now().0);
+        self.measured = now;
     }
 
     /// How long before `now` a wall's time in ns was.
