@@ -19,6 +19,7 @@ use gateway::run::turn::{Line, Shared, Turn};
 use gateway::scenario::{Mode, ModeChange, Scenario};
 use gateway::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};
+use protocol::can::Frame;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -83,9 +84,34 @@ fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
     let without = ticks(Mode::Distributed, &bus, false);
     assert_eq!(
         without,
-        Run { sent: 126, taken: 0, allocations: 0 },
-        "the joints, and a halt: the bus is gone"
+        Run { sent: 240, taken: 0, allocations: 0 },
+        "the joints, a halt, and it again before each of the 114 joints after it: the bus is gone"
     );
+}
+
+#[test]
+fn a_halt_that_a_bus_did_not_take_is_said_before_its_next_joints_and_then_no_more() {
+    let (mut turn, mut snapshots, table) = turn(&skin(4), Mode::Distributed);
+    let mut taken = Vec::new();
+    // Nothing is read back, so that the robot is halted within the first 100 ticks.
+    for number in 0..200_u64 {
+        snapshots.input_buffer_mut().take(table.snapshot(), false);
+        snapshots.publish();
+        turn.turn(
+            Tick { number, time: Micros(number * 2_000) },
+            0,
+            0,
+            || 0,
+            |_, frames| {
+                let takes = number >= 100;
+                taken.extend(frames.iter().filter(|_| takes).map(Frame::id));
+                takes
+            },
+        );
+    }
+    let (halt, joints) = (0x000, 0x001);
+    assert_eq!(taken[..2], [halt, joints]);
+    assert!(taken[2..].len() == 11 && taken[2..].iter().all(|&id| id == joints), "{taken:?}");
 }
 
 #[derive(Debug, PartialEq)]

@@ -69,19 +69,22 @@ pub struct Turn {
     scenario: Arc<Scenario>,
     shared: Arc<Shared>,
     records: rtrb::Producer<Timed>,
+    /// The halt or resume that each bus has not taken yet: its cells would else not be as the robot is.
+    owed: Vec<Option<Message>>,
 }
 
 impl Turn {
     /// A loop over some buses that has not begun.
     #[must_use]
-    pub const fn new(
+    pub fn new(
         cycle: Cycle,
         lines: Vec<Line>,
         scenario: Arc<Scenario>,
         shared: Arc<Shared>,
         records: rtrb::Producer<Timed>,
     ) -> Self {
-        Self { cycle, lines, scenario, shared, records }
+        let owed = vec![None; lines.len()];
+        Self { cycle, lines, scenario, shared, records, owed }
     }
 
     /// What the controller has counted, by name.
@@ -116,6 +119,7 @@ impl Turn {
             (now().saturating_sub(before), std::hint::black_box(felt))
         });
         if let Some((epoch, joints)) = outcome.joints {
+            self.say_what_is_owed(&mut send);
             for line in &mut self.lines {
                 // A full queue costs the receiver the unrounded positions, and nothing else.
                 let _ = line.positions.push((epoch, outcome.record.q));
@@ -125,8 +129,8 @@ impl Turn {
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
         }
         match outcome.command {
-            Some(Command::Halt) => self.say(&Message::Halt, &mut send),
-            Some(Command::Resume) => self.say(&Message::Resume, &mut send),
+            Some(Command::Halt) => self.command(Message::Halt, &mut send),
+            Some(Command::Resume) => self.command(Message::Resume, &mut send),
             Some(Command::Joints | Command::Sync | Command::Report) | None => {}
         }
         let timed = Timed {
@@ -140,18 +144,44 @@ impl Turn {
         }
     }
 
-    /// Sends a command on every bus.
-    fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
-        let packet = message.encode();
-        for (bus, line) in self.lines.iter().enumerate() {
-            let (frames, count) = frames(&packet, line.format);
-            let frames = frames.get(..count).unwrap_or_default();
-            if send(bus, frames) {
-                self.shared.commands.fetch_add(1, Ordering::Relaxed);
-            } else {
-                self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
-            }
+    /// Tells every bus to halt or to resume; one that does not take it is told before each of its next joints.
+    fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        self.owed.fill(Some(message));
+        self.say_what_is_owed(send);
+    }
+
+    fn say_what_is_owed(&mut self, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        for (bus, (line, owed)) in self.lines.iter().zip(&mut self.owed).enumerate() {
+            owed.take_if(|message| self.shared.say(bus, line.format, message, send));
         }
+    }
+
+    /// Sends joints on every bus.
+    fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        for (bus, line) in self.lines.iter().enumerate() {
+            self.shared.say(bus, line.format, message, send);
+        }
+    }
+}
+
+impl Shared {
+    /// Sends a command on a bus, and counts it; whether the bus took it.
+    fn say(
+        &self,
+        bus: usize,
+        format: Format,
+        message: &Message,
+        send: &mut impl FnMut(usize, &[Frame]) -> bool,
+    ) -> bool {
+        let (frames, count) = frames(&message.encode(), format);
+        let frames = frames.get(..count).unwrap_or_default();
+        let taken = send(bus, frames);
+        if taken {
+            self.commands.fetch_add(1, Ordering::Relaxed);
+        } else {
+            self.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+        }
+        taken
     }
 }
 
