@@ -4,10 +4,47 @@
 
 mod process;
 
-use process::whole;
+use gateway::generate::{Wanted, generate};
+use process::log::Log;
+use process::vcan::tool;
+use process::{PRESSED, Place, whole};
+use protocol::can::Format;
+use protocol::message::Message;
 
 #[test]
 #[ignore = "needs the lab machine"]
 fn all_253_processes_answer_every_broadcast_at_20_hz() {
     whole::runs_for_half_a_minute(20 * 30);
+}
+
+/// Frames bear the wall's time, and somebody may set it: by hand, or NTP.
+#[test]
+#[ignore = "needs the lab machine"]
+fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
+    let place = Place::on_vcan();
+    let wanted = Wanted { cells: 4, broadcast_hz: 20.0, ..Wanted::default() };
+    place.write("skin.toml", &generate(&wanted).unwrap());
+    place.scenario(PRESSED);
+    let bench = place.running_bench(6.0, "");
+    let guest = place.guest();
+    guest.waits_for_epoch(20);
+    let back = tool("date +%s").stdout;
+    let back: u64 = String::from_utf8(back).unwrap().trim().parse().unwrap();
+    tool(&format!("date --set @{}", back - 100));
+    guest.waits_for_epoch(60);
+    tool(&format!("date --set @{back}"));
+    bench.end().well();
+    place.summary().adds_up();
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let joints = |message: &Message| matches!(message, Message::Joints { .. });
+    let places: Vec<_> =
+        log.messages.iter().enumerate().filter(|(_, (message, _))| joints(message)).collect();
+    // Both steps may cost some epochs, until a cell has compared its clock again.
+    for (what, from, to) in [("before", 5, 18), ("between", 35, 55), ("after", 80, 110)] {
+        let (from, to) = (places[from].0, places[to].0);
+        for cell in 1..=4 {
+            let count = log.torques_after(from, cell) - log.torques_after(to, cell);
+            assert!(count > 0, "{what}, cell {cell}: {count} torques");
+        }
+    }
 }
