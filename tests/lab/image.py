@@ -32,6 +32,7 @@ NEEDED = {
     "depmod": "kmod",
     "candump": "can-utils",
     "ip": "iproute2",
+    "dpkg-deb": "dpkg",
 }
 
 # What `init` loads: the way to the host, then CAN. `modules.dep` adds the rest.
@@ -47,7 +48,7 @@ class LabError(Exception):
 
 def which(program):
     """Like `shutil.which`, but also looks where a user's PATH often does not."""
-    return shutil.which(program, path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/usr/bin:/bin")
+    return shutil.which(program, path=os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin")
 
 
 def need_packages(say):
@@ -64,7 +65,9 @@ def need_packages(say):
     say(f"installing {' '.join(missing)}")
     apt_update(say)
     env = dict(os.environ, DEBIAN_FRONTEND="noninteractive")
-    run([*install.split(), "-y", "-q"], f"cannot install {' '.join(missing)}; run by hand to see why: {install}", env=env)
+    run([*install.split(), "-y", "-q"], f"cannot install {' '.join(missing)}; with a network, run by hand: {install}", env=env)
+    if absent := [program for program in NEEDED if not which(program)]:
+        raise LabError(f"installed {' '.join(missing)}, and still not in PATH: {' '.join(absent)}")
 
 
 def apt_update(say):
@@ -89,12 +92,8 @@ def image(cache, say):
     if made := newest(cache.glob(f"*-{key}")):
         return made
     with contextlib.ExitStack() as stack:
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            lock = stack.enter_context(open(cache / "lock", "w", encoding="ascii"))
-        except OSError as error:
-            raise LabError(f"cannot write to the cache folder {cache} ({error.strerror}); "
-                           "name a writable one in SKINBUS_LAB_CACHE") from error
+        cache.mkdir(parents=True, exist_ok=True)
+        lock = stack.enter_context(open(cache / "lock", "w", encoding="ascii"))
         fcntl.flock(lock, fcntl.LOCK_EX)
         if made := newest(cache.glob(f"*-{key}")):
             return made
@@ -107,7 +106,9 @@ def image(cache, say):
             f"cannot unpack {deb}; delete it, and it is downloaded again")
         ready = making / "image"
         ready.mkdir()
-        vmlinuz = next((making / "root/boot").glob("vmlinuz-*"))
+        vmlinuz = newest((making / "root/boot").glob("vmlinuz-*"))
+        if not vmlinuz:
+            raise LabError(f"{deb} has no /boot/vmlinuz-*; put Debian 12's linux-image-6.1.*-amd64 package there instead")
         (ready / "vmlinux").write_bytes(bare_elf(vmlinuz))
         (ready / "initramfs.cpio").write_bytes(initramfs(making / "root"))
         made = cache / f"{deb.name.removeprefix('linux-image-').removesuffix('_amd64.deb')}-{key}"
@@ -128,6 +129,10 @@ def kernel_package(cache, making, say):
     cached = newest(cache.glob("linux-image-*.deb"))
     if cached:
         return cached
+    missing = (f"the programs are installed, only the kernel is missing, as {cache} has no linux-image-*.deb; "
+               "copy Debian 12's linux-image-6.1.*-amd64 package there, or try again")
+    if not (which("apt-get") and which("apt-cache")):
+        raise LabError(f"{missing} where there is apt")
     why = f"apt does not know {META_PACKAGE}"
     for attempt in range(2):
         if attempt == 1:                    # the lists may be missing, or older than the kernel there is
@@ -144,8 +149,7 @@ def kernel_package(cache, making, say):
             deb = next(making.glob("linux-image-*.deb"))
             return deb.rename(cache / deb.name)
         why = (done.stderr.strip().splitlines() or ["no output"])[-1]
-    raise LabError(f"cannot download a kernel ({why}), and {cache} has no linux-image-*.deb; "
-                   "try again with a network, or copy that package of Debian there")
+    raise LabError(f"{missing} with a network ({why})")
 
 
 def bare_elf(vmlinuz):
