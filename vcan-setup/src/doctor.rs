@@ -259,15 +259,12 @@ impl Facts {
         if !self.buses.is_empty() {
             return None;
         }
-        let usable = |interface: &&Interface| interface.up && interface.mtu >= FD_MTU;
-        Some(match self.present.iter().find(usable) {
-            Some(Interface { name, .. }) => Finding::ok(format!(
-                "{name} is up and carries CAN FD; `vcan-setup status` lists all interfaces"
-            )),
-            None => Finding::fault(
-                "there is no CAN interface that is up and carries CAN FD",
-                [self.own("up vcan0")],
-            ),
+        let up = self.present.iter().filter(|interface| interface.up);
+        Some(match up.max_by_key(|interface| interface.mtu >= FD_MTU) {
+            Some(Interface { name, mtu, .. }) => {
+                Finding::ok(format!("{name} is up and carries {}", carries(*mtu)))
+            }
+            None => Finding::fault("no CAN interface is up", [self.own("up vcan0")]),
         })
     }
 
@@ -300,9 +297,11 @@ impl Facts {
             Kind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
         };
         if would_run(&findings) {
-            let format = if interface.mtu >= FD_MTU { "CAN FD" } else { "classic CAN" };
             let what = interface.what();
-            findings.insert(0, Finding::ok(format!("{name} is {what}, up, and carries {format}")));
+            findings.insert(
+                0,
+                Finding::ok(format!("{name} is {what}, up, and carries {}", carries(interface.mtu))),
+            );
             findings.extend(self.traffic(bus, name));
         }
         findings
@@ -529,6 +528,11 @@ impl Facts {
             )),
         }
     }
+}
+
+/// What an interface of this MTU carries.
+const fn carries(mtu: u32) -> &'static str {
+    if mtu >= FD_MTU { "CAN FD" } else { "classic CAN" }
 }
 
 /// Frames that a packet takes.

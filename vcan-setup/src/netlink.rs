@@ -277,6 +277,19 @@ impl Netlink {
         self.change(message)
     }
 
+    /// Sees that a clock comes near enough to what was asked for: a driver takes what is five percent away.
+    fn see_rates(&mut self, index: u32, wanted: Rates) -> io::Result<()> {
+        let answers = self.request(RouteNetlinkMessage::GetLink(link(index)), 0)?;
+        let interface = answers.iter().find_map(|answer| interface(answer));
+        match interface.map(|interface| interface.kind) {
+            Some(Kind::Hardware(hardware)) if !Rates::of(&hardware).meet(wanted) => {
+                let nearest = Rates::of(&hardware);
+                Err(io::Error::other(format!("the nearest that its clock gives is {nearest}")))
+            }
+            Some(_) | None => Ok(()),
+        }
+    }
+
     /// Removes an interface, and the other end of its pair with it.
     ///
     /// # Errors
@@ -308,8 +321,10 @@ impl Netlink {
             Step::SetRates { index, rates, before, was_up, .. } => {
                 let undo = Some(Undo::Restore { index, mtu: None, rates: Some(before), up: was_up });
                 let down = if was_up { self.set_up(index, false) } else { Ok(()) };
-                let done =
-                    down.and_then(|()| self.set_rates(index, rates)).and_then(|()| self.set_up(index, true));
+                let done = down
+                    .and_then(|()| self.set_rates(index, rates))
+                    .and_then(|()| self.see_rates(index, rates))
+                    .and_then(|()| self.set_up(index, true));
                 self.or_undo(done, undo)
             }
             Step::Remove { index, .. } => self.remove(index).map(|()| None),

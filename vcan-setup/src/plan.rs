@@ -173,8 +173,16 @@ pub struct Rates {
 }
 
 impl Rates {
-    fn of(hardware: &Hardware) -> Self {
+    /// Those that hardware has; in classic mode it has none for data.
+    #[must_use]
+    pub fn of(hardware: &Hardware) -> Self {
         Self { bitrate: hardware.bitrate, data_bitrate: hardware.data_bitrate.filter(|_| hardware.fd) }
+    }
+
+    /// Whether these are what was wanted, but for half a percent.
+    #[must_use]
+    pub fn meet(self, wanted: Self) -> bool {
+        near(wanted.bitrate, self.bitrate) && near(wanted.data_bitrate, self.data_bitrate)
     }
 }
 
@@ -366,17 +374,13 @@ pub enum Refusal {
     },
     /// A pair that is there, and whose other end does not work.
     #[error(
-        "the other end of {name}, {peer} in {there}, is {what}, and vcan-setup changes nothing there: `sudo {command}` mends it"
+        "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` mends it"
     )]
     OtherEnd {
         /// Its name.
         name: String,
-        /// The other end.
-        peer: String,
-        /// The namespace of the other end.
-        there: Namespace,
-        /// What is wrong with it.
-        what: String,
+        /// The other end, and what is wrong with it.
+        end: String,
         /// What to do.
         command: String,
     },
@@ -553,7 +557,6 @@ pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, R
         return Ok(plan);
     };
     // Steps do not reach into the other namespace, but for making what is not there.
-    let peer = peer.to_owned();
     let ip = there.name.ip();
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
@@ -563,8 +566,8 @@ pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, R
             format!("sh -c '{ip} link set {peer} down && {ip} link set {peer} mtu {FD_MTU} up'"),
         ),
     };
-    let (name, there) = (name.to_owned(), there.name.clone());
-    Err(Refusal::OtherEnd { name, peer, there, what, command })
+    let end = format!("{peer} in {}, is {what}", there.name);
+    Err(Refusal::OtherEnd { name: name.to_owned(), end, command })
 }
 
 fn are_a_pair(here: &Interface, other: &Interface, there: Option<&There>) -> bool {
@@ -663,9 +666,13 @@ impl Plan {
 /// Whether hardware has the bit rates that a skin names; what it does not name may be anything.
 #[must_use]
 pub fn agrees(skin: &SkinBus, hardware: &Hardware) -> bool {
-    let same = |wanted: Option<u32>, has: Option<u32>| wanted.is_none() || wanted == has;
-    let has = Rates::of(hardware);
-    same(skin.bitrate, has.bitrate) && same(skin.data_bitrate, has.data_bitrate)
+    Rates::of(hardware).meet(Rates { bitrate: skin.bitrate, data_bitrate: skin.data_bitrate })
+}
+
+/// A controller's clock is divided by whole numbers: it may miss what was asked for, by less than the nodes
+/// of a bus may differ.
+fn near(wanted: Option<u32>, has: Option<u32>) -> bool {
+    wanted.is_none_or(|wanted| has.is_some_and(|has| u64::from(wanted.abs_diff(has)) * 200 <= wanted.into()))
 }
 
 /// The bit rates that hardware has, in words.

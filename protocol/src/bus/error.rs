@@ -53,7 +53,7 @@ pub enum BusError {
     /// A classic interface where CAN FD is wanted.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
-         {name} mtu 72 up`, or use the classic format (`vcan-setup doctor {name}` knows hardware)"
+         {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` says how)"
     )]
     ClassicOnly {
         /// The interface.

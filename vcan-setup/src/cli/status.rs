@@ -48,11 +48,8 @@ impl Status {
         if absent.is_empty() {
             return Ok(());
         }
-        let names = absent.join(", ");
-        Err(Failure::run(format!(
-            "not there: {names}; `sudo vcan-setup up {}` makes a vcan",
-            absent.join(" ")
-        )))
+        let (names, words) = (absent.join(", "), absent.join(" "));
+        Err(Failure::run(format!("not there: {names}; `vcan-setup doctor {words}` says how to get it")))
     }
 }
 

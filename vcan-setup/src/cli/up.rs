@@ -238,7 +238,11 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
              `gateway run ... --bus-kind embedded`"
         ))
     };
+    let data = if let Step::SetRates { rates, .. } = step { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
+        (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run(format!(
+            "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"
+        )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
             // Root would only be told this.
@@ -253,7 +257,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
             Failure::run(format!("cannot {doing}: its driver does not take that ({error})"))
         }
         (Some(Errno::EXIST), Some(_)) => Failure::run(format!(
-            "cannot {doing}: an interface of that name has appeared meanwhile; try again"
+            "cannot {doing}: an interface has that name since just now, or as an altname; `ip link show` lists them"
         )),
         _ => Failure::run(format!("cannot {doing}: {error}")),
     }

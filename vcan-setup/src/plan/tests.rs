@@ -104,9 +104,10 @@ impl World {
             }
             Step::Remove { name, index } => {
                 let removed = self.ours(*index, name).clone();
-                let peer = match &removed.kind {
-                    Kind::Vxcan(Some(Peer { index, place: Place::Here, .. })) => Some(*index),
-                    _ => None,
+                let peer = if let Kind::Vxcan(Some(Peer { index, place: Place::Here, .. })) = &removed.kind {
+                    Some(*index)
+                } else {
+                    None
                 };
                 self.here.retain(|it| it.index != *index && Some(it.index) != peer);
             }
@@ -246,6 +247,18 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
         set(in_skin("can0", Format::Fd, Some(250_000), None)),
         "skin.toml has no data_bitrate for can0: put `data_bitrate = 5000000` under its [[bus]], then try again"
     );
+}
+
+#[test]
+fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
+    let met = |has, wanted| {
+        let rates = |bitrate| Rates { bitrate, data_bitrate: None };
+        rates(has).meet(rates(wanted))
+    };
+    assert!(met(Some(10_000), Some(10_001)) && met(Some(83_333), Some(83_000)));
+    assert!(met(Some(995_000), Some(1_000_000)) && !met(Some(994_999), Some(1_000_000)));
+    assert!(met(Some(1_005_000), Some(1_000_000)) && !met(Some(1_005_001), Some(1_000_000)));
+    assert!(met(None, None) && met(Some(1), None) && !met(None, Some(1)));
 }
 
 #[test]
@@ -403,7 +416,7 @@ proptest! {
     ) {
         let Ok(plan) = up(&wanted, &world.here, set) else {
             let harmless = |wanted: &Wanted| find(&world.here, &wanted.name)
-                .map_or(!wanted.is_hardware(), |it| it.is_virtual() && it.ours);
+                .map_or_else(|| !wanted.is_hardware(), |it| it.is_virtual() && it.ours);
             prop_assert!(!wanted.iter().all(harmless), "refused, and all could have been had");
             return Ok(());
         };

@@ -1,0 +1,279 @@
+//! The commands as processes, as far as they need no CAN in the kernel and change no interface.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use protocol::bus::{Bus, BusKind, Choice, Options};
+use protocol::can::Frame;
+use protocol::id::{CellId, Id, Kind, Node};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// A folder with a copy of the program, and nothing beside it unless it is put there.
+struct Folder(TempDir);
+
+/// What a command said.
+#[derive(Debug)]
+struct Said {
+    code: i32,
+    out: String,
+    err: String,
+}
+
+impl Folder {
+    fn new() -> Self {
+        let folder = Self(TempDir::new().unwrap());
+        std::fs::copy(env!("CARGO_BIN_EXE_vcan-setup"), folder.program()).unwrap();
+        folder
+    }
+
+    fn program(&self) -> PathBuf {
+        self.0.path().join("vcan-setup")
+    }
+
+    fn buses(&self) -> PathBuf {
+        self.0.path().join("buses")
+    }
+
+    fn command(&self, arguments: &str) -> Command {
+        let mut command = Command::new(self.program());
+        command.args(arguments.split_whitespace()).env("SKINBUS_DIR", self.buses());
+        command.current_dir(self.0.path());
+        command
+    }
+
+    fn run(&self, arguments: &str) -> Said {
+        let output = self.command(arguments).output().unwrap();
+        let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+        Said { code: output.status.code().unwrap(), out, err }
+    }
+
+    fn write(&self, name: &str, text: &str) {
+        std::fs::write(self.0.path().join(name), text).unwrap();
+    }
+
+    /// Serves a bus, and says so before it returns.
+    fn serve(&self, name: &str) -> Served {
+        let mut child = self.command(&format!("serve {name}")).stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        assert!(line.starts_with("serving "), "{line}");
+        Served(child)
+    }
+}
+
+struct Served(Child);
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The skin of the README, with some lines changed.
+fn skin(changes: &[(&str, &str)]) -> String {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let text = std::fs::read_to_string(root.join("gateway/examples/ur5-253.toml")).unwrap();
+    changes.iter().fold(text, |text, (from, to)| {
+        assert!(text.contains(from), "{from}");
+        text.replace(from, to)
+    })
+}
+
+#[test]
+fn wrong_use_is_said_in_one_line() {
+    let folder = Folder::new();
+    folder.write("broken.toml", "version = 2\n");
+    folder.write("rates.toml", &skin(&[("format = \"fd\"", "format = \"fd\"\nbitrate = 5")]));
+    for (arguments, says) in [
+        ("up", "the following required arguments were not provided: <SKIN.toml|NAME>...; try '--help'"),
+        (
+            "up --pear x",
+            "unexpected argument '--pear' found; a similar argument exists: '--peer'; try '--help'",
+        ),
+        (
+            "up vcan0 --namespace x",
+            "the following required arguments were not provided: --peer <PEER>; try '--help'",
+        ),
+        ("up vcan0 vcan1 --peer x", "--peer makes one pair: give one NAME with it"),
+        (
+            "up lo",
+            "lo is real, the loopback interface, and is left alone: choose another name, as `vcan-setup up vcan0` does",
+        ),
+        ("down lo", "lo is the loopback interface that vcan-setup has not made, and is left alone"),
+        (
+            "up a23456789012345678",
+            "\"a23456789012345678\" is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'",
+        ),
+        (
+            "up vcan%d",
+            "\"vcan%d\" is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0",
+        ),
+        (
+            "up vcan0 --peer .x",
+            "\".x\" is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0",
+        ),
+        ("up nosuch.toml", "nosuch.toml: No such file or directory (os error 2)"),
+        ("status ./broken.toml", "./broken.toml:1: missing field `name`"),
+        ("doctor rates.toml", "rates.toml:36: bus[0].bitrate = 5: 10000 to 1000000 bit/s are possible"),
+        (
+            "doctor --bus-kind vcan",
+            "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is no kind of bus: auto, socketcan and embedded are; try '--help'",
+        ),
+        (
+            "up vcan0 --peer vcan1 --namespace nosuch",
+            "there is no network namespace nosuch in /run/netns: `sudo ip netns add nosuch` makes it, `ip netns` lists them; a process' number or a path is taken too",
+        ),
+    ] {
+        let said = folder.run(arguments);
+        assert_eq!(said.err, format!("vcan-setup: {says}\n"), "{arguments}");
+        assert_eq!((said.code, said.out.as_str()), (2, ""), "{arguments}");
+    }
+}
+
+#[test]
+fn a_plan_is_said_in_words_and_as_commands_and_nothing_is_done() {
+    let folder = Folder::new();
+    folder.write("skin.toml", &skin(&[("\"vcan0\"", "\"nosuchcan1\"")]));
+    let said = folder.run("up --dry-run skin.toml nosuchcan2");
+    let plan = |name| {
+        format!(
+            "would make {name}, a vcan with MTU 72, and bring it up\n    ip link add {name} mtu 72 type vcan && ip link \
+             set {name} alias skinbus up\n"
+        )
+    };
+    assert_eq!(said.out, plan("nosuchcan1") + &plan("nosuchcan2"));
+    assert_eq!((said.code, said.err.as_str()), (0, ""));
+    let said = folder.run("up --dry-run nosuchcan1 --peer nosuchcan2");
+    assert!(
+        said.out.starts_with("would make nosuchcan1 and its other end nosuchcan2, a vxcan pair"),
+        "{said:?}"
+    );
+    let said = folder.run("down skin.toml");
+    assert_eq!((said.code, said.out.as_str()), (0, "nosuchcan1 is not there\n"), "so nothing was made");
+}
+
+#[test]
+fn help_has_examples() {
+    let folder = Folder::new();
+    for command in ["", "up", "down", "status", "doctor", "serve"] {
+        let said = folder.run(&format!("{command} --help"));
+        assert!(said.code == 0 && said.out.contains("Example"), "{command}: {said:?}");
+    }
+}
+
+#[test]
+fn status_shows_embedded_buses_and_which_are_served() {
+    let folder = Folder::new();
+    let status = |arguments: &str| {
+        let said = folder.run(&format!("status --json {arguments}"));
+        let json: Value = serde_json::from_str(&said.out).unwrap();
+        (said.code, json["embedded"].clone(), said.err)
+    };
+    assert_eq!(status("").1, serde_json::json!([]));
+    let served = folder.serve("nosuchcan1");
+    let path = folder.buses().join("nosuchcan1.bus").display().to_string();
+    let expected = |served| serde_json::json!([{"name": "nosuchcan1", "path": path, "served": served}]);
+    assert_eq!(status("nosuchcan1"), (0, expected(true), String::new()));
+    let table = folder.run("status nosuchcan1").out;
+    assert!(table.contains("nosuchcan1  embedded bus  this user  served"), "{table}");
+    drop(served);
+    let (code, embedded, err) = status("nosuchcan1");
+    assert_eq!((code, embedded), (1, expected(false)), "its server was killed");
+    assert_eq!(err, "vcan-setup: not there: nosuchcan1; `vcan-setup doctor nosuchcan1` says how to get it\n");
+    assert_eq!(status("nosuchcan2").1, serde_json::json!([]));
+}
+
+/// The findings of one level, of a doctor who looks at the embedded bus.
+fn findings(said: &Said, level: &str) -> Vec<String> {
+    let json: Value = serde_json::from_str(&said.out).unwrap();
+    assert_eq!(json["bus_kind"], "embedded");
+    assert_eq!(json["would_run"], said.code == 0);
+    let all = json["findings"].as_array().unwrap().iter().filter(|it| it["level"] == level);
+    all.map(|it| it["text"].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn the_doctor_wants_the_cells_program_and_a_private_directory() {
+    let folder = Folder::new();
+    folder.write("skin.toml", &skin(&[("\"vcan0\"", "\"nosuchcan1\"")]));
+    let doctor = || folder.run("doctor skin.toml --bus-kind embedded --json");
+    let beside = folder.0.path().join("cell-node");
+    let missing =
+        format!("cell-node is not at {}: the gateway starts it from beside itself", beside.display());
+    assert_eq!(findings(&doctor(), "fault"), [missing]);
+    folder.write("cell-node", "");
+    assert_eq!(findings(&doctor(), "fault"), Vec::<String>::new());
+    let text = folder.run("doctor skin.toml --bus-kind embedded");
+    assert!(text.code == 0 && text.out.ends_with("\nA bench would run, on the embedded bus.\n"), "{text:?}");
+
+    std::fs::create_dir(folder.buses()).unwrap();
+    std::fs::set_permissions(folder.buses(), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let said = doctor();
+    assert!(findings(&said, "fault")[0].contains("has mode 0755, and the bus is private"), "{said:?}");
+    assert_eq!(folder.run("doctor skin.toml --bus-kind embedded").code, 1);
+}
+
+#[test]
+fn the_doctor_judges_the_kernel_by_the_choice() {
+    let folder = Folder::new();
+    folder.write("cell-node", "");
+    let said = folder.run("doctor nosuchcan1 --bus-kind socketcan");
+    let expected = match Choice::Auto.resolve() {
+        BusKind::SocketCan => "fault there is no interface nosuchcan1\n",
+        BusKind::Embedded => ") has no CAN, and --bus-kind socketcan needs it\n        ",
+    };
+    assert!(said.out.contains(expected) && said.out.contains("No bench would run"), "{said:?}");
+    assert_eq!((said.code, said.err.as_str()), (1, ""));
+}
+
+/// Runs the doctor while somebody says something on the bus all the time.
+fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
+    let options = Options { filters: vec![], directory: Some(folder.buses()), ..Options::default() };
+    let bus = Bus::open("nosuchcan1", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                bus.send(&frames).unwrap();
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        });
+        let said = folder.run(&format!("doctor skin.toml --bus-kind embedded --json {arguments}"));
+        done.store(true, Ordering::Relaxed);
+        said
+    })
+}
+
+#[test]
+fn the_doctor_hears_gateways_and_cells() {
+    let folder = Folder::new();
+    folder.write("skin.toml", &skin(&[("\"vcan0\"", "\"nosuchcan1\"")]));
+    folder.write("cell-node", "");
+    let _served = folder.serve("nosuchcan1");
+    let joints = Id::command(protocol::id::Command::Joints);
+    let heartbeat = |node| Id::new(Kind::Network, Node::Cell(CellId::new(node).unwrap()));
+    let stimulus = Id::new(Kind::Stimulus, Node::Cell(CellId::new(7).unwrap()));
+
+    let said = doctor_hears(&folder, "", &[stimulus]);
+    assert_eq!(findings(&said, "fault"), Vec::<String>::new(), "somebody at a shell is no gateway");
+    let said = doctor_hears(&folder, "", &[joints]);
+    let rival = "another gateway sends joints on the embedded bus nosuchcan1";
+    assert_eq!(findings(&said, "fault"), [rival]);
+    let cells = [heartbeat(3), heartbeat(12)];
+    let said = doctor_hears(&folder, "", &cells);
+    assert_eq!(findings(&said, "fault"), ["cells are on the embedded bus nosuchcan1 already: 3, 12"]);
+    let said = doctor_hears(&folder, "--no-spawn", &cells);
+    assert_eq!(findings(&said, "fault"), Vec::<String>::new());
+    assert!(findings(&said, "note")[0].starts_with(
+        "2 cells are on the embedded bus nosuchcan1; of the skin's these were not heard: 1, 2, 4, 5"
+    ));
+    let said = doctor_hears(&folder, "--no-spawn", &[]);
+    assert!(findings(&said, "fault")[0].starts_with("no cell is heard on the embedded bus nosuchcan1"));
+}
