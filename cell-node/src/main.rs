@@ -70,7 +70,7 @@ fn main() -> ExitCode {
         // Help and version, which are asked for, are printed as they are.
         Err(asked) if !asked.use_stderr() => asked.exit(),
         Err(wrong) => {
-            say(one_line(&wrong.render().to_string()));
+            say(protocol::usage::one_line(&wrong.render().to_string()));
             return ExitCode::from(2);
         }
     };
@@ -88,15 +88,6 @@ fn main() -> ExitCode {
             ExitCode::from(2)
         }
     }
-}
-
-/// What clap says in several lines: what is wrong and its tip, without the usage.
-fn one_line(text: &str) -> String {
-    let text = text.strip_prefix("error: ").unwrap_or(text);
-    let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
-    let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
-    let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
-    format!("{lines}; try '--help'")
 }
 
 fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {

@@ -59,7 +59,7 @@ pub(crate) fn main() -> ExitCode {
         Err(asked) if !asked.use_stderr() => asked.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => {
-            eprintln!("gateway: {}", one_line(&wrong.render().to_string()));
+            eprintln!("gateway: {}", protocol::usage::one_line(&wrong.render().to_string()));
             return ExitCode::from(2);
         }
     };
@@ -78,13 +78,4 @@ pub(crate) fn main() -> ExitCode {
             ExitCode::from(code)
         }
     }
-}
-
-/// What clap says in several lines: what is wrong and its tip, without the usage.
-fn one_line(text: &str) -> String {
-    let text = text.strip_prefix("error: ").unwrap_or(text);
-    let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
-    let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
-    let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
-    format!("{lines}; try '--help'")
 }
