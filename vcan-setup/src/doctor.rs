@@ -186,7 +186,7 @@ impl Facts {
     }
 
     fn sudo(&self, command: &str) -> String {
-        if self.user.admin { command.to_owned() } else { format!("sudo {command}") }
+        if self.user.admin || self.user.root { command.to_owned() } else { format!("sudo {command}") }
     }
 
     /// What `vcan-setup up` is told to mean a bus: its skin, or its name.
@@ -230,7 +230,11 @@ impl Facts {
             return findings;
         }
         match self.kernel.vcan {
-            Module::There | Module::Unknown => {}
+            Module::There => {}
+            Module::Unknown => findings.push(Finding::note(
+                "whether the kernel has vcan is not to be seen; should it have none:",
+                self.kernel.remedies(Module::Unknown),
+            )),
             Module::Loadable => findings.push(Finding::note(
                 "the kernel's module vcan is not loaded; making an interface loads it",
                 [self.sudo("modprobe vcan")],

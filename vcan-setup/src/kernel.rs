@@ -105,9 +105,7 @@ impl Kernel {
                 "sudo apt install linux-image-{architecture}  # {cloud}: boot it, then {modprobe}"
             );
         }
-        format!(
-            "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN: {release} has neither, nor modules for them"
-        )
+        "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN".to_owned()
     }
 }
 
@@ -214,7 +212,7 @@ mod tests {
             first("6.8.0-50-generic", mint, Module::Missing),
             "sudo apt install linux-modules-extra-6.8.0-50-generic && sudo modprobe -a can_raw vcan vxcan"
         );
-        let strange = "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN: ";
+        let strange = "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN";
         assert!(first("6.12.1", "ID=arch\n", Module::Missing).starts_with(strange));
         assert!(first("5.15.0-microsoft-WSL2", debian, Module::Missing).starts_with(strange));
         assert_eq!(first("6.1.0", debian, Module::Loadable), "sudo modprobe -a can_raw vcan vxcan");

@@ -1,5 +1,5 @@
 //! The commands as processes, as far as they need no CAN in the kernel and change no interface.
-#![allow(clippy::unwrap_used, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};

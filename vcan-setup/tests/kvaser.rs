@@ -2,7 +2,7 @@
 //!
 //! Needs root and the lab machine's two emulated controllers:
 //! `tests/lab/run --kvaser target/testrelease/deps/kvaser-HASH --ignored --test-threads=1`.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::path::Path;
 use std::process::Command;

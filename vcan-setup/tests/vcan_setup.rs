@@ -1,7 +1,7 @@
 //! `up`, `down`, `status` and `doctor` on a real kernel, looked at with `ip`.
 //!
 //! Needs root, and `vcan0` with MTU 72, up, which is left as it is.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::fs::File;
 use std::os::fd::AsFd;

@@ -139,12 +139,10 @@ fn unreadable(error: io::Error) -> Failure {
 fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
-    let file = namespace.open().map_err(|error| match error {
-        NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
-            not_allowed()
-        }
-        error => Failure::usage(error),
-    })?;
+    let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
+    let file = namespace
+        .open()
+        .map_err(|error| if denied(&error) { not_allowed() } else { Failure::usage(error) })?;
     let same = |file: &File| {
         let (there, here) = (file.metadata()?, std::fs::metadata("/proc/thread-self/ns/net")?);
         Ok::<_, io::Error>((there.dev(), there.ino()) == (here.dev(), here.ino()))
@@ -231,11 +229,20 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     };
     let doing = step.doing();
     let unknown = |kind: &str, kernel: &Kernel| {
-        let remedies = kernel.remedies(kernel.module(kind)).join("`, or `");
+        let remedies = kernel.remedies(kernel.module(kind));
+        let nearest = remedies.first().map_or("", String::as_str);
+        // A command and its comment.
+        let (command, why) = nearest.split_once("# ").unwrap_or((nearest, ""));
+        let command = if command.is_empty() { String::new() } else { format!("`{}`", command.trim()) };
+        let why = match (command.is_empty(), why) {
+            (_, "") => String::new(),
+            (true, why) => why.to_owned(),
+            (false, why) => format!(" ({why})"),
+        };
         let release = &kernel.release;
         Failure::run(format!(
-            "cannot {doing}: the kernel ({release}) has no {kind}: `{remedies}`; the embedded bus needs none: \
-             `gateway run ... --bus-kind embedded`"
+            "cannot {doing}: the kernel ({release}) has no {kind}: {command}{why}; or use the embedded bus, which \
+             needs none"
         ))
     };
     let data = if let Step::SetRates { rates, .. } = step { rates.data_bitrate } else { None };

@@ -172,6 +172,9 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert!(
         missing(admin, Module::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
     );
+    assert!(
+        missing(admin, Module::Unknown)[0].starts_with("note: whether the kernel has vcan is not to be seen")
+    );
     let contained = missing(User { root: true, admin: false }, Module::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
