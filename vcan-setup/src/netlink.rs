@@ -6,45 +6,36 @@
 use std::collections::HashMap;
 use std::fs::File;
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, OwnedFd};
-use std::path::Path;
+use std::os::fd::{AsFd, AsRawFd};
 use std::thread;
-use std::time::Duration;
 
-use netlink_packet_core::{
-    ErrorBuffer, NLM_F_ACK, NLM_F_CREATE, NLM_F_DUMP, NLM_F_DUMP_INTR, NLM_F_EXCL, NLM_F_REQUEST, NLMSG_DONE,
-    NLMSG_ERROR, NetlinkBuffer, NetlinkHeader, NetlinkMessage, NetlinkPayload, NlasIterator, Parseable,
-    ParseableParametrized,
-};
+use netlink_packet_core::{NLM_F_CREATE, NLM_F_DUMP, NLM_F_EXCL, NlasIterator, Parseable};
+use netlink_packet_route::RouteNetlinkMessage;
 use netlink_packet_route::link::{
     CanBitTiming, CanCtrlMode, CanCtrlModeFlags, InfoCan, InfoData, InfoKind, InfoVxcan, LinkAttribute,
-    LinkFlags, LinkHeader, LinkInfo, LinkLayerType, LinkMessage,
+    LinkFlags, LinkHeader, LinkInfo, LinkMessage,
 };
 use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
-use netlink_packet_route::{AddressFamily, RouteNetlinkMessage};
 use rustix::io::Errno;
-use rustix::net::netlink::SocketAddrNetlink;
-use rustix::net::sockopt::{Timeout, set_socket_timeout};
-use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{Counters, FD_MTU, Hardware, Interface, Kind, MARK, Peer, Place, State};
+use crate::link::{FD_MTU, Interface, Kind, MARK, Peer, Place};
 use crate::namespace::NAMED;
 use crate::plan::{Rates, Step};
 
-/// How long the kernel may take to answer; it answers at once.
-const PATIENCE: Duration = Duration::from_secs(5);
-/// How often a list that changed while it was read is read again.
-const RETRIES: usize = 8;
-/// Bytes of the two headers before attributes begin.
-const LINK_HEADER: usize = 16;
+mod exchange;
+mod reading;
+
+use exchange::Exchange;
+use reading::{driver, interface};
+
+/// Bytes of the header before a namespace's attributes begin.
 const NSID_HEADER: usize = 4;
 
 /// Speaks to the kernel about the interfaces of one network namespace.
 #[derive(Debug)]
 pub struct Netlink {
-    socket: OwnedFd,
-    sequence: u32,
+    exchange: Exchange,
 }
 
 impl Netlink {
@@ -53,16 +44,7 @@ impl Netlink {
     /// # Errors
     /// When the system gives no such socket.
     pub fn open() -> io::Result<Self> {
-        let socket = rustix::net::socket_with(
-            rustix::net::AddressFamily::NETLINK,
-            SocketType::RAW,
-            SocketFlags::CLOEXEC,
-            // NETLINK_ROUTE is protocol 0.
-            None,
-        )?;
-        set_socket_timeout(&socket, Timeout::Recv, Some(PATIENCE))?;
-        rustix::net::connect(&socket, &SocketAddrNetlink::new(0, 0))?;
-        Ok(Self { socket, sequence: 0 })
+        Exchange::open().map(|exchange| Self { exchange })
     }
 
     /// For another namespace. A socket stays in the namespace where it was opened, and a thread opens it.
@@ -83,7 +65,8 @@ impl Netlink {
     /// # Errors
     /// When the kernel does not answer.
     pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
-        let links = self.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
+        let links =
+            self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
         let mut interfaces: Vec<_> = links.iter().filter_map(|link| interface(link)).collect();
         interfaces.sort_by_key(|interface| interface.index);
         let names: HashMap<_, _> =
@@ -115,7 +98,7 @@ impl Netlink {
         let fd = u32::try_from(namespace.as_raw_fd()).map_err(io::Error::other)?;
         let mut message = NsidMessage::default();
         message.attributes.push(NsidAttribute::Fd(fd));
-        let answers = self.request(RouteNetlinkMessage::GetNsId(message), 0)?;
+        let answers = self.exchange.request(RouteNetlinkMessage::GetNsId(message), 0)?;
         let attributes = answers.iter().filter_map(|answer| answer.get(NSID_HEADER..));
         let mut ids =
             attributes.flat_map(NlasIterator::new).flatten().filter_map(|it| NsidAttribute::parse(&it).ok());
@@ -139,7 +122,7 @@ impl Netlink {
     fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
         let mut message = link(index);
         message.attributes.push(LinkAttribute::IfNetnsId(namespace));
-        let answers = self.request(RouteNetlinkMessage::GetLink(message), 0)?;
+        let answers = self.exchange.request(RouteNetlinkMessage::GetLink(message), 0)?;
         Ok(answers.iter().find_map(|answer| interface(answer)).map(|interface| interface.name))
     }
 
@@ -186,7 +169,8 @@ impl Netlink {
 
     /// A number that no interface has, one above all.
     fn free_index(&mut self) -> io::Result<u32> {
-        let links = self.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
+        let links =
+            self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
@@ -209,7 +193,7 @@ impl Netlink {
                 LinkAttribute::LinkInfo(info(Attempt { index, number })?),
             ];
             let flags = NLM_F_CREATE | NLM_F_EXCL;
-            match self.request(RouteNetlinkMessage::NewLink(message), flags) {
+            match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
                 // Somebody else took the number meanwhile.
                 Err(error) if is(&error, Errno::BUSY) && number < 64 => number += 2,
@@ -238,7 +222,7 @@ impl Netlink {
     }
 
     fn change(&mut self, message: LinkMessage) -> io::Result<()> {
-        self.request(RouteNetlinkMessage::NewLink(message), 0).map(|_| ())
+        self.exchange.request(RouteNetlinkMessage::NewLink(message), 0).map(|_| ())
     }
 
     /// Brings an interface up or down.
@@ -279,7 +263,7 @@ impl Netlink {
 
     /// Sees that a clock comes near enough to what was asked for: a driver takes what is five percent away.
     fn see_rates(&mut self, index: u32, wanted: Rates) -> io::Result<()> {
-        let answers = self.request(RouteNetlinkMessage::GetLink(link(index)), 0)?;
+        let answers = self.exchange.request(RouteNetlinkMessage::GetLink(link(index)), 0)?;
         let interface = answers.iter().find_map(|answer| interface(answer));
         match interface.map(|interface| interface.kind) {
             Some(Kind::Hardware(hardware)) if !Rates::of(&hardware).meet(wanted) => {
@@ -295,7 +279,7 @@ impl Netlink {
     /// # Errors
     /// What the kernel says.
     pub fn remove(&mut self, index: u32) -> io::Result<()> {
-        self.request(RouteNetlinkMessage::DelLink(link(index)), 0).map(|_| ())
+        self.exchange.request(RouteNetlinkMessage::DelLink(link(index)), 0).map(|_| ())
     }
 
     /// Does one step; what undoes it, if there is anything to be undone.
@@ -359,57 +343,6 @@ impl Netlink {
             }
         }
     }
-
-    /// Sends one request and takes all that answers it.
-    fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
-        for _ in 0..RETRIES {
-            let (answers, interrupted) = self.ask(payload.clone(), flags)?;
-            if !interrupted {
-                return Ok(answers);
-            }
-        }
-        Err(io::Error::other("the interfaces change faster than they can be read"))
-    }
-
-    fn ask(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {
-        self.sequence += 1;
-        let mut header = NetlinkHeader::default();
-        header.flags = NLM_F_REQUEST | NLM_F_ACK | flags;
-        header.sequence_number = self.sequence;
-        let mut message = NetlinkMessage::new(header, NetlinkPayload::InnerMessage(payload));
-        message.finalize();
-        let mut bytes = vec![0; message.buffer_len()];
-        message.serialize(&mut bytes);
-        rustix::net::send(&self.socket, &bytes, SendFlags::empty())?;
-
-        let (mut answers, mut interrupted) = (Vec::new(), false);
-        let mut buffer = vec![0; 1 << 17];
-        loop {
-            let (len, _) = rustix::io::retry_on_intr(|| {
-                rustix::net::recv(&self.socket, &mut buffer[..], RecvFlags::empty())
-            })?;
-            let mut rest = buffer.get(..len).unwrap_or_default();
-            while let Ok(answer) = NetlinkBuffer::new_checked(rest) {
-                let len = (answer.length() as usize).next_multiple_of(4);
-                rest = rest.get(len..).unwrap_or_default();
-                if answer.sequence_number() != self.sequence {
-                    continue;
-                }
-                interrupted |= answer.flags() & NLM_F_DUMP_INTR != 0;
-                match answer.message_type() {
-                    NLMSG_DONE => return Ok((answers, interrupted)),
-                    NLMSG_ERROR => {
-                        let error = ErrorBuffer::new_checked(answer.payload()).map_err(io::Error::other)?;
-                        return match error.code() {
-                            None => Ok((answers, interrupted)),
-                            Some(code) => Err(io::Error::from_raw_os_error(code.get().abs())),
-                        };
-                    }
-                    _ => answers.push(answer.payload().to_vec()),
-                }
-            }
-        }
-    }
 }
 
 /// What takes a step back.
@@ -449,96 +382,4 @@ fn link(index: u32) -> LinkMessage {
     let mut message = LinkMessage::default();
     message.header.index = index;
     message
-}
-
-/// Reads what the kernel says of one interface. What is not understood is left out: a strange interface
-/// must not hide the others.
-fn interface(bytes: &[u8]) -> Option<Interface> {
-    let header = LinkHeader::parse(bytes).ok()?;
-    let is_can = header.link_layer_type == LinkLayerType::Can;
-    let mut interface = Interface {
-        index: header.index,
-        name: String::new(),
-        kind: Kind::Other(words(header.link_layer_type, None)),
-        ours: false,
-        up: header.flags.contains(LinkFlags::Up),
-        mtu: 0,
-        counters: Counters::default(),
-    };
-    let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
-    for attribute in NlasIterator::new(bytes.get(LINK_HEADER..)?).flatten() {
-        let Ok(attribute) = LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec) else {
-            continue;
-        };
-        if let LinkAttribute::IfName(name) = attribute {
-            interface.name = name;
-        } else if let LinkAttribute::IfAlias(alias) = attribute {
-            interface.ours = alias == MARK;
-        } else if let LinkAttribute::Mtu(mtu) = attribute {
-            interface.mtu = mtu;
-        } else if let LinkAttribute::Link(index) = attribute {
-            peer = Some(index);
-        } else if let LinkAttribute::LinkNetNsId(id) = attribute {
-            namespace = Some(id);
-        } else if let LinkAttribute::LinkInfo(given) = attribute {
-            info = given;
-        } else if let LinkAttribute::Stats64(stats) = attribute {
-            interface.counters = Counters {
-                received: stats.rx_packets,
-                sent: stats.tx_packets,
-                dropped: stats.rx_dropped + stats.tx_dropped,
-                errors: stats.rx_errors + stats.tx_errors,
-            };
-        }
-    }
-    let kind = info.iter().find_map(|it| if let LinkInfo::Kind(kind) = it { Some(kind) } else { None });
-    let data = info.iter().find_map(|it| if let LinkInfo::Data(data) = it { Some(data) } else { None });
-    interface.kind = match (is_can, kind) {
-        (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
-        (true, Some(InfoKind::Vcan)) => Kind::Vcan,
-        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| {
-            let place = namespace.map_or(Place::Here, |id| Place::Namespace { id, name: None });
-            Peer { index, name: None, place }
-        })),
-        (true, _) => {
-            let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
-            Kind::Hardware(hardware(data))
-        }
-    };
-    Some(interface)
-}
-
-fn hardware(data: &[InfoCan]) -> Hardware {
-    let mut hardware = Hardware::default();
-    let set = |timing: &CanBitTiming| Some(timing.bitrate).filter(|&rate| rate > 0);
-    for attribute in data {
-        if let InfoCan::BitTiming(timing) = attribute {
-            hardware.bitrate = set(timing);
-        } else if let InfoCan::DataBitTiming(timing) = attribute {
-            hardware.data_bitrate = set(timing);
-        } else if let InfoCan::State(state) = attribute {
-            hardware.state = State::from_number(*state);
-        } else if let InfoCan::CtrlMode(mode) = attribute {
-            hardware.fd = mode.flags.contains(CanCtrlModeFlags::Fd);
-            hardware.listen_only = mode.flags.contains(CanCtrlModeFlags::ListenOnly);
-        }
-    }
-    hardware
-}
-
-/// What an interface is that is no CAN.
-fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
-    if layer == LinkLayerType::Loopback {
-        return "the loopback interface".to_owned();
-    }
-    match kind {
-        Some(kind) => format!("a network interface ({kind})"),
-        None => format!("a network interface ({})", layer.to_string().to_lowercase()),
-    }
-}
-
-/// The driver of hardware, by sysfs.
-fn driver(name: &str) -> Option<String> {
-    let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
-    Some(link.file_name()?.to_string_lossy().into_owned())
 }

@@ -1,5 +1,7 @@
 use super::*;
-use crate::link::{CLASSIC_MTU, Counters};
+use crate::kernel::Module;
+use crate::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, State};
+use crate::plan::SkinBus;
 
 fn interface(name: &str, kind: Kind) -> Interface {
     let counters = Counters::default();

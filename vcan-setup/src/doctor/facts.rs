@@ -1,0 +1,80 @@
+//! What the judgement rests on.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use protocol::bus::Choice;
+use protocol::id::CellId;
+
+use crate::kernel::Kernel;
+use crate::link::Interface;
+use crate::plan::Wanted;
+
+/// All that the judgement rests on.
+#[derive(Clone, Debug)]
+pub struct Facts {
+    /// Which kind of bus is wanted.
+    pub choice: Choice,
+    /// Whether the cells are there already, as `gateway run --no-spawn` has it.
+    pub no_spawn: bool,
+    /// How this program is called so that `sudo` finds it.
+    pub program: String,
+    /// The kernel.
+    pub kernel: Kernel,
+    /// Who asks.
+    pub user: User,
+    /// Bytes of a receive buffer that the kernel grants to whom asks as the gateway does.
+    pub receive_buffer: Option<usize>,
+    /// Frames that may wait in the kernel until they are handed on; `None` when it does not say.
+    pub backlog: Option<usize>,
+    /// The program of the cells.
+    pub cell_node: Program,
+    /// Where the embedded buses of this user are, or why none can be used.
+    pub embedded: Result<PathBuf, String>,
+    /// The buses that were asked about.
+    pub buses: Vec<Bus>,
+    /// The CAN interfaces that there are.
+    pub present: Vec<Interface>,
+}
+
+/// Who asks.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct User {
+    /// Whether it is root.
+    pub root: bool,
+    /// Whether it may make interfaces (`CAP_NET_ADMIN`).
+    pub admin: bool,
+}
+
+/// A program that a bench needs.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Program {
+    /// Where it should be.
+    pub path: PathBuf,
+    /// Whether it is there.
+    pub there: bool,
+}
+
+/// A bus that was asked about.
+#[derive(Clone, Debug)]
+pub struct Bus {
+    /// What is wanted of it.
+    pub wanted: Wanted,
+    /// Its cells; `None` when no skin says.
+    pub cells: Option<BTreeSet<CellId>>,
+    /// Whether its cells are to answer with sums.
+    pub sums: bool,
+    /// The interface of its name.
+    pub interface: Option<Interface>,
+    /// What was heard on it; `None` when it was not opened, or why it could not be.
+    pub heard: Result<Option<Heard>, String>,
+}
+
+/// What was heard on a bus.
+#[derive(Clone, Debug, Default, Eq, PartialEq)]
+pub struct Heard {
+    /// Whether another gateway sends on it.
+    pub gateway: bool,
+    /// Which cells do.
+    pub cells: BTreeSet<CellId>,
+}

@@ -1,0 +1,92 @@
+//! A socket to the kernel: one request, and all that answers it.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::time::Duration;
+
+use netlink_packet_core::{
+    ErrorBuffer, NLM_F_ACK, NLM_F_DUMP_INTR, NLM_F_REQUEST, NLMSG_DONE, NLMSG_ERROR, NetlinkBuffer,
+    NetlinkHeader, NetlinkMessage, NetlinkPayload,
+};
+use netlink_packet_route::RouteNetlinkMessage;
+use rustix::net::netlink::SocketAddrNetlink;
+use rustix::net::sockopt::{Timeout, set_socket_timeout};
+use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
+
+/// How long the kernel may take to answer; it answers at once.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often a list that changed while it was read is read again.
+const RETRIES: usize = 8;
+
+/// A socket of the namespace in which it was opened.
+#[derive(Debug)]
+pub(super) struct Exchange {
+    socket: OwnedFd,
+    sequence: u32,
+}
+
+impl Exchange {
+    pub(super) fn open() -> io::Result<Self> {
+        let socket = rustix::net::socket_with(
+            rustix::net::AddressFamily::NETLINK,
+            SocketType::RAW,
+            SocketFlags::CLOEXEC,
+            // NETLINK_ROUTE is protocol 0.
+            None,
+        )?;
+        set_socket_timeout(&socket, Timeout::Recv, Some(PATIENCE))?;
+        rustix::net::connect(&socket, &SocketAddrNetlink::new(0, 0))?;
+        Ok(Self { socket, sequence: 0 })
+    }
+
+    /// Sends one request and takes all that answers it.
+    pub(super) fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
+        for _ in 0..RETRIES {
+            let (answers, interrupted) = self.ask(payload.clone(), flags)?;
+            if !interrupted {
+                return Ok(answers);
+            }
+        }
+        Err(io::Error::other("the interfaces change faster than they can be read"))
+    }
+
+    fn ask(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {
+        self.sequence += 1;
+        let mut header = NetlinkHeader::default();
+        header.flags = NLM_F_REQUEST | NLM_F_ACK | flags;
+        header.sequence_number = self.sequence;
+        let mut message = NetlinkMessage::new(header, NetlinkPayload::InnerMessage(payload));
+        message.finalize();
+        let mut bytes = vec![0; message.buffer_len()];
+        message.serialize(&mut bytes);
+        rustix::net::send(&self.socket, &bytes, SendFlags::empty())?;
+
+        let (mut answers, mut interrupted) = (Vec::new(), false);
+        let mut buffer = vec![0; 1 << 17];
+        loop {
+            let (len, _) = rustix::io::retry_on_intr(|| {
+                rustix::net::recv(&self.socket, &mut buffer[..], RecvFlags::empty())
+            })?;
+            let mut rest = buffer.get(..len).unwrap_or_default();
+            while let Ok(answer) = NetlinkBuffer::new_checked(rest) {
+                let len = (answer.length() as usize).next_multiple_of(4);
+                rest = rest.get(len..).unwrap_or_default();
+                if answer.sequence_number() != self.sequence {
+                    continue;
+                }
+                interrupted |= answer.flags() & NLM_F_DUMP_INTR != 0;
+                match answer.message_type() {
+                    NLMSG_DONE => return Ok((answers, interrupted)),
+                    NLMSG_ERROR => {
+                        let error = ErrorBuffer::new_checked(answer.payload()).map_err(io::Error::other)?;
+                        return match error.code() {
+                            None => Ok((answers, interrupted)),
+                            Some(code) => Err(io::Error::from_raw_os_error(code.get().abs())),
+                        };
+                    }
+                    _ => answers.push(answer.payload().to_vec()),
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! What the kernel says of an interface, read.
+
+use std::path::Path;
+
+use netlink_packet_core::{NlasIterator, ParseableParametrized};
+use netlink_packet_route::AddressFamily;
+use netlink_packet_route::link::{
+    CanBitTiming, CanCtrlModeFlags, InfoCan, InfoData, InfoKind, LinkAttribute, LinkFlags, LinkHeader,
+    LinkInfo, LinkLayerType,
+};
+
+use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, Place, State};
+
+/// Bytes of the header before the attributes begin.
+const HEADER: usize = 16;
+
+/// Reads what the kernel says of one interface. What is not understood is left out: a strange interface
+/// must not hide the others.
+pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
+    let header = LinkHeader::parse(bytes).ok()?;
+    let is_can = header.link_layer_type == LinkLayerType::Can;
+    let mut interface = Interface {
+        index: header.index,
+        name: String::new(),
+        kind: Kind::Other(words(header.link_layer_type, None)),
+        ours: false,
+        up: header.flags.contains(LinkFlags::Up),
+        mtu: 0,
+        counters: Counters::default(),
+    };
+    let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
+    for attribute in NlasIterator::new(bytes.get(HEADER..)?).flatten() {
+        let Ok(attribute) = LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec) else {
+            continue;
+        };
+        if let LinkAttribute::IfName(name) = attribute {
+            interface.name = name;
+        } else if let LinkAttribute::IfAlias(alias) = attribute {
+            interface.ours = alias == MARK;
+        } else if let LinkAttribute::Mtu(mtu) = attribute {
+            interface.mtu = mtu;
+        } else if let LinkAttribute::Link(index) = attribute {
+            peer = Some(index);
+        } else if let LinkAttribute::LinkNetNsId(id) = attribute {
+            namespace = Some(id);
+        } else if let LinkAttribute::LinkInfo(given) = attribute {
+            info = given;
+        } else if let LinkAttribute::Stats64(stats) = attribute {
+            interface.counters = Counters {
+                received: stats.rx_packets,
+                sent: stats.tx_packets,
+                dropped: stats.rx_dropped + stats.tx_dropped,
+                errors: stats.rx_errors + stats.tx_errors,
+            };
+        }
+    }
+    let kind = info.iter().find_map(|it| if let LinkInfo::Kind(kind) = it { Some(kind) } else { None });
+    let data = info.iter().find_map(|it| if let LinkInfo::Data(data) = it { Some(data) } else { None });
+    interface.kind = match (is_can, kind) {
+        (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
+        (true, Some(InfoKind::Vcan)) => Kind::Vcan,
+        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| {
+            let place = namespace.map_or(Place::Here, |id| Place::Namespace { id, name: None });
+            Peer { index, name: None, place }
+        })),
+        (true, _) => {
+            let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
+            Kind::Hardware(hardware(data))
+        }
+    };
+    Some(interface)
+}
+
+fn hardware(data: &[InfoCan]) -> Hardware {
+    let mut hardware = Hardware::default();
+    let set = |timing: &CanBitTiming| Some(timing.bitrate).filter(|&rate| rate > 0);
+    for attribute in data {
+        if let InfoCan::BitTiming(timing) = attribute {
+            hardware.bitrate = set(timing);
+        } else if let InfoCan::DataBitTiming(timing) = attribute {
+            hardware.data_bitrate = set(timing);
+        } else if let InfoCan::State(state) = attribute {
+            hardware.state = State::from_number(*state);
+        } else if let InfoCan::CtrlMode(mode) = attribute {
+            hardware.fd = mode.flags.contains(CanCtrlModeFlags::Fd);
+            hardware.listen_only = mode.flags.contains(CanCtrlModeFlags::ListenOnly);
+        }
+    }
+    hardware
+}
+
+/// What an interface is that is no CAN.
+fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
+    if layer == LinkLayerType::Loopback {
+        return "the loopback interface".to_owned();
+    }
+    match kind {
+        Some(kind) => format!("a network interface ({kind})"),
+        None => format!("a network interface ({})", layer.to_string().to_lowercase()),
+    }
+}
+
+/// The driver of hardware, by sysfs.
+pub(super) fn driver(name: &str) -> Option<String> {
+    let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
+    Some(link.file_name()?.to_string_lossy().into_owned())
+}
