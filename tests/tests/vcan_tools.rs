@@ -439,6 +439,7 @@ fn the_stock_tools_read_our_log() {
     let place = Place::on_vcan();
     place.write("skin.toml", &small_skin(4));
     place.scenario(PRESSED);
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
     let bench = place.running_bench(60.0, "");
     place.guest().waits_for("a torque", torque_of(1, true));
     for noise in ["-I r -m -n 200", "-I r -R -n 20", "-I r -e -n 20", "-I r -f -b -E -n 20"] {
@@ -450,6 +451,24 @@ fn the_stock_tools_read_our_log() {
     let ours = frames_of(&path);
     assert_eq!(ours.len() as u64, place.summary().number("/recording/frames"));
     assert!(ours.len() > 300, "{}", ours.len());
+    // It says what candump says, letter by letter.
+    candump.frames();
+    let texts = |file: &str| {
+        let text = place.read(file);
+        let frames = text.lines().map(|line| line.rsplit(' ').next().unwrap().to_owned());
+        frames.filter(|frame| !frame.starts_with("1BADCAFE#")).collect::<Vec<_>>()
+    };
+    let mut theirs = BTreeMap::<String, usize>::new();
+    for frame in texts("candump.log") {
+        *theirs.entry(frame).or_default() += 1;
+    }
+    for frame in texts("run.log") {
+        let left = theirs.get_mut(&frame).filter(|left| **left > 0);
+        *left.unwrap_or_else(|| panic!("candump has not seen {frame}")) -= 1;
+    }
+    // Cells that are being ended may still say a heartbeat when the gateway no longer listens.
+    theirs.retain(|frame, left| *left > 0 && !frame.starts_with('4'));
+    assert_eq!(theirs, BTreeMap::new(), "candump has seen what we have not");
 
     let candump = Candump::start("vcan0", &place.path("played.log"));
     let played = tool(&format!("canplayer -t -I {} vcan0=vcan0", path.display()));
