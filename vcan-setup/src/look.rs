@@ -240,3 +240,29 @@ fn is_served(directory: &Path, name: &str) -> bool {
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };
     matches!(rustix::net::connect(&socket, &address), Ok(()) | Err(rustix::io::Errno::AGAIN))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gateway_is_known_by_what_nobody_types_at_a_shell() {
+        let heard = |id| {
+            let mut heard = Heard::default();
+            heard.take(id);
+            (heard.gateway, heard.cells.len())
+        };
+        let cell = Node::Cell(CellId::new(7).unwrap());
+        assert_eq!(heard(Id::command(Command::Joints)), (true, 0));
+        assert_eq!(heard(Id::new(Kind::Network, Node::Gateway)), (true, 0));
+        for command in [Command::Halt, Command::Sync, Command::Resume, Command::Report] {
+            assert_eq!(heard(Id::command(command)), (false, 0), "{command:?}");
+        }
+        for kind in [Kind::Configure, Kind::Stimulus] {
+            assert_eq!(heard(Id::new(kind, cell)), (false, 0), "{kind:?}");
+        }
+        for kind in [Kind::Sum, Kind::Torque, Kind::Sensors, Kind::Network, Kind::Configured] {
+            assert_eq!(heard(Id::new(kind, cell)), (false, 1), "{kind:?}");
+        }
+    }
+}

@@ -215,6 +215,11 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
         "can0 is CAN hardware (kvaser_pci) with MTU 16, and skin.toml says format = \"fd\", which needs 72: \
          `sudo vcan-setup up skin.toml --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     );
+    let classic = Hardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
+    assert!(
+        refused(&wanted, &[can0(classic, true)]).starts_with("can0 is at 1000 kbit/s and skin.toml says"),
+        "a rate for data that is not in use is none"
+    );
     let down = [can0(kvaser(Some(1_000_000), Some(5_000_000)), false)];
     assert_eq!(
         refused(&wanted, &down),
