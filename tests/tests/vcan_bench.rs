@@ -4,13 +4,11 @@
 
 mod process;
 
-use std::collections::BTreeMap;
-
 use gateway::generate::{Wanted, generate};
 use process::Place;
 use process::log::{Log, same_torques};
-use process::vcan::{Candump, frames_of};
-use protocol::can::{Format, Frame};
+use process::vcan::{Candump, by_identifier, frames_of};
+use protocol::can::Format;
 use protocol::id::{Id, Kind};
 
 /// The joints stand still, so that torques depend on nothing but the epoch, also when a slow machine skips
@@ -35,15 +33,6 @@ fn prepare(place: &Place) {
     let wanted = Wanted { cells: 24, broadcast_hz: 20.0, ..Wanted::default() };
     place.write("skin.toml", &generate(&wanted).unwrap());
     place.scenario(SCENARIO);
-}
-
-/// Frames by sender and kind, in the order in which each was sent: what two views of a bus have in common.
-fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
-    let mut all = BTreeMap::<_, Vec<Frame>>::new();
-    for frame in frames {
-        all.entry(frame.raw_id()).or_default().push(*frame);
-    }
-    all
 }
 
 #[test]

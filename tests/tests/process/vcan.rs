@@ -4,7 +4,7 @@
 //! MTU 72 and up, and nobody else's interfaces are.
 
 use std::cell::RefCell;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -224,4 +224,13 @@ pub(crate) fn frames_of(log: &Path) -> Vec<Frame> {
         other => panic!("{}: {line}: {other:?}", log.display()),
     };
     text.lines().map(frame).collect()
+}
+
+/// Frames by sender and kind, in the order in which each was sent: what two views of a bus have in common.
+pub(crate) fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
+    let mut all = BTreeMap::<_, Vec<Frame>>::new();
+    for frame in frames {
+        all.entry(frame.raw_id()).or_default().push(*frame);
+    }
+    all
 }

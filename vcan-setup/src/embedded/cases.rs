@@ -45,6 +45,10 @@ fn fd(id: u32) -> Frame {
     Frame::fd(id, 1, &[7; 16]).expect("16 bytes fit")
 }
 
+fn empty(id: u32) -> Frame {
+    Frame::fd(id, 0, &[]).expect("nothing fits")
+}
+
 fn remote(id: u32) -> Frame {
     Frame::remote(id, 0).expect("nothing fits")
 }
@@ -320,12 +324,7 @@ pub fn cases() -> Vec<Case> {
         },
         Case {
             fd: false,
-            ..case(
-                "a classic socket receives no FD frame, however short",
-                &all,
-                Frame::fd(0x123, 0, &[]).expect("nothing fits"),
-                false,
-            )
+            ..case("a classic socket receives no FD frame, however short", &all, empty(0x123), false)
         },
     ]
 }

@@ -1,0 +1,470 @@
+//! A real driver under the classic format: two emulated Kvaser controllers on one bus, `can0` and `can1`, with
+//! interrupts, a transmit queue of ten frames and bit timing over netlink, and without physics.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod process;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, OpenOptions};
+use std::os::unix::fs::FileExt;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use gateway::generate::{Format as Generated, Wanted, generate};
+use process::log::{Log, same_torques};
+use process::vcan::{Candump, by_identifier, command, frames_of, tool};
+use process::{PATIENCE, Place, Running, until};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::can::{Format, Frame};
+use protocol::candump::{Line, parse};
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage};
+use protocol::packet::{Half, Paired, data_id};
+use protocol::time::Micros;
+use rustix::process::Signal;
+use serde_json::Value;
+
+const CONTROLLERS: [&str; 2] = ["can0", "can1"];
+const CELLS: usize = 8;
+
+/// The joints stand still and each touch is a step, so that torques depend on little and few packets say it: on a
+/// slow machine the halves of a packet may come apart.
+fn scenario() -> String {
+    let mut text = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"hold\"\n\
+                    start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n"
+        .to_owned();
+    for step in 0..8 {
+        let (at, force) = (0.5 * f64::from(step), 0.7 + 0.4 * f64::from(step));
+        let length = if step == 7 { 60.0 } else { 0.5 };
+        text += &format!(
+            "\n[[touch]]\nat_s = {at:?}\nfor_s = {length:?}\nall = true\nforce_n = {force:?}\nprofile = \"step\"\n"
+        );
+    }
+    text
+}
+
+/// Both controllers at 1 Mbit/s and up; down again with the test.
+struct Controllers;
+
+impl Controllers {
+    fn up() -> Self {
+        // Their driver answers; vcan would take no bit rate.
+        for name in CONTROLLERS {
+            tool(&format!("ip link set {name} down"));
+            tool(&format!("ip link set {name} type can bitrate 1000000"));
+            tool(&format!("ip link set {name} txqueuelen 10 up"));
+        }
+        Self
+    }
+
+    /// Lets neither be heard by the processor: what they send is not seen to be sent, and their queues fill. They
+    /// have one interrupt together, so both or none.
+    fn hang(&self) -> Hanging {
+        Hanging::new()
+    }
+}
+
+impl Drop for Controllers {
+    fn drop(&mut self) {
+        for name in CONTROLLERS {
+            let _ = command(&format!("ip link set {name} down")).status();
+        }
+    }
+}
+
+/// Controllers whose interrupts do not come through, by a bit of their PCI command registers.
+struct Hanging(Vec<PathBuf>);
+
+impl Hanging {
+    /// Where the register stands, 16 bits, and its bit that disables interrupts.
+    const COMMAND: u64 = 4;
+    const NO_INTERRUPTS: u16 = 0x0400;
+
+    fn new() -> Self {
+        let path = |name| PathBuf::from(format!("/sys/bus/pci/devices/{}/config", address(name)));
+        let hanging = Self(CONTROLLERS.map(path).into());
+        hanging.set(|word| word | Self::NO_INTERRUPTS);
+        hanging
+    }
+
+    fn set(&self, change: impl Fn(u16) -> u16) {
+        for path in &self.0 {
+            let file = OpenOptions::new().read(true).write(true).open(path).unwrap();
+            let mut word = [0; 2];
+            file.read_exact_at(&mut word, Self::COMMAND).unwrap();
+            // Both bytes at once: the emulated bus looks at a write to the first.
+            file.write_all_at(&change(u16::from_le_bytes(word)).to_le_bytes(), Self::COMMAND).unwrap();
+        }
+    }
+}
+
+impl Drop for Hanging {
+    fn drop(&mut self) {
+        self.set(|word| word & !Self::NO_INTERRUPTS);
+    }
+}
+
+/// What `ip` or `tc` knows.
+fn json(words: &str) -> Value {
+    serde_json::from_slice(&tool(words).stdout).unwrap()
+}
+
+/// A controller's PCI address.
+fn address(name: &str) -> String {
+    let link = json(&format!("ip -json -details link show {name}"));
+    link[0]["parentdev"].as_str().unwrap_or_else(|| panic!("{name} is no PCI device: {link}")).to_owned()
+}
+
+/// How often a controller's queue had no room, which is what ENOBUFS means.
+fn refused(name: &str) -> u64 {
+    json(&format!("tc -statistics -json qdisc show dev {name}"))[0]["drops"].as_u64().unwrap()
+}
+
+fn options(filters: &[Filter]) -> Options {
+    Options { fd: false, filters: filters.to_vec(), receive_buffer: 8 << 20, ..Options::default() }
+}
+
+fn open(name: &str, options: &Options) -> Result<Bus, BusError> {
+    Bus::open(name, Choice::Only(BusKind::SocketCan), options)
+}
+
+/// A frame that says its number.
+fn numbered(number: u32) -> Frame {
+    Frame::classic(0x123, &number.to_le_bytes()).unwrap()
+}
+
+/// All numbers that have come, once the last is this one.
+fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
+    let mut inbox = Inbox::new();
+    let mut numbers = Vec::new();
+    until("the last frame", || {
+        bus.receive(&mut inbox).unwrap();
+        numbers.extend(
+            inbox.frames().map(|received| u32::from_le_bytes(*received.frame.data().first_chunk().unwrap())),
+        );
+        (numbers.last() == Some(&last)).then_some(())
+    });
+    assert_eq!(inbox.dropped(), 0);
+    numbers
+}
+
+/// The files of a bench whose gateway is on one bus and whose cells are on another, which are the same to them.
+fn prepare(place: &Place, gateway: &str, cells: &str) {
+    let wanted = Wanted { cells: CELLS, broadcast_hz: 20.0, format: Generated::Classic, ..Wanted::default() };
+    let skin = generate(&wanted).unwrap();
+    place.write("skin.toml", &skin.replace("vcan0", gateway));
+    place.write("cells.toml", &skin.replace("vcan0", cells));
+    place.scenario(&scenario());
+}
+
+/// A program that is not held up by its neighbours in the middle of a packet, which is two frames here, at most
+/// 4 ms apart: as a microcontroller is not. Everybody shares one emulated processor.
+fn urgent(priority: u8, command: &Command) -> Running {
+    let mut urgent = Command::new("chrt");
+    urgent.args(["--fifo", &priority.to_string()]).arg(command.get_program()).args(command.get_args());
+    urgent.envs(command.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    urgent.current_dir(command.get_current_dir().unwrap());
+    Running::start(urgent)
+}
+
+/// The cells, in three processes.
+fn start_cells(place: &Place, kind: BusKind, bus: &str) -> Vec<Running> {
+    let cells = ["--nodes 1-3", "--nodes 4-7", "--node 8"].map(|nodes| {
+        let words = format!("--bus {bus} --bus-kind {kind} {nodes} --skin cells.toml");
+        urgent(20, &place.command("cell-node", &words))
+    });
+    cells.into()
+}
+
+/// A bench with these cells.
+fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
+    let words = format!(
+        "run skin.toml --bus-kind {kind} --scenario scenario.toml --duration {seconds} --no-spawn \
+         --candump run.log --summary run.json"
+    );
+    urgent(25, &place.command("gateway", &words))
+}
+
+/// How many packets a log has, and how many halves under each identifier that found no other within 4 ms.
+fn pairs(log: &str) -> (u64, BTreeMap<u16, u64>) {
+    let (mut halves, mut whole, mut incomplete) = (BTreeMap::new(), 0, BTreeMap::new());
+    for line in log.lines() {
+        let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
+        let Ok(id) = data_id(&record.frame) else { continue };
+        let half = halves.entry(id.to_bits()).or_insert(Half::NONE);
+        match half.push(Micros(record.time.nanos / 1_000), id, record.frame.data()).unwrap() {
+            Paired::Waiting => {}
+            Paired::Whole(_) => whole += 1,
+            Paired::Incomplete => *incomplete.entry(id.to_bits()).or_default() += 1,
+        }
+    }
+    (whole, incomplete)
+}
+
+/// The cells that say, in the report that ends a run, that they took every stimulus that they were sent. One whose
+/// halves came apart is none to a cell, and then nobody else knows what it feels.
+fn cells_that_heard_all(log: &Log) -> BTreeSet<u8> {
+    let (mut sent, mut taken) = (BTreeMap::new(), BTreeMap::new());
+    for (message, _) in &log.messages {
+        match *message {
+            Message::Stimulus { to: Node::Cell(cell), .. } => *sent.entry(cell.get()).or_default() += 1,
+            Message::Network { from: Node::Cell(cell), page: NetworkPage::Heard(heard), .. } => {
+                taken.insert(cell.get(), heard.stimuli);
+            }
+            _ => {}
+        }
+    }
+    sent.into_iter().filter(|(cell, sent)| taken.get(cell) == Some(sent)).map(|(cell, _)| cell).collect()
+}
+
+/// Sees that all packets and replies of a run are accounted for, by what its log says itself.
+fn adds_up(place: &Place) -> Log {
+    let (summary, text) = (place.summary(), place.read("run.log"));
+    let log = Log::read(&text, Format::Classic);
+    let (whole, halves) = pairs(&text);
+    let incomplete: u64 = halves.values().sum();
+    let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
+    assert_eq!(
+        (whole, incomplete),
+        (packets - incomplete, summary.count("/buses/0/events", "incomplete pair"))
+    );
+    assert_eq!((summary.odd(0), summary.of_bus("/dropped_by_bus")), (incomplete, 0), "{:#}", summary.0);
+    // Who does not know what it feels does not know that it has to answer; and joints that the gateway itself does
+    // not see stand in nobody's account, where cells' heard ones would make up for others' that they did not hear.
+    let all_was_heard = cells_that_heard_all(&log).len() == CELLS && !halves.contains_key(&0x001);
+    assert!(summary.of_bus("/replies/unknown") == 0 || !all_was_heard, "{:#}", summary.0);
+    let of = |pointer: &str| summary.of_bus(pointer);
+    let lost = of("/uplink/dropped") + of("/uplink/backlog") + of("/uplink/unknown");
+    let arrived = of("/uplink/delivered") + of("/uplink/rejected");
+    assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", summary.0);
+    log
+}
+
+/// Waits until this many torques of cell 1 have come, in halves.
+fn torques_come(bus: &str) {
+    let torque = Filter { id: 0x201, mask: Filter::EXACT_MASK };
+    let bus = open(bus, &options(&[torque])).unwrap();
+    let (mut inbox, mut halves) = (Inbox::new(), 0);
+    until("torques", || {
+        halves += bus.receive(&mut inbox).unwrap();
+        (halves >= 10).then_some(())
+    });
+}
+
+/// A run across both controllers, which both see the same frames; its log.
+fn across_controllers() -> Log {
+    let place = Place::on_vcan();
+    prepare(&place, "can0", "can1");
+    let candumps = CONTROLLERS.map(|name| Candump::start(name, &place.path(&format!("{name}.log"))));
+    let cells = start_cells(&place, BusKind::SocketCan, "can1");
+    start_bench(&place, BusKind::SocketCan, 5.0).end().well();
+    drop(cells);
+    let [near, far] = candumps.map(|candump| {
+        let mut frames = candump.frames();
+        // What one candump is told to end by, the other sees as well.
+        frames.retain(|frame| !frame.is_extended());
+        by_identifier(&frames)
+    });
+    assert_eq!(near, far, "both controllers saw the same, each sender's in the same order");
+    let summary = place.summary();
+    assert_eq!(summary.of_bus("/uplink/unknown"), 0, "{:#}", summary.0);
+    assert!(summary.of_bus("/replies/in_time") > 50 * CELLS as u64, "{:#}", summary.0);
+    let ours = frames_of(&place.path("run.log"));
+    assert!(ours.iter().all(|frame| frame.format() == Format::Classic && frame.len() == 8));
+    for (id, ours) in by_identifier(&ours) {
+        // Cells speak before the gateway listens and after.
+        assert!(near[&id].windows(ours.len()).any(|part| part == ours), "{id:03X} comes in another order");
+    }
+    adds_up(&place)
+}
+
+/// The same run on the embedded bus.
+fn on_the_embedded_bus() -> Log {
+    let place = Place::new();
+    prepare(&place, "vcan0", "vcan0");
+    let server = urgent(28, &place.command("vcan-setup", "serve vcan0"));
+    server.prints("serving vcan0 at ");
+    let _cells = start_cells(&place, BusKind::Embedded, "vcan0");
+    start_bench(&place, BusKind::Embedded, 5.0).end().well();
+    adds_up(&place)
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn classic_cells_across_two_controllers_say_what_they_say_on_the_embedded_bus() {
+    let _controllers = Controllers::up();
+    let mut logs = [across_controllers(), on_the_embedded_bus()];
+    let [one, other] = logs.each_ref().map(cells_that_heard_all);
+    let heard_all: BTreeSet<_> = one.intersection(&other).collect();
+    assert!(heard_all.len() >= CELLS / 2, "{one:?}, {other:?}");
+    for log in &mut logs {
+        log.messages.retain(|(message, _)| match message {
+            Message::Torque { from, .. } => heard_all.contains(&from.get()),
+            _ => true,
+        });
+    }
+    let [one, other] = &logs;
+    let (shared, all) = same_torques(one, other);
+    let what = format!("{shared} of {all} causes of {heard_all:?} are in both runs");
+    assert!(all >= 4 * heard_all.len() && shared * 10 > all * 8, "{what}");
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn a_full_queue_is_waited_for_and_nothing_is_lost_or_sent_twice() {
+    const FRAMES: u32 = 2_000;
+    let controllers = Controllers::up();
+    let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
+    let sender = open("can0", &Options { send_patience: PATIENCE, ..options(&[]) }).unwrap();
+    let frames: Vec<_> = (0..FRAMES).map(numbered).collect();
+    for (round, part) in frames.chunks(400).enumerate() {
+        let before = refused("can0");
+        let hanging = controllers.hang();
+        std::thread::scope(|scope| {
+            // One by one and many at once, which are different system calls.
+            let at_once = if round % 2 == 0 { 1 } else { 100 };
+            let sender = &sender;
+            scope.spawn(move || part.chunks(at_once).for_each(|some| sender.send(some).unwrap()));
+            until("a full queue", || (refused("can0") > before).then_some(()));
+            drop(hanging);
+        });
+    }
+    assert_eq!(numbers_until(&receiver, FRAMES - 1), (0..FRAMES).collect::<Vec<_>>());
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
+    let controllers = Controllers::up();
+    let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
+    let patience = Duration::from_millis(50);
+    let patient = open("can0", &Options { send_patience: patience, ..options(&[]) }).unwrap();
+    let hasty = open("can0", &Options { send_patience: Duration::ZERO, ..options(&[]) }).unwrap();
+    let frames: Vec<_> = (0..40).map(numbered).collect();
+
+    let hanging = controllers.hang();
+    let (before, began) = (refused("can0"), Instant::now());
+    let error = patient.send(&frames).unwrap_err();
+    assert!(began.elapsed() >= patience);
+    // Ten in the queue, one in the controller, and where a queue is passed by while it is empty, one between.
+    let sent = error.sent;
+    assert!((11..=12).contains(&sent) && error.wanted == 40, "{error}");
+    assert!(error.cause.may_pass() && matches!(error.cause, BusError::Full { .. }), "{error}");
+    let said =
+        "can0 took no frame for 50 ms: its queue is full; send less, or ask whether anybody is on the bus";
+    assert_eq!(error.to_string(), format!("{said} ({sent} of 40 frames sent)"));
+    // It looks every half millisecond and does not spin.
+    let tries = refused("can0") - before;
+    assert!((2..=102).contains(&tries), "{tries} tries in 50 ms");
+
+    // Who has no time asks once.
+    let before = refused("can0");
+    let error = hasty.send(&frames[sent..]).unwrap_err();
+    assert!(error.sent == 0 && matches!(error.cause, BusError::Full { .. }), "{error}");
+    assert!(!hasty.offer(&frames[sent..=sent]));
+    assert_eq!(refused("can0"), before + 2);
+
+    drop(hanging);
+    let rest = u32::try_from(sent).unwrap();
+    assert_eq!(numbers_until(&receiver, rest - 1), (0..rest).collect::<Vec<_>>());
+    patient.send(&frames[sent..]).unwrap();
+    assert_eq!(numbers_until(&receiver, 39), (rest..40).collect::<Vec<_>>());
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
+    let (place, _controllers) = (Place::on_vcan(), Controllers::up());
+    prepare(&place, "can0", "can1");
+    let cells = start_cells(&place, BusKind::SocketCan, "can1");
+    let bench = start_bench(&place, BusKind::SocketCan, 60.0);
+    bench.hears_the_loop();
+    for name in CONTROLLERS {
+        torques_come("can0");
+        tool(&format!("ip link set {name} down"));
+        if name == "can0" {
+            bench.hears("can0 is down: bring it up with `ip link set can0 up`");
+        } else {
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        tool(&format!("ip link set {name} up"));
+    }
+    torques_come("can0");
+    bench.signal(Signal::INT);
+    let ended = bench.end().well();
+    assert!(ended.stderr.contains("can0 works again"), "{}", ended.stderr);
+    for cell in &cells {
+        assert!(command(&format!("kill -0 {}", cell.pid().as_raw_nonzero())).status().unwrap().success());
+    }
+    adds_up(&place);
+    let summary = place.summary();
+    assert_eq!(summary.silent().len(), 0, "{:#}", summary.0);
+    // What was sent to a controller that was down, or by one, is known to be missing, and not why.
+    assert!(summary.number("/loop/unsent") > 0, "{:#}", summary.0);
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn error_frames_of_the_driver_are_counted() {
+    let (place, controllers) = (Place::on_vcan(), Controllers::up());
+    prepare(&place, "can1", "can0");
+    let _cells = start_cells(&place, BusKind::SocketCan, "can0");
+    let candump = Candump::start("can1", &place.path("candump.log"));
+    let errors = open("can1", &Options { error_mask: u32::MAX, ..options(&[]) }).unwrap();
+    let bench = start_bench(&place, BusKind::SocketCan, 60.0);
+    bench.hears_the_loop();
+    for _ in 0..2 {
+        torques_come("can1");
+        // The gateway's controller has room for 64 bytes, and nobody takes them out. What the cells' controller has
+        // sent it does not hear of either: it is started anew for each frame.
+        let hanging = controllers.hang();
+        for _ in 0..10 {
+            tool("ip link set can0 down");
+            tool("ip link set can0 up");
+            // Its queue may be full of what the cells have to say, and its controller busy with that.
+            command("cansend can0 1ABCDEF0#0102030405060708").stderr(Stdio::null()).status().unwrap();
+        }
+        drop(hanging);
+        let mut inbox = Inbox::new();
+        until("an error frame", || (errors.receive(&mut inbox).unwrap() > 0).then_some(()));
+        let frames: Vec<_> = inbox.frames().map(|received| received.frame).collect();
+        // Of the controller (class 4), whose receive buffer overflowed (1).
+        assert!(
+            frames.iter().all(|frame| frame.is_error() && frame.raw_id() & 4 != 0 && frame.data()[1] == 1),
+            "{frames:?}"
+        );
+    }
+    torques_come("can1");
+    bench.signal(Signal::INT);
+    bench.end().well();
+    let (ours, theirs) = (frames_of(&place.path("run.log")), candump.frames());
+    let [ours, theirs] =
+        [&ours, &theirs].map(|frames| frames.iter().filter(|frame| frame.is_error()).count());
+    let summary = place.summary();
+    let counted = summary.count("/buses/0/events", "error frame");
+    assert!(theirs >= 2 && ours == theirs && counted == theirs as u64, "{ours}, {theirs}, {counted}");
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
+fn a_controller_that_is_not_ready_is_refused_with_the_remedy() {
+    let _controllers = Controllers::up();
+    // A driver that has just found its hardware knows no bit timing.
+    let (driver, address) = ("/sys/bus/pci/drivers/kvaser_pci", address("can0"));
+    for what in ["unbind", "bind"] {
+        fs::write(format!("{driver}/{what}"), &address).unwrap();
+    }
+    let up = command("ip link set can0 up").output().unwrap();
+    assert!(!up.status.success(), "the kernel has nothing to set it up with: {up:?}");
+    let error = open("can0", &options(&[Filter::ALL])).unwrap_err();
+    assert!(matches!(error, BusError::Down { .. }), "{error}");
+
+    tool("ip link set can0 type can bitrate 1000000");
+    tool("ip link set can0 up");
+    open("can0", &options(&[Filter::ALL])).unwrap();
+    let error = open("can0", &Options { fd: true, ..options(&[]) }).unwrap_err().to_string();
+    assert!(error.starts_with("can0 has MTU 16 and CAN FD needs 72"), "{error}");
+    assert!(error.ends_with("or use the classic format"), "{error}");
+}
