@@ -1,7 +1,13 @@
 //! A real driver under the classic format: two emulated Kvaser controllers on one bus, `can0` and `can1`, with
 //! interrupts, a transmit queue of ten frames and bit timing over netlink, and without physics.
 
-#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "a test may stop"
+)]
 
 mod process;
 
