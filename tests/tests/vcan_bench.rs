@@ -28,9 +28,9 @@ force_n = 1.5
 profile = "half-sine"
 "#;
 
-/// 24 cells at a rate that an emulated machine keeps up.
+/// Twelve cells at a rate that an emulated machine keeps up.
 fn prepare(place: &Place) {
-    let wanted = Wanted { cells: 24, broadcast_hz: 20.0, ..Wanted::default() };
+    let wanted = Wanted { cells: 12, broadcast_hz: 20.0, ..Wanted::default() };
     place.write("skin.toml", &generate(&wanted).unwrap());
     place.scenario(SCENARIO);
 }
@@ -50,7 +50,7 @@ fn candump_sees_exactly_what_the_gateway_counts_in_the_same_order_by_sender() {
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
     let counted = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     assert_eq!(ours.len() as u64, counted, "the log has what is counted");
-    assert!(summary.of_bus("/replies/due") > 1_000, "{:#}", summary.0);
+    assert!(summary.of_bus("/replies/due") > 600, "{:#}", summary.0);
 
     let (ours, theirs) = (by_identifier(&ours), by_identifier(&theirs));
     assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());
@@ -79,7 +79,7 @@ fn what_candump_logged_is_the_same_run_when_we_decode_it() {
         lines
     };
     let (ours, theirs) = (dumped("run.log"), dumped("candump.log"));
-    assert!(ours.len() > 24 * 40 && ours == theirs, "{} and {} lines", ours.len(), theirs.len());
+    assert!(ours.len() > 12 * 40 && ours == theirs, "{} and {} lines", ours.len(), theirs.len());
     let [ours, theirs] = [Log::read(&place.read("run.log"), Format::Fd), Log::of(frames, Format::Fd)];
     let (shared, all) = same_torques(&ours, &theirs);
     assert!(shared == all && ours.torques().len() == theirs.torques().len(), "{shared} of {all}");
@@ -101,5 +101,5 @@ fn torques_are_the_same_bit_for_bit_on_vcan_and_on_the_embedded_bus() {
     });
     // A machine that is away for a while makes a cell skip an epoch: what is there is compared, and has to be most.
     let (shared, all) = same_torques(&on_vcan, &on_embedded);
-    assert!(all > 1_000 && shared * 10 > all * 9, "{shared} of {all} causes are in both runs");
+    assert!(all > 500 && shared * 10 > all * 9, "{shared} of {all} causes are in both runs");
 }

@@ -14,6 +14,9 @@ use crate::cycle::{Cycle, Record, Tick};
 use crate::scenario::{Mode, Scenario};
 use crate::table::Snapshot;
 
+/// While the robot is halted, cells are told again before every so many joints.
+const HALT_AGAIN: u8 = 16;
+
 /// What all threads of a run look at.
 #[derive(Debug, Default)]
 pub struct Shared {
@@ -119,6 +122,10 @@ impl Turn {
             (now().saturating_sub(before), std::hint::black_box(felt))
         });
         if let Some((epoch, joints)) = outcome.joints {
+            // A cell that started anew, or did not hear it, would go on answering.
+            if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
+                self.owed.fill(Some(Message::Halt));
+            }
             self.say_what_is_owed(&mut send);
             for line in &mut self.lines {
                 // A full queue costs the receiver the unrounded positions, and nothing else.

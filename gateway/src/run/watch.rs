@@ -11,6 +11,7 @@ use protocol::bus::{Bus, BusKind};
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
+use protocol::skin::Cell;
 use protocol::time::Micros;
 
 use super::measured::Measured;
@@ -208,6 +209,17 @@ impl Bench<'_> {
         Ok(())
     }
 
+    /// Tells some cells again what the scenario makes them feel; what others feel is not its business.
+    fn remind(&self, script: &Script, wanted: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
+        let touched =
+            script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
+        for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| wanted(cell)) {
+            let sensors = script.touches.sensors(cell, script.epoch.saturating_sub(1));
+            self.stimulate(&Stimulus { cell, bus, node, sensors }, From::Next)?;
+        }
+        Ok(())
+    }
+
     fn stimulate(&self, stimulus: &Stimulus, from: From) -> Result<(), RunError> {
         let Some((lane, described)) = self.lanes.iter().zip(&self.options.skin.buses).nth(stimulus.bus)
         else {
@@ -271,11 +283,7 @@ impl Bench<'_> {
                 News::Notice(Notice::Restarted(cell)) => {
                     progress.note(&format!("cell {cell} on {} started anew", name(bus)));
                     // It has forgotten what it felt.
-                    let place = options.skin.cells.iter().position(|it| it.bus == bus && it.node == cell);
-                    if let Some(place) = place {
-                        let sensors = script.touches.sensors(place, script.epoch.saturating_sub(1));
-                        self.stimulate(&Stimulus { cell: place, bus, node: cell, sensors }, From::Next)?;
-                    }
+                    self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 News::Notice(Notice::Duplicate(cell)) => {
                     progress.note(&format!(
@@ -284,7 +292,11 @@ impl Bench<'_> {
                     ));
                 }
                 News::Down(why) => progress.note(&why),
-                News::Up => progress.note(&format!("{} works again", name(bus))),
+                News::Up => {
+                    progress.note(&format!("{} works again", name(bus)));
+                    // What was to change meanwhile did not come to them.
+                    self.remind(script, |it| it.bus == bus)?;
+                }
                 News::Lost(why) => return Err(RunError::Failed(why)),
             }
         }

@@ -118,6 +118,11 @@ impl Touches {
         })
     }
 
+    /// The cells that are ever touched, by their places in the skin.
+    pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
+        self.cells.iter().map(|felt| felt.cell)
+    }
+
     /// What a cell feels in an epoch: for one that was started anew.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {

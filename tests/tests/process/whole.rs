@@ -54,7 +54,7 @@ pub(crate) fn runs_for_half_a_minute(broadcasts: u32) -> Summary {
     let run = "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json";
     let bench = Running::start(place.command_of(&place.path("gateway"), run));
     let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
-    println!("{}", ended.stdout);
+    eprintln!("{}", ended.stdout);
     let summary = place.summary();
     summary.adds_up();
 
