@@ -9,7 +9,7 @@ use process::{Ended, PRESSED, Place, Summary, is_stopped, skin, tells, until};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Kind, Node};
-use protocol::message::{Message, NetworkPage};
+use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, WORDS};
 use rustix::process::Signal;
 
@@ -336,4 +336,45 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     // From the tick after the halt on the joints stand; one broadcast may have been on its way.
     assert!(joints(&log.messages[halt..resume]) <= 2, "a halted robot stands");
     assert!(joints(&log.messages[..halt]) > 2 && joints(&log.messages[resume..]) > 2, "else it moves");
+}
+
+#[test]
+fn a_cell_that_starts_anew_while_the_robot_is_halted_is_halted_too() {
+    let place = Place::new();
+    place.pressed();
+    let bench = place.running_bench(60.0, "");
+    let guest = place.guest();
+    guest.waits_for("a torque", torque_of(3));
+    guest.sends(&Message::Halt);
+    bench.hears("the robot is halted");
+    process::signal(bench.cell(3), Signal::KILL);
+    bench.hears("the process of cell 3 on vcan0 ended");
+    let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
+    bench.hears("cell 3 on vcan0 started anew");
+    let state = |message: &Message| match message {
+        Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
+            (from.to_byte() == 3).then_some(heartbeat.state)
+        }
+        _ => None,
+    };
+    let says = |bits| move |message: &Message| state(message).is_some_and(|state| state.has(bits));
+    let settled = |message: &Message| state(message).is_some_and(|state| !state.has(State::CLAIMING));
+    guest.waits_for("cell 3 that has its number", settled);
+    guest.waits_for("another halt", |message| *message == Message::Halt);
+    guest.waits_for("a cell 3 that is halted", says(State::HALTED));
+    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    guest.waits_for("its torque", torque_of(3));
+    bench.signal(Signal::TERM);
+    bench.end().well();
+    place.summary().adds_up();
+
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let from = |index: usize, wanted: &dyn Fn(&Message) -> bool| {
+        index + log.messages[index..].iter().position(|(message, _)| wanted(message)).unwrap()
+    };
+    let halt = from(0, &|message| *message == Message::Halt);
+    let anew = from(from(halt, &says(State::CLAIMING)), &settled);
+    let told = from(anew, &|message| *message == Message::Halt);
+    let resumed = from(told, &|message| *message == Message::Resume);
+    assert_eq!(log.torques_after(told, 3) - log.torques_after(resumed, 3), 0, "torques of a halted cell");
 }

@@ -15,7 +15,7 @@ use crate::scenario::{Mode, Scenario};
 use crate::table::Snapshot;
 
 /// While the robot is halted, cells are told again before every so many joints.
-const HALT_AGAIN: u8 = 16;
+const HALT_AGAIN: u8 = 8;
 
 /// What all threads of a run look at.
 #[derive(Debug, Default)]
