@@ -263,15 +263,16 @@ impl Bench<'_> {
             })?;
         }
         let patience = if options.spawn { STARTING } else { SHOWING };
-        let (mut ready, mut progress) = (0, Instant::now());
+        let (mut most, mut progress) = (0, Instant::now());
         loop {
             thread::sleep(Duration::from_millis(5));
             self.hear_while_starting()?;
             // Who has no parameters will not get any by waiting.
-            let now_ready = self.count(|cell| cell.ready || cell.unconfigured);
-            if now_ready > ready {
-                (ready, progress) = (now_ready, Instant::now());
+            let ready = self.count(|cell| cell.ready || cell.unconfigured);
+            if ready > most {
+                (most, progress) = (ready, Instant::now());
             }
+            // Where the machine was away for a moment, all may look dead that were ready before it: they speak again.
             if Instant::now() >= listened
                 && (ready == options.skin.cells.len() || progress.elapsed() > patience)
             {
