@@ -31,7 +31,7 @@ type Counts = BTreeMap<String, u64>;
 /// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
 const LEAD: u64 = 5;
 /// The main thread's rhythm.
-const LOOK: Duration = Duration::from_millis(4);
+const LOOK: Duration = Duration::from_millis(10);
 /// How long the cells may take to say their last words; a machine that is overloaded needs it.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
@@ -432,7 +432,8 @@ impl Spent {
         let cell = |(pid, spent): (&u32, &f64)| spent - before.cells.get(pid).copied().unwrap_or(0.0);
         Processor {
             gateway: (self.gateway - before.gateway) / seconds,
-            cells: self.cells.iter().map(cell).sum::<f64>() / seconds,
+            // Not sum(), which is -0.0 of no cells.
+            cells: self.cells.iter().map(cell).fold(0.0, |all, one| all + one) / seconds,
             buses: (self.buses - before.buses) / seconds,
         }
     }
