@@ -210,7 +210,7 @@ impl Facts {
         let granted = self.receive_buffer?;
         let most = self.buses.iter().map(|bus| match &bus.cells {
             Some(cells) => cells.len() * frames_of(&bus.wanted),
-            None => usize::from(CellId::MAX.get()),
+            None => usize::from(CellId::MAX.get()) * frames_of(&bus.wanted),
         });
         let frames = most.max().unwrap_or_else(|| usize::from(CellId::MAX.get()));
         let (once, needed) = (frames * FRAME, TIMES * frames * FRAME);

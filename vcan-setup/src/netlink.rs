@@ -31,6 +31,8 @@ use reading::{driver, interface};
 
 /// Bytes of the header before a namespace's attributes begin.
 const NSID_HEADER: usize = 4;
+/// How many numbers are tried for a new link while others make theirs; a pair takes two.
+const TRIES: u32 = 64;
 
 /// Speaks to the kernel about the interfaces of one network namespace.
 #[derive(Debug)]
@@ -195,8 +197,12 @@ impl Netlink {
             let flags = NLM_F_CREATE | NLM_F_EXCL;
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
-                // Somebody else took the number meanwhile.
-                Err(error) if is(&error, Errno::BUSY) && number < 64 => number += 2,
+                // Somebody else took the number of the other end meanwhile,
+                Err(error) if is(&error, Errno::BUSY) && number < TRIES => number += 2,
+                // or this one: the kernel says the same of a name that is taken.
+                Err(error) if is(&error, Errno::EXIST) && number < TRIES && self.free_index()? > index => {
+                    number += 2;
+                }
                 Err(error) => return Err(error),
             }
         }

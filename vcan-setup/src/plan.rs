@@ -80,6 +80,16 @@ impl Wanted {
         self.skin.as_ref().is_some_and(|skin| skin.bitrate.is_some())
     }
 
+    /// Why it cannot be had together with others, if it cannot: two skins give one bus two bit rates.
+    fn at_odds(&self, others: &[Self]) -> Option<Refusal> {
+        let own = self.skin.as_ref().filter(|skin| skin.bitrate.is_some())?;
+        let skins = others.iter().filter(|other| other.name == self.name).filter_map(|it| it.skin.as_ref());
+        let rates = |skin: &SkinBus| (skin.bitrate, skin.data_bitrate);
+        let other = skins.filter(|skin| skin.bitrate.is_some()).find(|skin| rates(skin) != rates(own))?;
+        let says = |skin: &SkinBus| format!("{} says {}", skin.file, wanted_rates(skin));
+        Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
+    }
+
     /// Whether an interface's MTU carries the frames that are wanted.
     #[must_use]
     pub const fn carried_by(&self, mtu: u32) -> bool {
@@ -127,6 +137,9 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 /// When that cannot be had without touching something that is not ours. Then nothing is to be done.
 pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
+    if let Some(refusal) = wanted.iter().enumerate().find_map(|(at, it)| it.at_odds(wanted.get(..at)?)) {
+        return Err(refusal);
+    }
     for wanted in wanted {
         if plan.steps.iter().any(|step| step.name() == wanted.name) {
             continue;
@@ -230,6 +243,13 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refu
 }
 
 impl Plan {
+    /// Says of an interface, once, that it is left as it is.
+    fn leave(&mut self, line: String) {
+        if !self.left.contains(&line) {
+            self.left.push(line);
+        }
+    }
+
     /// Brings a virtual interface that is there into the wanted state, if it is ours.
     fn fit(&mut self, wanted: &Wanted, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
@@ -238,7 +258,7 @@ impl Plan {
         match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by somebody else" };
-                self.left.push(format!("{name} is there already, and fits ({}{whose})", interface.what()));
+                self.leave(format!("{name} is there already, and fits ({}{whose})", interface.what()));
             }
             (false, _, false) => return Err(Refusal::Narrow { name, mtu }),
             (true, false, false) => return Err(Refusal::Down { name }),
@@ -263,7 +283,7 @@ impl Plan {
         let wide = wanted.carried_by(interface.mtu);
         if agrees && wide && interface.up {
             let checked = if skin.bitrate.is_some() { ", as the skin says" } else { "" };
-            self.left.push(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
+            self.leave(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }
         if set {
@@ -322,7 +342,7 @@ pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
             continue;
         }
         match (find(present, &name), &wanted.skin) {
-            (None, _) => plan.left.push(format!("{name} is not there")),
+            (None, _) => plan.leave(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 let with = removed_with(&plan, interface, present);
                 if !with {
@@ -331,7 +351,7 @@ pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
             }
             (Some(interface), Some(_)) => {
                 let what = interface.what();
-                plan.left.push(format!("{name} is {what} that vcan-setup has not made, and is left alone"));
+                plan.leave(format!("{name} is {what} that vcan-setup has not made, and is left alone"));
             }
             (Some(interface), None) => {
                 let remedy = if interface.is_virtual() {

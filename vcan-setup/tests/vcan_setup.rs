@@ -246,6 +246,25 @@ fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
     assert!(link("vcan0").is_some() && link("vcan20").is_none());
 }
 
+#[test]
+#[ignore = "needs vcan"]
+fn who_makes_interfaces_at_the_same_time_as_others_makes_them() {
+    const NAMES: [&str; 8] = ["vcan20", "vcan21", "vcan22", "vcan23", "vcan24", "vcan25", "vcan26", "vcan27"];
+    let _made = Made(&NAMES);
+    for _ in 0..4 {
+        // Each takes the first number that is free, and only the first of them can have it.
+        let said = std::thread::scope(|scope| {
+            let all = NAMES.map(|name| scope.spawn(move || done(&format!("up {name}"))));
+            all.map(|one| one.join().unwrap())
+        });
+        for (name, said) in NAMES.iter().zip(said) {
+            assert_eq!(said, format!("{name} is made, a vcan with MTU 72, and up\n"));
+            assert_ours(&link(name).unwrap(), "vcan");
+        }
+        done(&format!("down {}", NAMES.join(" ")));
+    }
+}
+
 /// A network namespace that ends with the test.
 struct Namespace(&'static str);
 
@@ -420,6 +439,7 @@ fn status_agrees_with_ip() {
     assert_eq!(done("status vcan21").lines().count(), 2, "a head and the one that was named");
     let said = run_as(0, "status vcan20 vcan77");
     assert!(said.code == 1 && said.err.starts_with("vcan-setup: not there: vcan77;"), "{said:?}");
+    assert_eq!(run_as(0, "status vcan77").out, "", "nothing that is untrue of the others");
 }
 
 fn doctor(arguments: &str) -> (i32, Vec<String>) {

@@ -5,10 +5,9 @@ use protocol::bus::{BusKind, Choice};
 use serde::Serialize;
 use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
 use vcan_setup::look::{self, Asked};
-use vcan_setup::netlink::Netlink;
 
 use super::print::print;
-use super::{Failure, Word, word};
+use super::{Failure, Word, ask, word};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///
@@ -45,7 +44,12 @@ impl Doctor {
                 Word::Name(name) => asked.push(Asked::named(&name)),
             }
         }
-        let present = Netlink::open().and_then(|mut netlink| netlink.interfaces()).unwrap_or_default();
+        let present = match (ask(), self.bus_kind.resolve()) {
+            (Ok((_, present)), _) => present,
+            // Which needs none of them.
+            (Err(_), BusKind::Embedded) => Vec::new(),
+            (Err(failure), BusKind::SocketCan) => return Err(failure),
+        };
         for Asked { wanted, .. } in asked.iter_mut().filter(|asked| asked.cells.is_none()) {
             wanted.take_format_of_hardware(&present);
         }

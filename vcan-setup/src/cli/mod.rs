@@ -7,6 +7,7 @@ mod serve;
 mod status;
 mod up;
 
+use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -14,6 +15,8 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
+use vcan_setup::link::Interface;
+use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{Refusal, Wanted};
 
 /// Gives you a bus: makes vcan interfaces, says what a bench still needs, serves embedded buses
@@ -130,4 +133,15 @@ fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
         }
     }
     Ok(all)
+}
+
+/// The interfaces that there are, and who told.
+fn ask() -> Result<(Netlink, Vec<Interface>), Failure> {
+    let mut netlink = Netlink::open().map_err(unreadable)?;
+    let present = netlink.interfaces().map_err(unreadable)?;
+    Ok((netlink, present))
+}
+
+fn unreadable(error: io::Error) -> Failure {
+    Failure::run(format!("cannot ask the kernel for its interfaces: {error}"))
 }

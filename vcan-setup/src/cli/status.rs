@@ -5,10 +5,9 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde::Serialize;
 use vcan_setup::link::{CLASSIC_MTU, FD_MTU, Hardware, Interface, Kind, Peer, Place, bit_rate};
 use vcan_setup::look::{Embedded, embedded_buses};
-use vcan_setup::netlink::Netlink;
 
 use super::print::print;
-use super::{Failure, wanted};
+use super::{Failure, ask, wanted};
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
@@ -29,16 +28,20 @@ pub(crate) struct Status {
 impl Status {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let wanted = wanted(&self.what)?;
-        let present = Netlink::open()
-            .and_then(|mut netlink| netlink.interfaces())
-            .map_err(|error| Failure::run(format!("cannot ask the kernel for its interfaces: {error}")))?;
+        let (_, present) = ask()?;
         let is_wanted = |name: &str| wanted.is_empty() || wanted.iter().any(|wanted| wanted.name == name);
         let named = |interface: &&Interface| {
             if wanted.is_empty() { interface.is_can() } else { is_wanted(&interface.name) }
         };
         let interfaces: Vec<_> = present.iter().filter(named).collect();
         let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_wanted(&bus.name)).collect();
-        let text = if self.json { json(&interfaces, &embedded)? } else { table(&interfaces, &embedded) };
+        let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
+            (true, _) => json(&interfaces, &embedded)?,
+            (false, false) => table(&interfaces, &embedded),
+            (false, true) if wanted.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
+            // What was named and is not there is said below.
+            (false, true) => String::new(),
+        };
         print(&text)?;
         let there = |name: &str| {
             interfaces.iter().any(|it| it.name == name)
@@ -54,9 +57,6 @@ impl Status {
 }
 
 fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
-    if interfaces.is_empty() && embedded.is_empty() {
-        return "no CAN interface, no embedded bus\n".to_owned();
-    }
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     table.set_header([

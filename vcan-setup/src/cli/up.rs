@@ -13,7 +13,7 @@ use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
 
 use super::print::print;
-use super::{Failure, Word, wanted, word};
+use super::{Failure, Word, ask, unreadable, wanted, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -123,16 +123,6 @@ fn plain(name: &str) -> Result<(), Failure> {
         )));
     }
     Ok(())
-}
-
-fn ask() -> Result<(Netlink, Vec<vcan_setup::link::Interface>), Failure> {
-    let mut netlink = Netlink::open().map_err(unreadable)?;
-    let present = netlink.interfaces().map_err(unreadable)?;
-    Ok((netlink, present))
-}
-
-fn unreadable(error: io::Error) -> Failure {
-    Failure::run(format!("cannot ask the kernel for its interfaces: {error}"))
 }
 
 /// Opens a namespace; `None` when it is the one where we are.

@@ -92,6 +92,13 @@ impl Facts {
                 0,
                 Finding::ok(format!("{name} is {what}, up, and carries {}", carries(interface.mtu))),
             );
+            if interface.is_virtual() && bus.wanted.is_hardware() {
+                let command = if interface.ours { self.own("down") } else { self.sudo("ip link del") };
+                findings.push(Finding::note(
+                    format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has"),
+                    [format!("{command} {name}  # if hardware is to have this name")],
+                ));
+            }
             findings.extend(self.traffic(bus, name));
         }
         findings

@@ -147,6 +147,21 @@ fn no_can_in_the_kernel_matters_by_what_was_chosen() {
 }
 
 #[test]
+fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
+    let note = |ours| {
+        about(|facts| {
+            let bus = &mut facts.buses[0];
+            bus.wanted.skin.as_mut().unwrap().bitrate = Some(500_000);
+            bus.interface.as_mut().unwrap().ours = ours;
+        })
+    };
+    let text = "note: vcan0 is a vcan and has no bit rate; the skin gives it one, as hardware has | sudo";
+    let why = "vcan0  # if hardware is to have this name";
+    assert_eq!(note(true), [format!("{text} vcan-setup down {why}")]);
+    assert_eq!(note(false), [format!("{text} ip link del {why}")]);
+}
+
+#[test]
 fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let missing = |user: User, vcan: Module| {
         about(|facts| {

@@ -87,6 +87,16 @@ pub enum Refusal {
         /// The skin's file.
         file: String,
     },
+    /// Two skins that give one bus different bit rates.
+    #[error("of {name} {one} and {other}: run `vcan-setup up` with one of them, or make them agree")]
+    AtOdds {
+        /// Its name.
+        name: String,
+        /// What one says.
+        one: String,
+        /// What the other says.
+        other: String,
+    },
     /// Hardware with other bit rates.
     #[error(
         "{name} is at {has} and {file} says {wants}: `sudo vcan-setup up {file} --set-bit-rates` sets them, or change {file}"
@@ -159,6 +169,7 @@ impl Refusal {
             Self::NotCan { .. }
             | Self::Hardware { .. }
             | Self::OneName { .. }
+            | Self::AtOdds { .. }
             | Self::NoRate { .. }
             | Self::NotOurs { .. } => true,
             Self::Narrow { .. }

@@ -176,7 +176,7 @@ impl Rates {
         let bitrate = self.bitrate.unwrap_or(0);
         match self.data_bitrate {
             Some(data) => format!("bitrate {bitrate} dbitrate {data} fd on"),
-            None => format!("bitrate {bitrate}"),
+            None => format!("bitrate {bitrate} fd off"),
         }
     }
 }

@@ -255,6 +255,38 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
 }
 
 #[test]
+fn who_goes_from_can_fd_to_classic_switches_it_off() {
+    let wanted = in_skin("can0", Format::Classic, Some(500_000), None);
+    let fd = Hardware { fd: true, ..kvaser(Some(1_000_000), Some(5_000_000)) };
+    let plan = up(&[wanted], &[can0(fd, false)], true).unwrap();
+    assert_eq!(
+        plan.steps[0].command(),
+        "ip link set can0 type can bitrate 500000 fd off && ip link set can0 up"
+    );
+}
+
+#[test]
+fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
+    let skin = |rate| in_skin("can0", Format::Classic, rate, None);
+    for set in [false, true] {
+        for present in [vec![], vec![can0(kvaser(Some(500_000), None), true)]] {
+            let refusal = up(&[skin(Some(500_000)), skin(Some(250_000))], &present, set).unwrap_err();
+            assert_eq!(
+                refusal.to_string(),
+                "of can0 skin.toml says 500 kbit/s and skin.toml says 250 kbit/s: run `vcan-setup up` with one of \
+                 them, or make them agree"
+            );
+            assert!(refusal.is_usage());
+        }
+    }
+    let present = [can0(kvaser(Some(500_000), None), true)];
+    let both = [skin(Some(500_000)), skin(None), skin(Some(500_000))];
+    let plan = up(&both, &present, false).unwrap();
+    assert_eq!(plan.steps, []);
+    assert_eq!(plan.left.len(), 2, "each line once: {:?}", plan.left);
+}
+
+#[test]
 fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
     let met = |has, wanted| {
         let rates = |bitrate| Rates { bitrate, data_bitrate: None };
