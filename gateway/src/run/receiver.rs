@@ -16,8 +16,6 @@ use protocol::time::Micros;
 use super::turn::Shared;
 use crate::table::{Notice, Said, Snapshot, Status, Table};
 
-/// Frames are left to gather for so long, so that one wake-up takes many.
-const GATHER: Duration = Duration::from_millis(1);
 /// How often time is let pass when nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
@@ -82,6 +80,8 @@ pub struct Receiver {
     pub index: usize,
     /// The bus.
     pub bus: Arc<Bus>,
+    /// So long frames are left to gather, so that one wake-up takes many: a tick, as nobody looks more often.
+    pub gather: Duration,
     /// What is known of it.
     pub table: Table,
     /// Where snapshots go.
@@ -166,7 +166,7 @@ impl Receiver {
             self.publish();
             // A full inbox has more behind it.
             if (1..BATCH).contains(&count) {
-                std::thread::sleep(GATHER);
+                std::thread::sleep(self.gather);
             }
         }
         self.table.finish();

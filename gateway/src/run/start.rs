@@ -30,6 +30,8 @@ use crate::table::{Notice, Table};
 
 /// How long the loop's own sends may wait for a bus.
 const SEND_PATIENCE: Duration = Duration::from_millis(1);
+/// Frames gather for a tick, and no longer than this.
+const GATHER: Duration = Duration::from_millis(10);
 /// Said when a receive buffer is smaller than it should be.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 /// Two gateways on one bus notice each other in this time.
@@ -228,6 +230,7 @@ fn listen(
     let receiver = Receiver {
         index,
         bus: Arc::clone(&bus),
+        gather: Duration::from_nanos(options.skin.timing.tick_nanos()).min(GATHER),
         table,
         snapshots,
         positions: of_broadcasts,

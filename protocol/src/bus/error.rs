@@ -62,7 +62,9 @@ pub enum BusError {
         mtu: i32,
     },
     /// The interface is down: found when it was opened, or while it was in use. It may come back.
-    #[error("{name} is down: bring it up with `ip link set {name} up`")]
+    #[error(
+        "{name} is down: bring it up with `ip link set {name} up`; if that is refused, `vcan-setup doctor {name}` says why"
+    )]
     Down {
         /// The interface.
         name: String,
