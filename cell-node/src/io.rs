@@ -186,7 +186,7 @@ impl Cells {
         self.flush(bus)?;
         let wait = Duration::from_micros(next.since(now).0);
         if wait >= Bus::PATIENCE {
-            bus.receive_patiently(inbox)?;
+            bus.receive_one_patiently(inbox)?;
         } else if bus.wait(Some(wait))? {
             bus.receive(inbox)?;
         }

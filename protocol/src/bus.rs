@@ -173,7 +173,7 @@ pub struct Bus {
 }
 
 impl Bus {
-    /// How long [`Bus::receive_patiently`] waits.
+    /// How long [`Bus::receive_one_patiently`] waits.
     pub const PATIENCE: Duration = Duration::from_millis(100);
 
     /// Opens a bus. When this returns, the filters are in force.
@@ -238,13 +238,13 @@ impl Bus {
         self.take(inbox, |batch, socket| batch.receive(socket))
     }
 
-    /// The same, but waits up to [`Bus::PATIENCE`] for the first frame: one system call instead of two for
-    /// whoever has nothing else to do.
+    /// The same, but waits up to [`Bus::PATIENCE`] for one frame, and takes only this one: one system call
+    /// instead of two for whoever has nothing else to do and is woken for each frame.
     ///
     /// # Errors
     /// As [`Bus::receive`].
-    pub fn receive_patiently(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
-        self.take(inbox, |batch, socket| batch.receive_patiently(socket))
+    pub fn receive_one_patiently(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
+        self.take(inbox, |batch, socket| batch.receive_one_patiently(socket))
     }
 
     fn take(
@@ -464,7 +464,8 @@ mod tests {
         let error =
             Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
         if kernel::has_socketcan() {
-            let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`";
+            let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`, or plug \
+                            it in if it is hardware";
             assert_eq!(error.to_string(), expected);
         } else {
             assert!(matches!(error, BusError::NoSocketCan { .. }), "{error}");

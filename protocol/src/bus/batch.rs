@@ -45,23 +45,23 @@ impl Batch {
     /// # Errors
     /// What `recvmmsg` says; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
-        self.take(fd, false)
-    }
-
-    /// The same, but waits for the first one as long as the socket's `SO_RCVTIMEO` says.
-    pub(super) fn receive_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
-        self.take(fd, true)
-    }
-
-    fn take(&mut self, fd: impl AsFd, wait: bool) -> io::Result<usize> {
         self.count = 0;
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
         let Some((few, rest)) = slots.split_first_chunk_mut::<FEW>() else { return Ok(0) };
-        self.count = calls::receive(fd, few, wait)?;
+        self.count = calls::receive(fd, few, false)?;
         if let (FEW, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FEW }>()) {
             // Nothing more, or an error that the next call will meet again.
             self.count += calls::receive(fd, many, false).unwrap_or(0);
         }
+        Ok(self.count)
+    }
+
+    /// Waits for one datagram as long as the socket's `SO_RCVTIMEO` says, and takes only this one: who is
+    /// woken for each would look for a second in vain.
+    pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
+        self.count = 0;
+        let Some((one, _)) = self.slots.split_first_chunk_mut::<1>() else { return Ok(0) };
+        self.count = calls::receive(fd.as_fd(), one, true)?;
         Ok(self.count)
     }
 

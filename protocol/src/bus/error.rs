@@ -37,7 +37,9 @@ pub enum BusError {
         name: String,
     },
     /// The kernel has SocketCAN and no such interface.
-    #[error("there is no interface {name}: make it with `vcan-setup up {name}`")]
+    #[error(
+        "there is no interface {name}: make it with `vcan-setup up {name}`, or plug it in if it is hardware"
+    )]
     NoInterface {
         /// The bus.
         name: String,
