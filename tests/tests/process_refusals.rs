@@ -202,7 +202,9 @@ fn a_bus_that_does_not_exist_is_named_with_its_remedy() {
     let place = Place::new();
     place.write("skin.toml", &skin(3).replace("\"vcan0\"", "\"nosuch0\""));
     let expected = match Choice::Auto.resolve() {
-        BusKind::SocketCan => "there is no interface nosuch0: make it with `vcan-setup up nosuch0`",
+        BusKind::SocketCan => {
+            "there is no interface nosuch0: make it with `vcan-setup up nosuch0`, or plug it in if it is hardware"
+        }
         BusKind::Embedded => {
             "nosuch0: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
              (--bus-kind embedded)"

@@ -96,7 +96,8 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
     assert_eq!(bus.kind(), BusKind::SocketCan);
     assert!(bus.receive_buffer() >= Options::default().receive_buffer, "{}", bus.receive_buffer());
     let error = Bus::open("vcan77", Choice::Auto, &Options::default()).unwrap_err();
-    let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`";
+    let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`, or plug it in if \
+                    it is hardware";
     assert_eq!(error.to_string(), expected);
     let error = Bus::open("lo", Choice::Auto, &Options::default()).unwrap_err();
     assert!(matches!(error, BusError::NotCan { .. }), "{error}");
