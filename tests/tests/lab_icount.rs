@@ -18,6 +18,7 @@ fn all_253_processes_answer_every_broadcast_in_time_at_the_full_rate() {
     whole::all_is_answered(&summary);
     assert_eq!(summary.of_bus("/epochs_complete"), u64::from(broadcasts));
     assert_eq!((summary.of_bus("/replies/late"), summary.number("/loop/ticks_skipped")), (0, 0));
+    assert_eq!(summary.number("/loop/broadcasts_skipped"), 0);
 }
 
 /// Everything moves and changes all the time, by the number of the broadcast: a robot that the torques move would
