@@ -28,8 +28,8 @@ use crate::scenario::FaultKind;
 use crate::summary::histogram;
 use crate::table::{Notice, Table};
 
-/// How long the loop's own sends may wait for a bus.
-const SEND_PATIENCE: Duration = Duration::from_millis(1);
+/// How long stimuli and commands may wait for a full bus; the loop's own frames never wait.
+const SEND_PATIENCE: Duration = Duration::from_millis(10);
 /// Frames gather for a tick, and no longer than this.
 const GATHER: Duration = Duration::from_millis(10);
 /// Said when a receive buffer is smaller than it should be.
