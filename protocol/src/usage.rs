@@ -1,4 +1,6 @@
-//! Wrong use of a command line, said in one line.
+//! Command lines: wrong use, said in one line, and words that can be typed again.
+
+use std::borrow::Cow;
 
 /// What clap says in several lines, in one: what is wrong and its tip, without the usage.
 #[must_use]
@@ -8,6 +10,17 @@ pub fn one_line(text: &str) -> String {
     let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
     let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     format!("{lines}; try '--help'")
+}
+
+/// A word as a shell takes it: as it is, or in quotes.
+#[must_use]
+pub fn quoted(word: &str) -> Cow<'_, str> {
+    let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"_-./:=,@%+".contains(&byte);
+    if !word.is_empty() && word.bytes().all(plain) {
+        return Cow::Borrowed(word);
+    }
+    let quote = "'\\''";
+    Cow::Owned(format!("'{}'", word.replace('\'', quote)))
 }
 
 #[cfg(test)]
@@ -23,5 +36,14 @@ mod tests {
         assert_eq!(one_line(said), expected.replace(" ; ", "; "));
         let said = "error: invalid value 'x' for '--node'\n\nFor more information, try '--help'.\n";
         assert_eq!(one_line(said), "invalid value 'x' for '--node'; try '--help'");
+    }
+    #[test]
+    fn a_word_can_be_typed_again() {
+        for plain in ["vcan0", "/tmp/a-b_c.toml", "--peer=x"] {
+            assert_eq!(quoted(plain), plain);
+        }
+        assert_eq!(quoted("a b.toml"), "'a b.toml'");
+        assert_eq!(quoted("it's $HOME"), r"'it'\''s $HOME'");
+        assert_eq!(quoted(""), "''");
     }
 }

@@ -12,6 +12,7 @@
 
 use protocol::can::Format;
 use protocol::skin::Skin;
+use protocol::usage::quoted;
 
 use crate::link::{FD_MTU, Hardware, Interface, Kind, Peer, Place};
 use crate::namespace::Namespace;
@@ -36,7 +37,7 @@ pub struct Wanted {
 /// What a skin says of a bus that may be hardware.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct SkinBus {
-    /// The skin's file.
+    /// The skin's file, as a shell takes it.
     pub file: String,
     /// `bitrate`.
     pub bitrate: Option<u32>,
@@ -58,7 +59,7 @@ impl Wanted {
             name: bus.name.clone(),
             format: bus.format,
             skin: Some(SkinBus {
-                file: file.to_owned(),
+                file: quoted(file).into_owned(),
                 bitrate: bus.bitrate,
                 data_bitrate: bus.data_bitrate,
             }),
@@ -286,13 +287,13 @@ impl Plan {
             self.leave(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }
+        let needs_data = wanted.format == Format::Fd;
+        let missing = match (skin.bitrate, skin.data_bitrate) {
+            (None, _) => Some(("bitrate", 1_000_000)),
+            (Some(_), None) if needs_data => Some(("data_bitrate", 5_000_000)),
+            (Some(_), _) => None,
+        };
         if set {
-            let needs_data = wanted.format == Format::Fd;
-            let missing = match (skin.bitrate, skin.data_bitrate) {
-                (None, _) => Some(("bitrate", 1_000_000)),
-                (Some(_), None) if needs_data => Some(("data_bitrate", 5_000_000)),
-                (Some(_), _) => None,
-            };
             if let Some((key, example)) = missing {
                 return Err(Refusal::NoRate { name, key, example, file });
             }
@@ -308,7 +309,12 @@ impl Plan {
         if !wide {
             return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
-        Err(Refusal::HardwareDown { name, what, file })
+        match missing {
+            // Somebody has set its rates, of which the skin says nothing.
+            Some(_) if before.bitrate.is_some() => Err(Refusal::Down { name }),
+            Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
+            None => Err(Refusal::HardwareDown { name, what, file }),
+        }
     }
 }
 

@@ -5,6 +5,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
+use protocol::usage::quoted;
 use rustix::io::Errno;
 use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
@@ -161,8 +162,10 @@ fn not_allowed(what: &str) -> Failure {
              NET_ADMIN`"
         ));
     }
-    let arguments: Vec<_> = std::env::args().skip(1).collect();
-    let again = format!("{} {}", look::program(), arguments.join(" "));
+    let again: Vec<_> = std::iter::once(look::program())
+        .chain(std::env::args().skip(1).map(|word| quoted(&word).into_owned()))
+        .collect();
+    let again = again.join(" ");
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
