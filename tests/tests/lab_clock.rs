@@ -14,19 +14,24 @@ use rustix::process::Signal;
 
 /// The loop goes at 100 Hz, because here a tick costs a quarter of a millisecond.
 ///
-/// How fast the emulated processor is depends on who else uses this one. While it has time left, everything is
-/// answered but for what a pause of the whole machine costs; when it has none, cells skip joints and say so.
+/// Left alone this machine has the last reply 27 ms after a broadcast. Whoever else uses the host makes it slower,
+/// for moments or all the time; cells then skip joints that are older than a period, and count them. So what is
+/// missing has to be just that, and everything is demanded where time is instructions (`lab_icount`).
 #[test]
 #[ignore = "needs the lab machine"]
-fn all_253_processes_answer_every_broadcast_at_20_hz() {
+fn what_253_processes_do_not_answer_at_20_hz_they_were_too_late_for_and_nothing_is_lost() {
     let summary = whole::runs_for_half_a_minute(20 * 30, 100.0);
     let busy = summary.figure("/processor/gateway") + summary.figure("/processor/cells");
     let complete = summary.of_bus("/epochs_complete");
     eprintln!("{complete} of 600 broadcasts answered by all, {busy:.2} of the processor");
-    if busy < SATURATED && complete < 600 {
-        assert!(complete >= 570, "{complete} of 600 with {busy:.2} of the processor: {:#}", summary.0);
-    } else if busy < SATURATED {
+    if complete == 600 {
         whole::all_is_answered(&summary);
+    }
+    let of = |reason: &str| summary.of_bus(&format!("/replies/{reason}"));
+    if busy < SATURATED {
+        let missing = of("due") - of("in_time") - of("late");
+        assert_eq!(missing, of("skipped") + of("too_late"), "{:#}", summary.0);
+        assert!(complete > 300, "{complete} of 600 with {busy:.2} of the processor: {:#}", summary.0);
     }
 }
 

@@ -69,8 +69,14 @@ pub(crate) fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A program of this build, which `cargo test` of this package alone does not make.
+/// A program of this build, which `cargo test` of this package alone does not make; or one from the folder that
+/// `SKINBUS_PROGRAMS` names.
 pub(crate) fn program(name: &str) -> PathBuf {
+    if let Some(folder) = std::env::var_os("SKINBUS_PROGRAMS") {
+        let path = Path::new(&folder).join(name);
+        assert!(path.is_file(), "{} is missing: build it, or unset SKINBUS_PROGRAMS", path.display());
+        return path;
+    }
     let own = std::env::current_exe().unwrap();
     let folder = own.parent().and_then(Path::parent).expect("tests lie in target/PROFILE/deps");
     let path = folder.join(name);
