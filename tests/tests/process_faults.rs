@@ -351,6 +351,8 @@ fn a_cell_that_starts_anew_while_the_robot_is_halted_is_halted_too() {
     bench.hears("the process of cell 3 on vcan0 ended");
     let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
     bench.hears("cell 3 on vcan0 started anew");
+    // One that has heard nothing of its first life.
+    let guest = place.guest();
     let state = |message: &Message| match message {
         Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
             (from.to_byte() == 3).then_some(heartbeat.state)
