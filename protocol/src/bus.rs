@@ -24,7 +24,6 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::PathBuf;
 use std::str::FromStr;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -171,8 +170,6 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_patience: Duration,
-    /// A sender was told that the interface is down, which the kernel tells once, and the receiver was not.
-    down: AtomicBool,
 }
 
 impl Bus {
@@ -200,15 +197,7 @@ impl Bus {
         sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::PATIENCE)).map_err(|errno| {
             BusError::Io { name: name.to_owned(), doing: "set the patience of", source: errno.into() }
         })?;
-        Ok(Self {
-            name: name.to_owned(),
-            kind,
-            socket,
-            receive_buffer,
-            fd,
-            send_patience,
-            down: AtomicBool::new(false),
-        })
+        Ok(Self { name: name.to_owned(), kind, socket, receive_buffer, fd, send_patience })
     }
 
     /// The name under which it was opened.
@@ -236,9 +225,6 @@ impl Bus {
     /// # Errors
     /// When the system cannot wait.
     pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
-        if self.down.load(Ordering::Relaxed) {
-            return Ok(true);
-        }
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
     }
 
@@ -267,9 +253,6 @@ impl Bus {
         receive: impl Fn(&mut Batch, &CanFdSocket) -> std::io::Result<usize>,
     ) -> Result<usize, BusError> {
         inbox.clear();
-        if self.down.swap(false, Ordering::Relaxed) {
-            return Err(BusError::Down { name: self.name.clone() });
-        }
         loop {
             match receive(&mut inbox.batch, &self.socket) {
                 Ok(_) => break,
@@ -339,14 +322,7 @@ impl Bus {
     #[must_use]
     pub fn offer(&self, frames: &[Frame]) -> bool {
         let fits = self.fd || frames.iter().all(|frame| frame.format() == Format::Classic);
-        if !fits {
-            return false;
-        }
-        let sent = self.send_some(frames);
-        if sent.as_ref().is_err_and(|error| is(error, Errno::NETDOWN)) {
-            self.down.store(true, Ordering::Relaxed);
-        }
-        sent.is_ok_and(|sent| sent == frames.len())
+        fits && self.send_some(frames).is_ok_and(|sent| sent == frames.len())
     }
 
     fn send_some(&self, frames: &[Frame]) -> std::io::Result<usize> {
