@@ -405,7 +405,6 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
     for cell in &cells {
         assert!(command(&format!("kill -0 {}", cell.pid().as_raw_nonzero())).status().unwrap().success());
     }
-    adds_up(&place);
     let summary = place.summary();
     assert_eq!(summary.silent().len(), 0, "{:#}", summary.0);
     // What was sent to a controller that was down, or by one, is known to be missing, and not why.
