@@ -27,7 +27,11 @@ struct Said {
 impl Folder {
     fn new() -> Self {
         let folder = Self(TempDir::new().unwrap());
-        std::fs::copy(env!("CARGO_BIN_EXE_vcan-setup"), folder.program()).unwrap();
+        // By a process of its own: a child that another test starts while this one has the copy open for writing
+        // would keep it open for a moment, and until then it is "busy" and cannot be run.
+        let mut copy = Command::new("cp");
+        copy.arg(env!("CARGO_BIN_EXE_vcan-setup")).arg(folder.program());
+        assert!(copy.status().unwrap().success());
         folder
     }
 
