@@ -24,6 +24,7 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -170,6 +171,9 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_patience: Duration,
+    /// A sender was told that the interface is down, and the receiver is yet to hear it: the kernel tells a
+    /// socket once.
+    down: AtomicBool,
 }
 
 impl Bus {
@@ -197,7 +201,15 @@ impl Bus {
         sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::PATIENCE)).map_err(|errno| {
             BusError::Io { name: name.to_owned(), doing: "set the patience of", source: errno.into() }
         })?;
-        Ok(Self { name: name.to_owned(), kind, socket, receive_buffer, fd, send_patience })
+        Ok(Self {
+            name: name.to_owned(),
+            kind,
+            socket,
+            receive_buffer,
+            fd,
+            send_patience,
+            down: AtomicBool::new(false),
+        })
     }
 
     /// The name under which it was opened.
@@ -225,6 +237,9 @@ impl Bus {
     /// # Errors
     /// When the system cannot wait.
     pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
+        if self.down.load(Ordering::Relaxed) {
+            return Ok(true);
+        }
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
     }
 
@@ -253,6 +268,9 @@ impl Bus {
         receive: impl Fn(&mut Batch, &CanFdSocket) -> std::io::Result<usize>,
     ) -> Result<usize, BusError> {
         inbox.clear();
+        if self.down.swap(false, Ordering::Relaxed) {
+            return Err(BusError::Down { name: self.name.clone() });
+        }
         loop {
             match receive(&mut inbox.batch, &self.socket) {
                 Ok(_) => break,
@@ -318,11 +336,19 @@ impl Bus {
     }
 
     /// Sends frames, at most 64, if the bus takes them all at once, and says whether it did. Never waits,
-    /// never allocates, and does not say why not: for a loop that has its own deadline.
+    /// never allocates, and does not say why not: for a loop that has its own deadline. That the interface is
+    /// down is what the next [`Bus::receive`] says.
     #[must_use]
     pub fn offer(&self, frames: &[Frame]) -> bool {
         let fits = self.fd || frames.iter().all(|frame| frame.format() == Format::Classic);
-        fits && self.send_some(frames).is_ok_and(|sent| sent == frames.len())
+        if !fits {
+            return false;
+        }
+        let sent = self.send_some(frames);
+        if sent.as_ref().is_err_and(|error| is(error, Errno::NETDOWN)) {
+            self.down.store(true, Ordering::Relaxed);
+        }
+        sent.is_ok_and(|sent| sent == frames.len())
     }
 
     fn send_some(&self, frames: &[Frame]) -> std::io::Result<usize> {

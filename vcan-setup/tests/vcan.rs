@@ -124,13 +124,17 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     ip("link set vcan9 mtu 72");
     ip("link set vcan9 up");
 
-    let (a, b) = (open().unwrap(), open().unwrap());
+    let [a, b, c] = [(); 3].map(|()| open().unwrap());
     let mut inbox = Inbox::new();
     ip("link set vcan9 down");
     assert!(a.wait(Some(Duration::from_secs(5))).unwrap(), "going down can be waited for");
     let error = a.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Down { .. }) && error.may_pass(), "{error}");
     assert_eq!(a.receive(&mut inbox).unwrap(), 0, "and is told once");
+    // A loop that only offers frames takes the word; who receives on the same bus hears it all the same.
+    assert!(!c.offer(&[frame]) && c.wait(Some(Duration::ZERO)).unwrap());
+    assert!(matches!(c.receive(&mut inbox).unwrap_err(), BusError::Down { .. }));
+    assert!(!c.wait(Some(Duration::ZERO)).unwrap(), "once for each time that it was said");
     // What the socket was told has precedence over what it is asked to do.
     let errors = [(); 2].map(|()| b.send(&[frame]).unwrap_err());
     assert!(errors.iter().all(|error| matches!(error.cause, BusError::Down { .. })), "{errors:?}");
