@@ -1,6 +1,84 @@
-//! Command lines: wrong use, said in one line, and words that can be typed again.
+//! Command lines: errors in one line with their exit codes, wrong use, output whose reader may leave, and words
+//! that can be typed again.
 
 use std::borrow::Cow;
+use std::fmt::Display;
+use std::io::{self, ErrorKind, Write};
+use std::process::ExitCode;
+
+/// An error for people, and the exit code that goes with it.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Failure {
+    text: String,
+    code: u8,
+}
+
+impl Failure {
+    /// Wrong use or configuration: exit code 2.
+    #[must_use]
+    pub fn usage(text: impl Display) -> Self {
+        Self::with_code(2, text)
+    }
+
+    /// Something failed, or is not possible here: exit code 1.
+    #[must_use]
+    pub fn run(text: impl Display) -> Self {
+        Self::with_code(1, text)
+    }
+
+    /// Exit code 1 after all has been said.
+    #[must_use]
+    pub const fn said() -> Self {
+        Self { text: String::new(), code: 1 }
+    }
+
+    /// An error that knows its exit code.
+    #[must_use]
+    pub fn with_code(code: u8, text: impl Display) -> Self {
+        Self { text: text.to_string(), code }
+    }
+
+    /// The same, with what failed after it.
+    #[must_use]
+    pub fn and(mut self, more: impl Display) -> Self {
+        self.text += &format!("; and {more}");
+        self
+    }
+}
+
+/// How a program ends: with 0, or with its error on standard error, in one piece and after its name, and the exit
+/// code of that.
+#[must_use]
+pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
+    let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
+    if !text.is_empty() {
+        // When it is closed, nobody wants to know.
+        let _ = io::stderr().write_all(format!("{program}: {text}\n").as_bytes());
+    }
+    ExitCode::from(code)
+}
+
+/// Writes a text to standard output.
+///
+/// # Errors
+/// As [`written`].
+pub fn print(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+}
+
+/// The end of writing to standard output: who read it may have left, as `head` does, and that is fine.
+///
+/// # Errors
+/// When it could not be written for another reason.
+pub fn written(done: io::Result<()>) -> Result<(), Failure> {
+    match done {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            Err(Failure::run(format!("standard output: {error}")))
+        }
+        Ok(()) | Err(_) => Ok(()),
+    }
+}
 
 /// What clap says in several lines, in one: what is wrong and its tip, without the usage.
 #[must_use]
@@ -27,6 +105,22 @@ pub fn quoted(word: &str) -> Cow<'_, str> {
 mod tests {
     use super::*;
 
+    #[test]
+    fn an_exit_code_goes_with_each_error() {
+        assert_eq!(end("test", Ok(())), ExitCode::SUCCESS);
+        assert_eq!(end("test", Err(Failure::said())), ExitCode::from(1));
+        assert_eq!(Failure::usage("no"), Failure::with_code(2, "no"));
+        assert_eq!(Failure::run("no"), Failure::with_code(1, "no"));
+        assert_eq!(end("test", Err(Failure::with_code(3, ""))), ExitCode::from(3));
+        assert_eq!(Failure::usage("no").and("no again"), Failure::usage("no; and no again"));
+    }
+    #[test]
+    fn a_reader_may_leave_and_a_disk_may_not_be_full() {
+        assert_eq!(written(Ok(())), Ok(()));
+        assert_eq!(written(Err(ErrorKind::BrokenPipe.into())), Ok(()));
+        let full = io::Error::from(ErrorKind::StorageFull);
+        assert_eq!(written(Err(full)), Err(Failure::run("standard output: no storage space")));
+    }
     #[test]
     fn what_is_wrong_and_its_tip_remain() {
         let said = "error: unexpected argument '--nod' found\n\n  tip: a similar argument exists: '--node'\n\n\

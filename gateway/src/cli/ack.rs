@@ -8,8 +8,9 @@ use protocol::bus::{Bus, BusError, Choice, Options};
 use protocol::can;
 use protocol::message::Message;
 use protocol::skin::Skin;
+use protocol::usage::Failure;
 
-use super::{Failure, output};
+use super::output;
 
 /// Leave the halted state: send resume to a bus, or to all buses of a skin
 ///

@@ -18,9 +18,10 @@ use protocol::can::{self, EXTENDED_MASK, Frame};
 use protocol::candump::{self, Direction, Line, Record, Timestamp};
 use protocol::id::Node;
 use protocol::time::Micros;
+use protocol::usage::{Failure, written};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::{Failure, output};
+use super::output;
 
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(200);
@@ -186,7 +187,7 @@ fn log(
         };
         output::note(format_args!("{name}:{number}: {complaint}"));
     };
-    output::written(done.and_then(|()| printer.out.flush()))?;
+    written(done.and_then(|()| printer.out.flush()))?;
     if bad > 0 {
         output::note(format_args!("{name}: {bad} of {seen} lines could not be read"));
     }
@@ -247,7 +248,7 @@ fn live(
             "{name}: {dropped} frames are missing: they came faster than they were shown"
         ));
     }
-    output::written(done)
+    written(done)
 }
 
 /// A file whose reader can be told to stop: then it is at its end.

@@ -12,8 +12,9 @@ use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
+use protocol::usage::{Failure, print};
 
-use super::{Failure, ack, output};
+use super::ack;
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
@@ -170,7 +171,7 @@ impl Frame {
                 let bus = ack::open(&name, self.bus_kind, format).map_err(Failure::usage)?;
                 ack::send(&bus, &message, format)
             }
-            None => output::print(&text(&message, format)),
+            None => print(&text(&message, format)),
         }
     }
 }

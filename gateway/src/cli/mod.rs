@@ -13,6 +13,7 @@ use std::process::ExitCode;
 
 use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
+use protocol::usage::{Failure, end, one_line};
 
 /// Bridges a robot skin's bus to a control loop.
 #[derive(Debug, Parser)]
@@ -32,50 +33,27 @@ enum Command {
     Skin(skin::Skin),
 }
 
-/// An error for people, and the exit code that goes with it.
-#[derive(Debug)]
-pub(crate) struct Failure {
-    text: String,
-    code: u8,
-}
-
-impl Failure {
-    /// Wrong use or configuration.
-    pub(crate) fn usage(text: impl core::fmt::Display) -> Self {
-        Self { text: text.to_string(), code: 2 }
-    }
-
-    /// Something failed.
-    pub(crate) fn run(text: impl core::fmt::Display) -> Self {
-        Self { text: text.to_string(), code: 1 }
+impl Command {
+    fn run(self) -> Result<(), Failure> {
+        match self {
+            Self::Demo(command) => command.run(),
+            Self::Run(command) => command.run(),
+            Self::Dump(command) => command.run(),
+            Self::Frame(command) => command.run(),
+            Self::Ack(command) => command.run(),
+            Self::Skin(command) => command.run(),
+        }
     }
 }
 
 /// Reads the command line and does it.
 pub(crate) fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
-        Ok(arguments) => arguments,
+    let done = match Arguments::try_parse() {
+        Ok(arguments) => arguments.command.run(),
         // Help and version, which are asked for, are printed as they are.
         Err(asked) if !asked.use_stderr() => asked.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => {
-            eprintln!("gateway: {}", protocol::usage::one_line(&wrong.render().to_string()));
-            return ExitCode::from(2);
-        }
+        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
     };
-    let done = match arguments.command {
-        Command::Demo(command) => command.run(),
-        Command::Run(command) => command.run(),
-        Command::Dump(command) => command.run(),
-        Command::Frame(command) => command.run(),
-        Command::Ack(command) => command.run(),
-        Command::Skin(command) => command.run(),
-    };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { text, code }) => {
-            eprintln!("gateway: {text}");
-            ExitCode::from(code)
-        }
-    }
+    end("gateway", done)
 }

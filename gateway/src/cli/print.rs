@@ -4,8 +4,7 @@ use std::fmt::Display;
 
 use comfy_table::{ContentArrangement, Table, presets};
 use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
-
-use super::{Failure, output};
+use protocol::usage::{Failure, print};
 
 /// The paper's mean absolute error of single torques, in Nm.
 const PAPER_SINGLE_NM: f64 = 0.0054;
@@ -15,7 +14,7 @@ const WIDTH: u16 = 110;
 
 /// Prints the whole run on standard output.
 pub(crate) fn summary(summary: &Summary) -> Result<(), Failure> {
-    output::print(&format!("{}\n", table(summary)))
+    print(&format!("{}\n", table(summary)))
 }
 
 /// What is printed: a name, a value, and what it is to be compared with.

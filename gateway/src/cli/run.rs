@@ -13,9 +13,10 @@ use gateway::summary::Summary;
 use protocol::bus::{BusKind, Choice};
 use protocol::skin::Skin;
 use protocol::time::Span;
+use protocol::usage::Failure;
 use rustix::fs::{MemfdFlags, memfd_create};
 
-use super::{Failure, print};
+use super::print;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../../examples/ur5-253.toml");
@@ -170,7 +171,7 @@ impl Common {
 }
 
 fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
-    let failure = |error: RunError| Failure { code: error.exit_code(), text: error.to_string() };
+    let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
     if summary_file.is_some() && summary_file == options.candump.as_deref() {
         return Err(Failure::usage("--summary and --candump name the same file: name two"));
     }

@@ -9,8 +9,9 @@ use gateway::generate::{self, Wanted};
 use protocol::can::Format;
 use protocol::packet::crc16;
 use protocol::skin::{ControllerKind, Reply, Skin as Description};
+use protocol::usage::{Failure, print};
 
-use super::{Failure, output};
+use super::output;
 
 /// Make and check the descriptions of skins
 #[derive(Args, Debug)]
@@ -69,7 +70,7 @@ impl Generate {
         let text = generate::generate(&self.wanted).map_err(Failure::usage)?;
         match self.output {
             Some(path) => output::write_file(&path, &text),
-            None => output::print(&text),
+            None => print(&text),
         }
     }
 }
@@ -82,7 +83,7 @@ impl Check {
         if self.cells {
             list(&mut text, &skin).expect("a string takes whatever is written");
         }
-        output::print(&text)
+        print(&text)
     }
 }
 

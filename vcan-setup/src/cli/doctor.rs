@@ -2,12 +2,12 @@
 
 use clap::Args;
 use protocol::bus::{BusKind, Choice};
+use protocol::usage::{Failure, print};
 use serde::Serialize;
 use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
 use vcan_setup::look::{self, Asked};
 
-use super::print::print;
-use super::{Failure, Word, ask, word};
+use super::{Word, ask, word};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///

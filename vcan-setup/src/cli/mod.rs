@@ -2,7 +2,6 @@
 //! 1 (it failed, or this machine does not allow it) and 2 (wrong use or configuration).
 
 mod doctor;
-mod print;
 mod serve;
 mod status;
 mod up;
@@ -15,9 +14,10 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
+use protocol::usage::{Failure, end, one_line};
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{Refusal, Wanted};
+use vcan_setup::plan::Wanted;
 
 /// Gives you a bus: makes vcan interfaces, says what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
@@ -44,64 +44,28 @@ enum Command {
     Serve(serve::Serve),
 }
 
-/// An error for people, and the exit code that goes with it.
-#[derive(Debug)]
-pub(crate) struct Failure {
-    text: String,
-    code: u8,
-}
-
-impl Failure {
-    /// Wrong use or configuration.
-    pub(crate) fn usage(text: impl core::fmt::Display) -> Self {
-        Self { text: text.to_string(), code: 2 }
-    }
-
-    /// Something failed, or is not possible here.
-    pub(crate) fn run(text: impl core::fmt::Display) -> Self {
-        Self { text: text.to_string(), code: 1 }
-    }
-
-    /// Exit code 1 after all has been said.
-    pub(crate) const fn said() -> Self {
-        Self { text: String::new(), code: 1 }
-    }
-}
-
-impl From<Refusal> for Failure {
-    fn from(refusal: Refusal) -> Self {
-        if refusal.is_usage() { Self::usage(refusal) } else { Self::run(refusal) }
+impl Command {
+    fn run(self) -> Result<(), Failure> {
+        match self {
+            Self::Up(command) => command.run(),
+            Self::Down(command) => command.run(),
+            Self::Status(command) => command.run(),
+            Self::Doctor(command) => command.run(),
+            Self::Serve(command) => command.run(),
+        }
     }
 }
 
 /// Reads the command line and does it.
 pub(crate) fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
-        Ok(arguments) => arguments,
+    let done = match Arguments::try_parse() {
+        Ok(arguments) => arguments.command.run(),
         // Help and version, which are asked for, are printed as they are.
         Err(asked) if !asked.use_stderr() => asked.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => {
-            eprintln!("vcan-setup: {}", protocol::usage::one_line(&wrong.render().to_string()));
-            return ExitCode::from(2);
-        }
+        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
     };
-    let done = match arguments.command {
-        Command::Up(command) => command.run(),
-        Command::Down(command) => command.run(),
-        Command::Status(command) => command.run(),
-        Command::Doctor(command) => command.run(),
-        Command::Serve(command) => command.run(),
-    };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { text, code }) => {
-            if !text.is_empty() {
-                eprintln!("vcan-setup: {text}");
-            }
-            ExitCode::from(code)
-        }
-    }
+    end("vcan-setup", done)
 }
 
 /// A bus' name, as the command line gives it.

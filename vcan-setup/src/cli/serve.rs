@@ -5,11 +5,12 @@ use std::os::unix::net::UnixStream;
 
 use anyhow::Context;
 use clap::Args;
+use protocol::usage::Failure;
 use rustix::process::Signal;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::embedded::Server;
 
-use super::{Failure, bus_name};
+use super::bus_name;
 
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
 ///

@@ -2,12 +2,12 @@
 
 use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use protocol::usage::{Failure, print};
 use serde::Serialize;
 use vcan_setup::link::{CLASSIC_MTU, FD_MTU, Hardware, Interface, Kind, Peer, Place, bit_rate};
 use vcan_setup::look::{Embedded, embedded_buses};
 
-use super::print::print;
-use super::{Failure, ask, wanted};
+use super::{ask, wanted};
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///

@@ -5,7 +5,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
-use protocol::usage::quoted;
+use protocol::usage::{Failure, print, quoted};
 use rustix::io::Errno;
 use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
@@ -13,8 +13,7 @@ use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
 
-use super::print::print;
-use super::{Failure, Word, ask, unreadable, wanted, word};
+use super::{Word, ask, unreadable, wanted, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -201,7 +200,7 @@ impl Worker<'_> {
                     let mut failure = explain(step, &error);
                     for done in undo.iter().rev() {
                         if let Err(error) = self.netlink.undo(done) {
-                            failure.text += &format!("; and taking back what was done fails: {error}");
+                            failure = failure.and(format_args!("taking back what was done fails: {error}"));
                         }
                     }
                     return Err(failure);

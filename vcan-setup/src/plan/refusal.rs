@@ -1,5 +1,6 @@
 //! Why nothing is done.
 
+use protocol::usage::Failure;
 use thiserror::Error;
 
 use super::Rates;
@@ -181,5 +182,11 @@ impl Refusal {
             | Self::HardwareDown { .. }
             | Self::HardwareNarrow { .. } => false,
         }
+    }
+}
+
+impl From<Refusal> for Failure {
+    fn from(refusal: Refusal) -> Self {
+        if refusal.is_usage() { Self::usage(refusal) } else { Self::run(refusal) }
     }
 }
