@@ -49,6 +49,7 @@ mod kernel;
 pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, Received};
+pub use kernel::{GATEWAY_RECEIVE_BUFFER, set_receive_buffer};
 
 /// What carries the frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]

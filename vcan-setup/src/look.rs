@@ -8,12 +8,14 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::bus::embedded::{DirectoryError, address, open_directory, socket_name, usual_directory};
-use protocol::bus::{Bus, BusError, BusKind, Choice, Inbox, Options};
+use protocol::bus::{
+    Bus, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options, set_receive_buffer,
+};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::skin::{Reply, Skin};
 use rustix::fs::Access;
-use rustix::net::{AddressFamily, SocketFlags, SocketType, sockopt};
+use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
 
 use crate::doctor::{self, Facts, Heard, Program, User};
@@ -24,8 +26,6 @@ use crate::plan::Wanted;
 /// How long a bus is listened to: a gateway sends joints much more often, a cell says that it is there at
 /// least every half second.
 const LISTEN: Duration = Duration::from_millis(600);
-/// What the gateway asks for.
-const RECEIVE_BUFFER: usize = 8 << 20;
 
 /// A bus that is to be judged.
 #[derive(Clone, Debug)]
@@ -149,10 +149,7 @@ impl Heard {
 fn receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
-    if sockopt::set_socket_recv_buffer_size_force(&socket, RECEIVE_BUFFER).is_err() {
-        sockopt::set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER)?;
-    }
-    Ok(sockopt::socket_recv_buffer_size(&socket)?)
+    set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
 }
 
 /// How this program is called so that `sudo`, which looks in the system's own directories only, finds it.

@@ -10,7 +10,7 @@ use gateway::run::file::WholeFile;
 use gateway::run::{self, Options, RunError};
 use gateway::scenario::Scenario;
 use gateway::summary::Summary;
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER};
 use protocol::skin::Skin;
 use protocol::time::Span;
 use protocol::usage::Failure;
@@ -21,9 +21,6 @@ use super::print;
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../../examples/demo.toml");
-
-/// Bytes for frames that wait: all cells may answer a report at once.
-const RECEIVE_BUFFER: u32 = 8 << 20;
 
 /// How long a run without a scenario takes, unless it is told.
 const IDLE: Span = Span::from_millis(10_000);
@@ -96,7 +93,7 @@ pub(crate) struct Run {
     no_spawn: bool,
     /// Ask for so many bytes for frames that wait unread in the gateway's socket of each bus, about 1 KiB a
     /// frame; the kernel grants the double, or less to those who may not have it
-    #[arg(long, value_name = "BYTES", default_value_t = RECEIVE_BUFFER, value_parser = clap::value_parser!(u32).range(..=1 << 30))]
+    #[arg(long, value_name = "BYTES", default_value_t = GATEWAY_RECEIVE_BUFFER, value_parser = clap::value_parser!(u32).range(..=1 << 30))]
     receive_buffer: u32,
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
@@ -163,7 +160,7 @@ impl Common {
             flash: None,
             cell_node: self.cell_node.clone(),
             vcan_setup: self.vcan_setup.clone(),
-            receive_buffer: RECEIVE_BUFFER as usize,
+            receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
             candump: None,
             quiet: self.quiet,
         }

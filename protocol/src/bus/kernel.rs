@@ -14,6 +14,10 @@ use super::{BusError, Options};
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: i32 = 72;
 
+/// Bytes that a gateway lets wait unread in its socket of each bus, unless it is told another number: all cells may
+/// answer a report at once.
+pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
+
 /// Whether the kernel has `CAN_RAW` sockets: anything but "no such protocol" counts as yes.
 pub(super) fn has_socketcan() -> bool {
     !matches!(probe(), Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
@@ -70,13 +74,21 @@ pub(super) fn open(name: &str, options: &Options) -> Result<(CanFdSocket, usize)
     super::set_stamps(&socket).map_err(failed)?;
     socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1).map_err(failed)?;
     discard(&socket);
-    // Forcing needs CAP_NET_ADMIN; without it the system's limit holds, and what was granted is reported.
-    if sockopt::set_socket_recv_buffer_size_force(&socket, options.receive_buffer).is_err() {
-        sockopt::set_socket_recv_buffer_size(&socket, options.receive_buffer)
-            .map_err(|errno| failed(errno.into()))?;
-    }
-    let granted = sockopt::socket_recv_buffer_size(&socket).map_err(|errno| failed(errno.into()))?;
+    let granted = set_receive_buffer(&socket, options.receive_buffer).map_err(failed)?;
     Ok((socket, granted))
+}
+
+/// Lets so many bytes wait unread in a socket of any sort; how many the kernel granted and counts, which is twice
+/// what was asked for when all was granted.
+///
+/// # Errors
+/// When the system refuses. To get less than was asked for is no error.
+pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> {
+    // Forcing needs CAP_NET_ADMIN; without it the system's limit holds.
+    if sockopt::set_socket_recv_buffer_size_force(&socket, bytes).is_err() {
+        sockopt::set_socket_recv_buffer_size(&socket, bytes)?;
+    }
+    Ok(sockopt::socket_recv_buffer_size(&socket)?)
 }
 
 /// Throws away what came between the opening and the filters: no more than a default buffer holds.
@@ -86,5 +98,20 @@ fn discard(socket: &CanFdSocket) {
         if batch.receive(socket).is_err() {
             break;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernel_grants_twice_what_it_may_and_less_is_no_error() {
+        let flags = SocketFlags::CLOEXEC;
+        let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, flags, None).unwrap();
+        assert_eq!(set_receive_buffer(&socket, 64 << 10).unwrap(), 128 << 10);
+        let much = GATEWAY_RECEIVE_BUFFER as usize;
+        let granted = set_receive_buffer(&socket, much).unwrap();
+        assert!(granted > 128 << 10 && granted <= 2 * much, "{granted}");
     }
 }
