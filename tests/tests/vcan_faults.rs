@@ -14,7 +14,7 @@ use protocol::fixed::Q3_12;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::WORDS;
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal};
 
 const CELLS: usize = 6;
 const DOWN: &str = "vcan0 is down: bring it up with `";
@@ -60,6 +60,18 @@ fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
         summary.0
     );
     assert!(dropped == 0 && unknown > 0, "{:#}", summary.0);
+}
+
+/// Waits until a cell says that the robot is halted, lets it go on, and sees that the same cells answer again.
+fn goes_on_when_told(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
+    place.guest().waits_for("the cells to be told", |message| {
+        matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
+            if heartbeat.state.has(State::HALTED))
+    });
+    place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
+    bench.hears("the robot goes on");
+    all_answer(place);
+    assert_eq!(bench.cells(), cells, "nobody was started anew");
 }
 
 /// Ends a bench whose bus took nothing for a while, and sees that this has cost what it must, and no more.
@@ -117,14 +129,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
         bench.tells(cell, "spoken again");
     }
     assert!(!bench.stderr().contains("the robot goes on"), "{}", bench.stderr());
-    place.guest().waits_for("the cells to be told", |message| {
-        matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
-            if heartbeat.state.has(State::HALTED))
-    });
-    place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
-    bench.hears("the robot goes on");
-    all_answer(&place);
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    goes_on_when_told(&place, &bench, &cells);
     assert_eq!(bench.stderr().matches("works again").count(), 1, "{}", bench.stderr());
     ends_well_after_a_pause(&place, bench);
 }
@@ -147,14 +152,7 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     for cell in 1..=6 {
         bench.tells(cell, "spoken again");
     }
-    place.guest().waits_for("the cells to be told", |message| {
-        matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
-            if heartbeat.state.has(State::HALTED))
-    });
-    place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
-    bench.hears("the robot goes on");
-    all_answer(&place);
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    goes_on_when_told(&place, &bench, &cells);
     ends_well_after_a_pause(&place, bench);
 }
 
