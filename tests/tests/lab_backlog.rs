@@ -9,14 +9,10 @@ mod process;
 
 use std::fs;
 
-use process::vcan::{Candump, Vcan, backlog_drops, small_skin, tool};
+use process::vcan::{Candump, Vcan, backlog_drops, route, small_skin};
 use process::{PRESSED, Place};
 
 const MAX_BACKLOG: &str = "/proc/sys/net/core/netdev_max_backlog";
-
-fn route(from: &str, to: &str, filter: &str) {
-    tool(&format!("cangw -A -s {from} -d {to} -X -e -f {filter}"));
-}
 
 #[test]
 #[ignore = "needs the lab machine"]
@@ -30,12 +26,12 @@ fn what_the_backlog_dropped_is_counted_exactly_and_nothing_stays_unknown() {
     let _cells = place.start("cell-node", "--bus vcan0 --bus-kind socketcan --nodes 1-4 --skin cells.toml");
     // The kernel's gateway passes all on; a torque of cell 3 it first copies ten times to where nobody is, by a
     // filter that comes before the exact one. More than two do not find room in the queue.
-    route("vcan1", "vcan0", "0:0");
-    route("vcan0", "vcan1", "203~C00007FF");
+    route("vcan1", "vcan0", "0:0", "");
+    route("vcan0", "vcan1", "203~C00007FF", "");
     for _ in 0..10 {
-        route("vcan0", "vcan2", "203:7FF");
+        route("vcan0", "vcan2", "203:7FF", "");
     }
-    route("vcan0", "vcan1", "203:C00007FF");
+    route("vcan0", "vcan1", "203:C00007FF", "");
     fs::write(MAX_BACKLOG, "1").unwrap();
 
     let before = backlog_drops();

@@ -12,7 +12,7 @@
 mod process;
 
 use process::log::Log;
-use process::vcan::{Candump, Vcan, command, frames_of, small_skin, tool};
+use process::vcan::{Candump, Vcan, command, frames_of, route, small_skin};
 use process::{PRESSED, Place, Running, until};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
@@ -54,12 +54,6 @@ impl Parted {
         });
         Self { place, _cells: cells.into(), _rules: Rules, _vcan1: vcan1 }
     }
-}
-
-/// Frames of one bus that match a filter go to the other, changed as it says. The kernel's rules are for CAN FD
-/// frames here, and what they send is seen by every socket on that bus (vcan needs that to be asked for).
-fn route(from: &str, to: &str, filter: &str, change: &str) {
-    tool(format!("cangw -A -s {from} -d {to} -X -e -f {filter} {change}").trim_end());
 }
 
 /// Bits that are turned in the data, from the first byte on; what is in the identifier's place is not looked at.

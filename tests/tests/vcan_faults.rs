@@ -4,10 +4,8 @@
 
 mod process;
 
-use std::process::Stdio;
-
 use process::log::Log;
-use process::vcan::{Candump, Vcan0, cansend, command, small_skin, tool};
+use process::vcan::{Candump, Vcan, Vcan0, cansend, small_skin};
 use process::{Ended, PRESSED, Place, Running, Summary, is_stopped, until};
 use protocol::can::Format;
 use protocol::fixed::Q3_12;
@@ -178,35 +176,13 @@ fn cells_alone_outlive_a_bus_that_goes_down() {
     assert_eq!((ended.signal(), ended.stderr.as_str()), (Some(15), ""), "{ended:#?}");
 }
 
-/// An interface of a test's own.
-struct Interface(&'static str);
-
-impl Interface {
-    fn new(name: &'static str, mtu: u32) -> Self {
-        tool(&format!("ip link add {name} type vcan"));
-        tool(&format!("ip link set {name} mtu {mtu} up"));
-        Self(name)
-    }
-
-    fn remove(&self) {
-        tool(&format!("ip link del {}", self.0));
-    }
-}
-
-impl Drop for Interface {
-    fn drop(&mut self) {
-        // It may be gone already.
-        let _ = command(&format!("ip link del {}", self.0)).stderr(Stdio::null()).status();
-    }
-}
-
 #[test]
 #[ignore = "needs vcan"]
 fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept() {
     let place = prepare();
     place.write("skin.toml", &small_skin(CELLS).replace("vcan0", "vcan5"));
     let removed = "vcan5 was removed while it was in use: make it again and open it again";
-    let vcan5 = Interface::new("vcan5", 72);
+    let vcan5 = Vcan::make("vcan5");
     let bench = place.running_bench(60.0, "");
     vcan5.remove();
     let Ended { status, stdout, stderr } = bench.end();
@@ -221,7 +197,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     assert!(stderr.contains(&format!("{} frames until then are in run.log", log.frames.len())), "{stderr}");
 
     // And cells that nobody has started say it themselves.
-    let vcan5 = Interface::new("vcan5", 72);
+    let vcan5 = Vcan::make("vcan5");
     let cells = place.start("cell-node", "--bus vcan5 --nodes 1-6 --skin skin.toml");
     let lists =
         || std::fs::read_to_string("/proc/net/can/rcvlist_sff").is_ok_and(|list| list.contains("  vcan5  "));
@@ -251,7 +227,7 @@ fn a_bus_that_cannot_be_used_is_refused_with_its_remedy() {
         assert!(said.starts_with(&format!("gateway: {wrong}")), "{said}");
     };
     says("vcan0", DOWN);
-    let _narrow = Interface::new("vcan6", 16);
+    let _narrow = Vcan::with_mtu("vcan6", 16);
     says("vcan6", "vcan6 has MTU 16 and CAN FD needs 72: set it with `");
     says("vcan7", "there is no interface vcan7: make it with `");
     says("lo", "lo is an interface, but no CAN interface");

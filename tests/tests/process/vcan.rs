@@ -53,17 +53,34 @@ fn missing(words: &str, error: &std::io::Error) -> ! {
 pub(crate) struct Vcan(&'static str);
 
 impl Vcan {
+    /// One that carries CAN FD, and is up.
     pub(crate) fn make(name: &'static str) -> Self {
+        Self::with_mtu(name, 72)
+    }
+
+    pub(crate) fn with_mtu(name: &'static str, mtu: u32) -> Self {
         tool(&format!("ip link add {name} type vcan"));
-        tool(&format!("ip link set {name} mtu 72 up"));
+        tool(&format!("ip link set {name} mtu {mtu} up"));
         Self(name)
+    }
+
+    /// Removes it while it may be in use.
+    pub(crate) fn remove(&self) {
+        tool(&format!("ip link del {}", self.0));
     }
 }
 
 impl Drop for Vcan {
     fn drop(&mut self) {
-        let _ = command(&format!("ip link del {}", self.0)).status();
+        // It may be gone already.
+        let _ = command(&format!("ip link del {}", self.0)).stderr(Stdio::null()).status();
     }
+}
+
+/// Frames of one bus that match a filter go to the other, changed as it says. The kernel's rules are for CAN FD
+/// frames here, and what they send is seen by every socket on that bus (vcan needs that to be asked for).
+pub(crate) fn route(from: &str, to: &str, filter: &str, change: &str) {
+    tool(format!("cangw -A -s {from} -d {to} -X -e -f {filter} {change}").trim_end());
 }
 
 /// Frames that the kernel has dropped on their way from senders to sockets, of any interface: the second
