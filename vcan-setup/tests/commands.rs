@@ -1,28 +1,20 @@
 //! The commands as processes, as far as they need no CAN in the kernel and change no interface.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
+mod process;
+
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
+use process::{Said, while_somebody_says};
 use protocol::bus::{Bus, BusKind, Choice, Options};
-use protocol::can::Frame;
 use protocol::id::{CellId, Id, Kind, Node};
 use serde_json::Value;
 use tempfile::TempDir;
 
 /// A folder with a copy of the program, and nothing beside it unless it is put there.
 struct Folder(TempDir);
-
-/// What a command said.
-#[derive(Debug)]
-struct Said {
-    code: i32,
-    out: String,
-    err: String,
-}
 
 impl Folder {
     fn new() -> Self {
@@ -51,9 +43,7 @@ impl Folder {
     }
 
     fn run(&self, arguments: &str) -> Said {
-        let output = self.command(arguments).output().unwrap();
-        let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
-        Said { code: output.status.code().unwrap(), out, err }
+        Said::by(&mut self.command(arguments))
     }
 
     fn write(&self, name: &str, text: &str) {
@@ -240,18 +230,8 @@ fn the_doctor_judges_the_kernel_by_the_choice() {
 fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
     let options = Options { filters: vec![], directory: Some(folder.buses()), ..Options::default() };
     let bus = Bus::open("nosuchcan1", Choice::Only(BusKind::Embedded), &options).unwrap();
-    let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            while !done.load(Ordering::Relaxed) {
-                bus.send(&frames).unwrap();
-                std::thread::sleep(Duration::from_millis(10));
-            }
-        });
-        let said = folder.run(&format!("doctor skin.toml --bus-kind embedded --json {arguments}"));
-        done.store(true, Ordering::Relaxed);
-        said
+    while_somebody_says(&bus, ids, || {
+        folder.run(&format!("doctor skin.toml --bus-kind embedded --json {arguments}"))
     })
 }
 

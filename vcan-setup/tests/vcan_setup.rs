@@ -3,13 +3,15 @@
 //! Needs root, and `vcan0` with MTU 72, up, which is left as it is.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
+mod process;
+
 use std::fs::File;
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use process::{Said, while_somebody_says};
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
 use protocol::can::Frame;
 use protocol::id::{CellId, Id, Kind, Node};
@@ -17,23 +19,13 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// What a command said.
-#[derive(Debug)]
-struct Said {
-    code: i32,
-    out: String,
-    err: String,
-}
-
 fn run_as(user: u32, arguments: &str) -> Said {
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
     command.args(arguments.split_whitespace());
     if user != 0 {
         command.uid(user).gid(user);
     }
-    let output = command.output().unwrap();
-    let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
-    Said { code: output.status.code().unwrap(), out, err }
+    Said::by(&mut command)
 }
 
 /// A command that does what it is told.
@@ -475,8 +467,8 @@ fn the_doctor_finds_what_is_wrong_and_its_remedies_mend_it() {
         (1, [format!("there is no interface vcan20 | {program} up vcan20")].as_slice())
     );
     mend(&faults[0]);
-    assert_eq!(while_somebody_says(&[heartbeat], || doctor("vcan20")), (0, vec![]));
-    let rival = while_somebody_says(&[heartbeat, joints], || doctor("vcan20"));
+    assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
+    let rival = while_somebody_says(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
     assert!(rival.0 == 1 && rival.1[0].starts_with("another gateway sends joints on vcan20"), "{rival:?}");
     assert!(doctor("vcan20").1[0].starts_with("no cell is heard on vcan20"));
 
@@ -494,29 +486,11 @@ fn the_doctor_finds_what_is_wrong_and_its_remedies_mend_it() {
         let (code, faults) = doctor("vcan20");
         assert!(code == 1 && faults[0].ends_with(&remedy), "{faults:?}");
         mend(&faults[0]);
-        assert_eq!(while_somebody_says(&[heartbeat], || doctor("vcan20")), (0, vec![]));
+        assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
     }
     let (code, faults) = doctor("lo");
     assert!(
         code == 1 && faults[0].starts_with("lo is the loopback interface, which carries no CAN"),
         "{faults:?}"
     );
-}
-
-/// Does something while frames with these identifiers are on vcan20.
-fn while_somebody_says<T>(ids: &[Id], act: impl FnOnce() -> T) -> T {
-    let bus = open("vcan20");
-    let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            while !done.load(Ordering::Relaxed) {
-                bus.send(&frames).unwrap();
-                std::thread::sleep(Duration::from_millis(10));
-            }
-        });
-        let result = act();
-        done.store(true, Ordering::Relaxed);
-        result
-    })
 }
