@@ -8,6 +8,7 @@ pub mod decode;
 pub mod external;
 pub mod generate;
 pub mod robot;
+pub mod ros2;
 pub mod run;
 pub mod scenario;
 pub mod summary;
