@@ -1,0 +1,254 @@
+//! Captures as candump text: read line by line in bounded memory whatever the file is, and written.
+
+use std::io::{self, Read};
+use std::ops::Range;
+
+use protocol::candump::{self, Line};
+
+use super::{Entry, Note, NoteKind};
+
+/// The longest line that is read, with its end: twice that of the longest CAN XL frame.
+pub const LONGEST: usize = 8_192;
+/// Bytes that are read at once; several of the longest lines.
+const CHUNK: usize = 1 << 18;
+/// What some editors write before the first line.
+const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
+
+/// Reads the entries of a log.
+pub(super) struct LogReader {
+    input: Box<dyn Read + Send>,
+    buffer: Vec<u8>,
+    /// What of the buffer is not used up.
+    rest: Range<usize>,
+    at_end: bool,
+    /// Lines so far.
+    lines: u64,
+    /// The time of the last frame.
+    nanos: u64,
+}
+
+impl LogReader {
+    /// Goes on behind `head`, which has been read already.
+    pub(super) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
+        let mut buffer = vec![0; CHUNK];
+        let head = head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head);
+        for (to, from) in buffer.iter_mut().zip(head) {
+            *to = *from;
+        }
+        Self { input, buffer, rest: 0..head.len(), at_end: false, lines: 0, nanos: 0 }
+    }
+
+    pub(super) const fn lines(&self) -> u64 {
+        self.lines
+    }
+
+    pub(super) const fn is_drained(&self) -> bool {
+        self.rest.start >= self.rest.end
+    }
+
+    /// The next entry: one for each line. Never panics.
+    pub(super) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
+        let Some((line, long)) = self.next_line()? else { return Ok(None) };
+        self.lines += 1;
+        let text = self.buffer.get(line).unwrap_or_default();
+        let kind = match read(text, long) {
+            Ok(Line::Frame(record)) => {
+                self.nanos = record.time.nanos;
+                return Ok(Some(Entry::Frame(record)));
+            }
+            Ok(Line::Other) => NoteKind::Text,
+            Ok(Line::Dropped { frames }) => NoteKind::Dropped(frames),
+            Ok(Line::CanXl) => NoteKind::CanXl,
+            Err(why) => NoteKind::Unreadable(why),
+        };
+        let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted(text) } else { "" };
+        Ok(Some(Entry::Note(Note { kind, nanos: self.nanos, interface, line: self.lines, text })))
+    }
+
+    /// Where the next line stands in the buffer, without its end, and whether it was longer than is read.
+    fn next_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
+        let mut seen = 0;
+        loop {
+            let Range { start, end } = self.rest;
+            let fresh = self.buffer.get(start + seen..end).unwrap_or_default();
+            // A line end beyond the limit is as good as none.
+            let fresh = fresh.get(..LONGEST - seen).unwrap_or(fresh);
+            if let Some(at) = memchr::memchr(b'\n', fresh) {
+                let newline = start + seen + at;
+                self.rest.start = newline + 1;
+                return Ok(Some((start..self.before_return(start..newline), false)));
+            }
+            seen += fresh.len();
+            if seen == LONGEST {
+                let line = self.skip_line(start..start + seen)?;
+                return Ok(Some((line, true)));
+            }
+            if self.at_end || self.fill()? == 0 {
+                let Range { start, end } = self.rest;
+                self.rest.start = end;
+                return Ok((start < end).then(|| (start..self.before_return(start..end), false)));
+            }
+        }
+    }
+
+    /// The line's end without the carriage return of other systems.
+    fn before_return(&self, line: Range<usize>) -> usize {
+        let returned = self.buffer.get(line.clone()).is_some_and(|line| line.ends_with(b"\r"));
+        line.end - usize::from(returned)
+    }
+
+    /// Goes to the end of a line, of which `line` is kept. Where that is in the buffer afterwards.
+    fn skip_line(&mut self, line: Range<usize>) -> io::Result<Range<usize>> {
+        self.buffer.copy_within(line.clone(), 0);
+        let kept = line.len();
+        let mut rest = line.end..self.rest.end;
+        loop {
+            if let Some(at) = self.buffer.get(rest.clone()).and_then(|rest| memchr::memchr(b'\n', rest)) {
+                self.rest = rest.start + at + 1..rest.end;
+                return Ok(0..kept);
+            }
+            let room = self.buffer.get_mut(kept..).unwrap_or_default();
+            let got = read_some(&mut self.input, room)?;
+            rest = kept..kept + got;
+            if got == 0 {
+                self.at_end = true;
+                self.rest = rest;
+                return Ok(0..kept);
+            }
+        }
+    }
+
+    /// Reads more behind the rest; 0 at the end.
+    fn fill(&mut self) -> io::Result<usize> {
+        if self.rest.start > 0 {
+            self.buffer.copy_within(self.rest.clone(), 0);
+            self.rest = 0..self.rest.len();
+        }
+        let room = self.buffer.get_mut(self.rest.end..).unwrap_or_default();
+        let got = read_some(&mut self.input, room)?;
+        self.rest.end += got;
+        self.at_end = got == 0;
+        Ok(got)
+    }
+}
+
+/// Reads what there is, whatever signals come.
+pub(super) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
+    loop {
+        match input.read(room) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            done => return done,
+        }
+    }
+}
+
+/// What a line is. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
+pub(super) fn read(text: &[u8], long: bool) -> Result<Line<'_>, String> {
+    if long {
+        return Err(format!("a line of more than {LONGEST} bytes"));
+    }
+    match core::str::from_utf8(text) {
+        Ok(text) => candump::parse(text).map_err(|error| error.to_string()),
+        Err(_) if text.starts_with(b"(") => Err("bytes that are no text".to_owned()),
+        Err(_) => Ok(Line::Other),
+    }
+}
+
+/// The bus that candump's word about lost frames is about: `... frames on 'vcan0' socket ...`.
+fn quoted(text: &[u8]) -> &str {
+    text.split(|&byte| byte == b'\'').nth(1).and_then(|name| core::str::from_utf8(name).ok()).unwrap_or("")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads in pieces of so many bytes, as pipes do.
+    struct Pieces(Vec<u8>, usize);
+
+    impl Read for Pieces {
+        fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
+            let len = self.1.min(self.0.len()).min(room.len());
+            for (to, from) in room.iter_mut().zip(self.0.drain(..len)) {
+                *to = from;
+            }
+            Ok(len)
+        }
+    }
+
+    /// Each line's number and text, and what it is.
+    fn all(bytes: &[u8], piece: usize) -> Vec<(u64, Vec<u8>, NoteKind)> {
+        let mut log = LogReader::new(&[], Box::new(Pieces(bytes.to_vec(), piece)));
+        let mut all = Vec::new();
+        loop {
+            match log.next().unwrap() {
+                Some(Entry::Note(note)) => all.push((note.line, note.text.to_vec(), note.kind)),
+                Some(Entry::Frame(_)) => {}
+                None => return all,
+            }
+        }
+    }
+
+    fn text(line: u64, text: &[u8]) -> (u64, Vec<u8>, NoteKind) {
+        (line, text.to_vec(), NoteKind::Text)
+    }
+
+    #[test]
+    fn lines_are_counted_and_the_last_one_needs_no_end() {
+        for piece in [1, 2, 5, 1000] {
+            let found = all(b"one\n\r\n(1.000000) can0 123#\n\xFF\nfive", piece);
+            assert_eq!(found, [text(1, b"one"), text(2, b""), text(4, b"\xFF"), text(5, b"five")]);
+            assert_eq!(all(b"", piece), []);
+            assert_eq!(all(b"\n", piece), [text(1, b"")]);
+        }
+    }
+
+    #[test]
+    fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
+        let long = || Err::<(), _>(format!("a line of more than {LONGEST} bytes"));
+        for piece in [4097, CHUNK] {
+            let mut bytes = vec![b'('; 3 * CHUNK];
+            bytes.extend_from_slice(b"\nnext\n");
+            bytes.extend_from_slice(&vec![b'x'; CHUNK]);
+            let found = all(&bytes, piece);
+            let unreadable = NoteKind::Unreadable(long().unwrap_err());
+            assert_eq!(found[0], (1, vec![b'('; LONGEST], unreadable.clone()));
+            assert_eq!(found[1], text(2, b"next"));
+            assert_eq!(found[2], (3, vec![b'x'; LONGEST], unreadable));
+            assert_eq!(found.len(), 3);
+        }
+    }
+
+    #[test]
+    fn a_line_may_be_as_long_as_the_limit_and_not_longer() {
+        let line = |len: usize| [b"#".repeat(len - 1).as_slice(), b"\nnext\n"].concat();
+        for piece in [1023, CHUNK] {
+            let longest = all(&line(LONGEST), piece);
+            assert_eq!(longest, [text(1, &b"#".repeat(LONGEST - 1)), text(2, b"next")]);
+            let longer = all(&line(LONGEST + 1), piece);
+            assert!(matches!(longer[0].2, NoteKind::Unreadable(_)), "{:?}", longer[0].2);
+            assert_eq!(longer[1..], [text(2, b"next")]);
+        }
+    }
+
+    #[test]
+    fn bytes_that_are_no_text_are_a_fault_only_in_a_frame() {
+        let fault = NoteKind::Unreadable("bytes that are no text".to_owned());
+        assert_eq!(all(b"(\xff\n\xff\n", 100), [(1, b"(\xff".to_vec(), fault), text(2, b"\xFF")]);
+    }
+
+    #[test]
+    fn a_note_has_the_time_of_the_frame_before_it_and_a_loss_its_bus() {
+        let bytes =
+            b"# a\n(2.000001) can0 123#\nDROPCOUNT: dropped 3 CAN frames on 'can7' socket (total drops 9)\n";
+        let mut log = LogReader::new(&[], Box::new(&bytes[..]));
+        let mut notes = Vec::new();
+        while let Some(entry) = log.next().unwrap() {
+            if let Entry::Note(note) = entry {
+                notes.push((note.line, note.nanos, note.interface.to_owned(), note.kind));
+            }
+        }
+        let lost = (3, 2_000_001_000, "can7".to_owned(), NoteKind::Dropped(3));
+        assert_eq!(notes, [(1, 0, String::new(), NoteKind::Text), lost]);
+    }
+}

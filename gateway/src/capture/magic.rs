@@ -1,0 +1,110 @@
+//! What a file is, by its first bytes.
+
+use std::io::{self, Read};
+
+use super::log::read_some;
+
+/// What a file that is not text is, and what to do with it; `None` for an MCAP recording.
+type Other = Option<(&'static str, &'static str)>;
+
+const UNPACK: &str = "unpack it first";
+const EXPORT: &str = "write a candump log with python-can's can_logconvert";
+
+/// Files that are told by their first bytes. Anything else is text.
+const MAGIC: &[(&[u8], Other)] = &[
+    (b"\x89MCAP", None),
+    (b"PK\x03\x04", Some(("a zip archive", UNPACK))),
+    (b"PK\x05\x06", Some(("an empty zip archive", UNPACK))),
+    (b"\x1F\x8B", Some(("a gzip file", UNPACK))),
+    (b"\x28\xB5\x2F\xFD", Some(("a zstd file", UNPACK))),
+    (b"\xFD7zXZ", Some(("an xz file", UNPACK))),
+    (b"BZh", Some(("a bzip2 file", UNPACK))),
+    (b"\x04\x22\x4D\x18", Some(("an lz4 file", UNPACK))),
+    (b"\xD4\xC3\xB2\xA1", Some(PCAP)),
+    (b"\xA1\xB2\xC3\xD4", Some(PCAP)),
+    (b"\x4D\x3C\xB2\xA1", Some(PCAP)),
+    (b"\xA1\xB2\x3C\x4D", Some(PCAP)),
+    (b"\x0A\x0D\x0D\x0A", Some(PCAP)),
+    (b"LOGG", Some(("a BLF file", EXPORT))),
+    (b"MDF  ", Some(("an MDF file", EXPORT))),
+    (b"#ROSBAG V", Some(("a ROS 1 bag", "make an MCAP of it"))),
+    (
+        b"SQLite format 3",
+        Some(("an SQLite database", "if it is a ROS 2 bag, make an MCAP of it with `ros2 bag convert`")),
+    ),
+    (b"\xFF\xFE", Some(UTF_16)),
+    (b"\xFE\xFF", Some(UTF_16)),
+];
+
+const PCAP: (&str, &str) = ("a packet capture", "take the capture as a candump log (candump -l)");
+const UTF_16: (&str, &str) = ("text in UTF-16", "save it as UTF-8");
+
+/// What is read as a capture.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Kind {
+    Text,
+    Mcap,
+    /// What it is, and what to do.
+    Other(&'static str, &'static str),
+}
+
+/// Reads the beginning of an input, no more of it than is needed to tell what it is, so that a pipe whose
+/// first line is slow to come is not waited for longer than that.
+pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
+    let mut head = Vec::new();
+    let longest = MAGIC.iter().map(|(magic, _)| magic.len()).max().unwrap_or(0);
+    let mut room = vec![0; longest];
+    loop {
+        if let Some((_, other)) = MAGIC.iter().find(|(magic, _)| head.starts_with(magic)) {
+            return Ok((other.map_or(Kind::Mcap, |(what, remedy)| Kind::Other(what, remedy)), head));
+        }
+        let open = MAGIC.iter().any(|(magic, _)| magic.starts_with(&head));
+        let free = room.get_mut(head.len()..).unwrap_or_default();
+        if !open || free.is_empty() {
+            return Ok((Kind::Text, head));
+        }
+        let got = read_some(input, free)?;
+        if got == 0 {
+            return Ok((Kind::Text, head));
+        }
+        head.extend_from_slice(free.get(..got).unwrap_or_default());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Cursor;
+
+    #[test]
+    fn files_are_told_by_their_first_bytes() {
+        let kind = |bytes: &[u8]| look(&mut Cursor::new(bytes)).unwrap();
+        assert_eq!(kind(mcap::MAGIC).0, Kind::Mcap);
+        assert_eq!(kind(b"PK\x03\x04 and more").0, Kind::Other("a zip archive", UNPACK));
+        assert_eq!(kind(b"(1.000000) can0 123#").0, Kind::Text);
+        for text in [&b""[..], b"P", b"PK\x03", b"\n", b"#", b"#ROS", b"BZ"] {
+            assert_eq!(kind(text), (Kind::Text, text.to_vec()));
+        }
+        for (magic, other) in MAGIC {
+            assert_eq!(kind(magic).0 == Kind::Mcap, other.is_none());
+            assert_ne!(kind(magic).0, Kind::Text, "{magic:?}");
+        }
+    }
+
+    #[test]
+    fn of_a_pipe_no_more_is_taken_than_tells_what_it_is() {
+        /// Gives its bytes one by one, and fails a test that wants more.
+        struct Slow(&'static [u8]);
+        impl Read for Slow {
+            fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
+                let (first, rest) = self.0.split_first().expect("enough was there");
+                self.0 = rest;
+                room[0] = *first;
+                Ok(1)
+            }
+        }
+        // A zstd file begins with a parenthesis too.
+        assert_eq!(look(&mut Slow(b"(1")).unwrap(), (Kind::Text, b"(1".to_vec()));
+        assert_eq!(look(&mut Slow(b"PK\x03\x04")).unwrap().0, Kind::Other("a zip archive", UNPACK));
+    }
+}

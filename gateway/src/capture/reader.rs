@@ -1,0 +1,198 @@
+//! Reading a capture of either format.
+
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+
+use thiserror::Error;
+
+use super::Entry;
+use super::log::LogReader;
+use super::magic::{self, Kind};
+
+/// What a capture is written in.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Format {
+    /// Text of `candump -L`.
+    Candump,
+    /// An MCAP recording.
+    Mcap,
+}
+
+/// Why a capture cannot be read, or not further.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CaptureError {
+    /// It cannot be opened or read.
+    #[error("{name}: {source}")]
+    Io {
+        /// Its name.
+        name: String,
+        /// Why.
+        source: io::Error,
+    },
+    /// Its first bytes say that it is something else.
+    #[error("{name} is {what}, and no candump log or MCAP recording: {remedy}")]
+    Other {
+        /// Its name.
+        name: String,
+        /// What it is.
+        what: &'static str,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// From here on it is not what it was.
+    #[error("{name}: {what}; {entries} entries before that were read")]
+    Damaged {
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        what: String,
+        /// How many entries came before.
+        entries: u64,
+    },
+}
+
+/// What an MCAP recording has beside frames and notes, as far as it has been read.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Extras {
+    /// Topics that are no frames and no notes, in the order in which they came.
+    pub topics: Vec<Topic>,
+    /// Attachments by name; the largest without their bytes.
+    pub attachments: Vec<(String, Vec<u8>)>,
+    /// Metadata by name.
+    pub metadata: Vec<(String, Vec<(String, String)>)>,
+    /// What is missing at its end, when it was never finished.
+    pub unfinished: Option<String>,
+}
+
+/// A topic that is neither frames nor notes.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Topic {
+    /// Its name.
+    pub name: String,
+    /// The type of its messages.
+    pub schema: String,
+    /// How many.
+    pub messages: u64,
+}
+
+/// Reads a capture from its beginning to its end, in bounded memory.
+pub struct Reader {
+    name: String,
+    source: Source,
+}
+
+enum Source {
+    Log(LogReader),
+}
+
+impl fmt::Debug for Reader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Reader")
+            .field("name", &self.name)
+            .field("format", &self.format())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Reader {
+    /// Opens a file, or standard input by the name `-`.
+    ///
+    /// # Errors
+    /// When it cannot be opened or is no capture.
+    pub fn open(path: &Path) -> Result<Self, CaptureError> {
+        if path.as_os_str() == "-" {
+            return Self::from_read("standard input", io::stdin());
+        }
+        let name = path.display().to_string();
+        let failed = |source| CaptureError::Io { name: name.clone(), source };
+        let file = File::open(path).map_err(failed)?;
+        if file.metadata().map_err(failed)?.is_dir() {
+            return Err(failed(io::ErrorKind::IsADirectory.into()));
+        }
+        Self::from_read(name, file)
+    }
+
+    /// Reads from anything; the name is for errors. What it is, is told by its first bytes, which are waited
+    /// for here.
+    ///
+    /// # Errors
+    /// When it cannot be read or is no capture.
+    pub fn from_read(
+        name: impl Into<String>,
+        input: impl Read + Send + 'static,
+    ) -> Result<Self, CaptureError> {
+        let (name, mut input) = (name.into(), Box::new(input));
+        let source = match magic::look(&mut input) {
+            Ok((Kind::Text, head)) => Source::Log(LogReader::new(&head, input)),
+            Ok((Kind::Mcap, _)) => {
+                return Err(CaptureError::Other {
+                    name,
+                    what: "an MCAP recording",
+                    remedy: "not read in this version",
+                });
+            }
+            Ok((Kind::Other(what, remedy), _)) => return Err(CaptureError::Other { name, what, remedy }),
+            Err(source) => return Err(CaptureError::Io { name, source }),
+        };
+        Ok(Self { name, source })
+    }
+
+    /// Its name, as errors have it.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What it is written in.
+    #[must_use]
+    pub const fn format(&self) -> Format {
+        match self.source {
+            Source::Log(_) => Format::Candump,
+        }
+    }
+
+    /// The next entry, in the order of the file; `None` after the last one. Never panics.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is damaged: then nothing more comes.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "an entry borrows from the reader; an iterator's cannot"
+    )]
+    pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
+        let Self { name, source } = self;
+        match source {
+            Source::Log(log) => log.next().map_err(|source| CaptureError::Io { name: name.clone(), source }),
+        }
+    }
+
+    /// Lines of a log so far: the number of the last entry's; 0 in an MCAP recording.
+    #[must_use]
+    pub const fn lines(&self) -> u64 {
+        match &self.source {
+            Source::Log(log) => log.lines(),
+        }
+    }
+
+    /// Whether all that has been taken from the input is used up, so that the next entry may take a while: the
+    /// time to flush what is shown of a live pipe.
+    #[must_use]
+    pub const fn is_drained(&self) -> bool {
+        match &self.source {
+            Source::Log(log) => log.is_drained(),
+        }
+    }
+
+    /// What it has beside frames and notes, as far as it has been read. A log has nothing.
+    #[must_use]
+    pub fn extras(&self) -> &Extras {
+        static NONE: Extras =
+            Extras { topics: Vec::new(), attachments: Vec::new(), metadata: Vec::new(), unfinished: None };
+        match &self.source {
+            Source::Log(_) => &NONE,
+        }
+    }
+}
