@@ -4,6 +4,7 @@ pub mod capture;
 pub mod central;
 pub mod controller;
 pub mod cycle;
+pub mod dbc;
 pub mod decode;
 pub mod external;
 pub mod generate;

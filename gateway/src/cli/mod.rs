@@ -2,6 +2,7 @@
 //! 1 (the run failed) and 2 (wrong use or configuration).
 
 mod ack;
+mod dbc;
 mod dump;
 mod frame;
 mod output;
@@ -31,6 +32,7 @@ enum Command {
     Frame(frame::Frame),
     Ack(ack::Ack),
     Skin(skin::Skin),
+    Dbc(dbc::Dbc),
 }
 
 impl Command {
@@ -42,6 +44,7 @@ impl Command {
             Self::Frame(command) => command.run(),
             Self::Ack(command) => command.run(),
             Self::Skin(command) => command.run(),
+            Self::Dbc(command) => command.run(),
         }
     }
 }

@@ -1,0 +1,180 @@
+//! The text.
+
+use core::fmt::{self, Write};
+
+use protocol::message::VERSION;
+use protocol::packet::BYTES;
+use protocol::skin::{Bus, Skin};
+
+use super::signal::{Page, Signal};
+use super::{Message, Party, Rhythm, are_packets};
+
+/// Who sends or receives and has no name, by the format.
+const UNNAMED: &str = "Vector__XXX";
+/// The sections that a reader may meet.
+const SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
+/// What `VFrameFormat` can be; the last but one is an FD frame with an identifier of 11 bits.
+const FRAME_FORMATS: [&str; 16] = [
+    "StandardCAN",
+    "ExtendedCAN",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "StandardCAN_FD",
+    "ExtendedCAN_FD",
+];
+const STANDARD_CAN_FD: u8 = 14;
+/// What `GenMsgSendType` can be.
+const SEND_TYPES: [&str; 3] = ["NoMsgSendType", "Cyclic", "CyclicIfActive"];
+
+pub(super) fn write(
+    out: &mut impl Write,
+    skin: &Skin,
+    index: usize,
+    bus: &Bus,
+    messages: &[Message],
+) -> fmt::Result {
+    writeln!(out, "VERSION \"{VERSION}\"\n\nNS_ :")?;
+    for section in SECTIONS {
+        writeln!(out, "\t{section}")?;
+    }
+    write!(out, "\nBS_:\n\nBU_: gateway")?;
+    let mut cells: Vec<_> = skin.cells_of(index).collect();
+    cells.sort_unstable_by_key(|cell| cell.node);
+    for cell in &cells {
+        write!(out, " cell_{}", cell.node)?;
+    }
+    writeln!(out, "\n")?;
+    let everyone: Vec<_> = cells.iter().map(|cell| cell.node.get()).collect();
+    for message in messages {
+        frame(out, message, &everyone)?;
+    }
+    about(out, skin, bus)?;
+    for cell in &cells {
+        let (serial, joint, hash) = (cell.serial, cell.joint, skin.parameters(cell).hash());
+        let text = format!("Serial number {serial}, moved by joint {joint}, configuration hash {hash:04X}.");
+        writeln!(out, "CM_ BU_ cell_{} \"{text}\";", cell.node)?;
+    }
+    for message in messages {
+        writeln!(out, "CM_ BO_ {} \"{}\";", message.id.to_bits(), message.comment)?;
+    }
+    attributes(out, bus, messages)?;
+    for message in messages {
+        for signal in message.signals.iter().filter(|signal| !signal.names.is_empty()) {
+            write!(out, "VAL_ {} {}", message.id.to_bits(), signal.name)?;
+            for (value, name) in &signal.names {
+                write!(out, " {value} \"{name}\"")?;
+            }
+            writeln!(out, " ;")?;
+        }
+    }
+    Ok(())
+}
+
+/// A message and its signals.
+fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Result {
+    let Message { id, name, from, .. } = message;
+    write!(out, "BO_ {} {name}: {BYTES} ", id.to_bits())?;
+    parties(out, *from, everyone)?;
+    writeln!(out)?;
+    for signal in &message.signals {
+        let Signal { name, page, start, bits, signed, factor, range: [least, greatest], unit, names: _ } =
+            signal;
+        write!(out, " SG_ {name} ")?;
+        match page {
+            Page::Every => {}
+            Page::Number => write!(out, "M ")?,
+            Page::Only(page) => write!(out, "m{page} ")?,
+        }
+        let sign = if *signed { '-' } else { '+' };
+        // After the @ stands 1: least significant byte first.
+        write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{least}|{greatest}] \"{unit}\" ")?;
+        parties(out, message.to, everyone)?;
+        writeln!(out)?;
+    }
+    writeln!(out)
+}
+
+fn parties(out: &mut impl Write, party: Party, everyone: &[u8]) -> fmt::Result {
+    match party {
+        Party::Gateway => write!(out, "gateway"),
+        Party::Cell(node) => write!(out, "cell_{node}"),
+        Party::Unnamed => write!(out, "{UNNAMED}"),
+        Party::Cells if everyone.is_empty() => write!(out, "{UNNAMED}"),
+        Party::Cells => {
+            for (index, node) in everyone.iter().enumerate() {
+                write!(out, "{}cell_{node}", if index == 0 { "" } else { "," })?;
+            }
+            Ok(())
+        }
+    }
+}
+
+/// What the whole file is.
+fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
+    // A quotation mark would end the comment.
+    let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));
+    let travels = if are_packets(bus) {
+        "Classic: a packet travels in two frames of 8 bytes under one identifier; this describes the 16 bytes of the \
+         two joined, which no frame of the bus has."
+    } else {
+        "A packet is one CAN FD frame with bit-rate switch."
+    };
+    writeln!(
+        out,
+        "CM_ \"Skin {skin}, bus {bus_name}, protocol version {VERSION}. {travels} The crc is CRC-16/CCITT-FALSE over \
+         the identifier (2 bytes, least significant first) and bytes 0 to 13. Epochs and counters wrap.\";"
+    )
+}
+
+fn attributes(out: &mut impl Write, bus: &Bus, messages: &[Message]) -> fmt::Result {
+    let choices =
+        |names: &[&str]| names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(",");
+    writeln!(out, "BA_DEF_ \"BusType\" STRING ;")?;
+    writeln!(out, "BA_DEF_ \"DBName\" STRING ;")?;
+    let rates = [("Baudrate", bus.bitrate), ("BaudrateCANFD", bus.data_bitrate)];
+    let rates = rates.into_iter().filter_map(|(name, rate)| Some((name, rate?)));
+    for (name, _) in rates.clone() {
+        writeln!(out, "BA_DEF_ \"{name}\" INT 0 20000000;")?;
+    }
+    writeln!(out, "BA_DEF_ BO_ \"VFrameFormat\" ENUM {};", choices(&FRAME_FORMATS))?;
+    writeln!(out, "BA_DEF_ BO_ \"CANFD_BRS\" ENUM \"0\",\"1\";")?;
+    writeln!(out, "BA_DEF_ BO_ \"GenMsgSendType\" ENUM {};", choices(&SEND_TYPES))?;
+    writeln!(out, "BA_DEF_ BO_ \"GenMsgCycleTime\" INT 0 65535;")?;
+    writeln!(out, "BA_DEF_DEF_ \"BusType\" \"CAN FD\";")?;
+    writeln!(out, "BA_DEF_DEF_ \"DBName\" \"\";")?;
+    for (name, _) in rates.clone() {
+        writeln!(out, "BA_DEF_DEF_ \"{name}\" 0;")?;
+    }
+    writeln!(out, "BA_DEF_DEF_ \"VFrameFormat\" \"StandardCAN_FD\";")?;
+    writeln!(out, "BA_DEF_DEF_ \"CANFD_BRS\" \"1\";")?;
+    writeln!(out, "BA_DEF_DEF_ \"GenMsgSendType\" \"NoMsgSendType\";")?;
+    writeln!(out, "BA_DEF_DEF_ \"GenMsgCycleTime\" 0;")?;
+    writeln!(out, "BA_ \"BusType\" \"CAN FD\";")?;
+    writeln!(out, "BA_ \"DBName\" \"{}\";", bus.name.replace('"', "'"))?;
+    for (name, rate) in rates {
+        writeln!(out, "BA_ \"{name}\" {rate};")?;
+    }
+    for message in messages {
+        let id = message.id.to_bits();
+        writeln!(out, "BA_ \"VFrameFormat\" BO_ {id} {STANDARD_CAN_FD};")?;
+        writeln!(out, "BA_ \"CANFD_BRS\" BO_ {id} 1;")?;
+        let (kind, ms) = match message.rhythm {
+            Rhythm::Seldom => continue,
+            Rhythm::Every(ms) => (1, ms),
+            Rhythm::WhileActive(ms) => (2, ms),
+        };
+        writeln!(out, "BA_ \"GenMsgSendType\" BO_ {id} {kind};")?;
+        writeln!(out, "BA_ \"GenMsgCycleTime\" BO_ {id} {ms};")?;
+    }
+    Ok(())
+}

@@ -1,0 +1,88 @@
+//! `gateway dbc` as a process.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use tempfile::TempDir;
+
+fn gateway(folder: &Path, arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder);
+    command.env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus").output().unwrap()
+}
+
+/// Standard output of a command that is done well and has nothing to complain of.
+fn output(folder: &Path, arguments: &str) -> String {
+    let Output { status, stdout, stderr } = gateway(folder, arguments);
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), said.as_str()), (Some(0), ""), "{arguments}");
+    String::from_utf8(stdout).unwrap()
+}
+
+/// What a command says that ends with this code and prints nothing: one line.
+fn refusal(folder: &Path, arguments: &str, code: i32) -> String {
+    let Output { status, stdout, stderr } = gateway(folder, arguments);
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), stdout.as_slice()), (Some(code), b"".as_slice()), "{arguments}: {said}");
+    assert_eq!(said.matches('\n').count(), 1, "{arguments}: {said}");
+    said.trim_end().to_owned()
+}
+
+/// A folder with skins in it: `one.toml`, `two.toml` of two buses, `classic.toml`.
+fn skins() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let skins =
+        [("one", "--cells 3"), ("two", "--cells 4 --buses 2"), ("classic", "--cells 3 --format classic")];
+    for (name, what) in skins {
+        output(folder.path(), &format!("skin generate {what} -o {name}.toml"));
+    }
+    folder
+}
+
+#[test]
+fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
+    let folder = skins();
+    let folder = folder.path();
+    let text = output(folder, "dbc one.toml");
+    assert!(text.starts_with("VERSION \"1\"\n") && text.contains("\nBO_ 515 torque_3: 16 cell_3\n"));
+    assert_eq!(output(folder, "dbc one.toml -o one.dbc"), "");
+    let written = || std::fs::read_to_string(folder.join("one.dbc")).unwrap();
+    assert_eq!(written(), text);
+    let said = refusal(folder, "dbc classic.toml --joined -o one.dbc", 2);
+    assert_eq!(said, "gateway: one.dbc is there already; --force writes over it");
+    assert_eq!(written(), text);
+    output(folder, "dbc classic.toml --joined -o one.dbc --force");
+    assert!(written().contains("Classic: a packet travels in two frames of 8 bytes under one identifier"));
+    let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 1);
+    assert!(said.starts_with("gateway: nowhere/one.dbc: "), "{said}");
+}
+
+#[test]
+fn of_several_buses_one_is_chosen() {
+    let folder = skins();
+    let folder = folder.path();
+    let said = refusal(folder, "dbc two.toml", 2);
+    let expected =
+        "gateway: two.toml has 2 buses, and a DBC describes one: say --bus and one of vcan0, vcan1";
+    assert_eq!(said, expected);
+    let said = refusal(folder, "dbc two.toml --bus can7", 2);
+    assert_eq!(said, "gateway: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
+    for bus in ["vcan0", "vcan1"] {
+        let text = output(folder, &format!("dbc two.toml --bus {bus}"));
+        assert!(text.contains(&format!("BA_ \"DBName\" \"{bus}\";")), "{text}");
+    }
+}
+
+#[test]
+fn a_classic_bus_is_described_only_as_joined_packets() {
+    let folder = skins();
+    let folder = folder.path();
+    let said = refusal(folder, "dbc classic.toml", 2);
+    let expected = "gateway: bus vcan0 is classic: a packet is two frames of 8 bytes under one identifier, which a \
+                    DBC cannot tell apart; --joined describes the 16 bytes of both, for a program that joins them \
+                    first";
+    assert_eq!(said, expected);
+    let said = refusal(folder, "dbc one.toml --joined", 2);
+    assert_eq!(said, "gateway: --joined is for classic buses; on vcan0 a packet is one FD frame");
+}
