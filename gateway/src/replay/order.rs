@@ -1,0 +1,207 @@
+//! Frames in the order of their times, with bounded memory.
+//!
+//! ```text
+//!   frames in the capture's order ──> push ──> [ window ] ──> pop ──> frames in the order in which they are sent
+//! ```
+//!
+//! Whoever records several buses reads them in turn, so in a capture the frames of one bus stand in the bus' order and
+//! those of two may not stand in the order of their times. So the buses are merged by time, and no bus' own order is
+//! ever changed: what a cell heard before it heard the joints, it has to hear before the joints again, whatever the
+//! time stamps say. Frames of the same time keep the capture's order.
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+/// A frame waits until one has been read that is so much newer, in ns.
+pub const WINDOW_NS: u64 = 1_000_000_000;
+/// At most so many frames wait.
+pub const WINDOW_FRAMES: usize = 8_192;
+
+/// One that waits.
+#[derive(Debug)]
+struct Waiting<T> {
+    /// Its time, or that of a frame before it on its bus, when that was later.
+    key: u64,
+    /// Where it stood in the capture.
+    place: u64,
+    nanos: u64,
+    item: T,
+}
+
+impl<T> Ord for Waiting<T> {
+    /// The earliest is the greatest, for the heap gives out the greatest.
+    fn cmp(&self, other: &Self) -> Ordering {
+        (other.key, other.place).cmp(&(self.key, self.place))
+    }
+}
+
+impl<T> PartialOrd for Waiting<T> {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl<T> PartialEq for Waiting<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other) == Ordering::Equal
+    }
+}
+
+impl<T> Eq for Waiting<T> {}
+
+/// The next one to be sent.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Ordered<T> {
+    /// When, by the capture's clock; never before the one before it.
+    pub at: u64,
+    /// Its own time.
+    pub nanos: u64,
+    /// Whether one that is newer came before it: then it is sent at once.
+    pub is_late: bool,
+    /// What it is.
+    pub item: T,
+}
+
+/// Merges buses by time.
+#[derive(Debug)]
+pub struct Order<T> {
+    heap: BinaryHeap<Waiting<T>>,
+    /// The greatest time so far on each bus.
+    buses: Vec<u64>,
+    places: u64,
+    newest: u64,
+    /// The time of the last one that came out.
+    released: u64,
+}
+
+impl<T> Default for Order<T> {
+    fn default() -> Self {
+        Self { heap: BinaryHeap::new(), buses: Vec::new(), places: 0, newest: 0, released: 0 }
+    }
+}
+
+impl<T> Order<T> {
+    /// Takes the capture's next frame.
+    pub fn push(&mut self, bus: usize, nanos: u64, item: T) {
+        if self.buses.len() <= bus {
+            self.buses.resize(bus + 1, 0);
+        }
+        let key = self.buses.get_mut(bus).map_or(nanos, |greatest| {
+            *greatest = nanos.max(*greatest);
+            *greatest
+        });
+        self.heap.push(Waiting { key, place: self.places, nanos, item });
+        self.places += 1;
+        self.newest = self.newest.max(nanos);
+    }
+
+    /// The next one, if it need not wait any longer.
+    pub fn pop(&mut self) -> Option<Ordered<T>> {
+        let next = self.heap.peek()?;
+        let waits = self.newest - next.key.min(self.newest) <= WINDOW_NS && self.heap.len() <= WINDOW_FRAMES;
+        if waits { None } else { self.pop_last() }
+    }
+
+    /// The next one, when the capture has no more.
+    pub fn pop_last(&mut self) -> Option<Ordered<T>> {
+        let Waiting { key, nanos, item, .. } = self.heap.pop()?;
+        let is_late = nanos < self.released;
+        self.released = self.released.max(key);
+        Some(Ordered { at: self.released, nanos, is_late, item })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// All that comes out: bus, place and what the order says of it.
+    fn merged(frames: &[(usize, u64)]) -> Vec<Ordered<(usize, usize)>> {
+        let mut order = Order::default();
+        let mut out = Vec::new();
+        for (place, &(bus, nanos)) in frames.iter().enumerate() {
+            order.push(bus, nanos, (bus, place));
+            out.extend(std::iter::from_fn(|| order.pop()));
+        }
+        out.extend(std::iter::from_fn(|| order.pop_last()));
+        out
+    }
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn buses_that_were_read_in_turn_are_merged() {
+        let frames = [(0, 10), (0, 30), (0, 50), (1, 20), (1, 30), (1, 40)].map(|(bus, at)| (bus, at * MS));
+        let places: Vec<_> = merged(&frames).iter().map(|it| it.item.1).collect();
+        assert_eq!(places, [0, 3, 1, 4, 5, 2], "of the same time, the capture's order");
+    }
+
+    #[test]
+    fn the_order_of_one_bus_is_never_changed() {
+        let frames = [(0, 20 * MS), (0, 10 * MS), (1, 15 * MS)];
+        let out = merged(&frames);
+        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.at / MS, it.is_late)).collect();
+        assert_eq!(seen, [(2, 15, false), (0, 20, false), (1, 20, true)]);
+    }
+
+    #[test]
+    fn what_is_older_than_the_window_comes_at_once() {
+        let frames = [(0, 1_000 * MS), (0, 5_000 * MS), (1, 500 * MS), (0, 9_000 * MS)];
+        let out = merged(&frames);
+        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.at / MS, it.is_late)).collect();
+        assert_eq!(seen, [(0, 1_000, false), (2, 1_000, true), (1, 5_000, false), (3, 9_000, false)]);
+    }
+
+    #[test]
+    fn no_more_frames_wait_than_are_said_to() {
+        let mut order = Order::default();
+        for place in 0..3 * WINDOW_FRAMES {
+            order.push(0, 7, place);
+            while order.pop().is_some() {}
+            assert!(order.heap.len() <= WINDOW_FRAMES);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn all_come_out_once_in_each_bus_order_and_times_never_run_backwards(
+            frames in proptest::collection::vec((0_usize..3, 0_u64..4_000), 0..200),
+        ) {
+            let frames: Vec<_> = frames.into_iter().map(|(bus, at)| (bus, at * MS)).collect();
+            let out = merged(&frames);
+            prop_assert_eq!(out.len(), frames.len());
+            prop_assert!(out.is_sorted_by_key(|it| it.at));
+            for bus in 0..3 {
+                let places: Vec<_> =
+                    out.iter().filter(|it| it.item.0 == bus).map(|it| it.item.1).collect();
+                let expected: Vec<_> = (0..frames.len()).filter(|&place| frames[place].0 == bus).collect();
+                prop_assert_eq!(places, expected);
+            }
+            for it in &out {
+                prop_assert_eq!(it.is_late, it.nanos < it.at, "at once is when it is late, and only then");
+            }
+        }
+
+        #[test]
+        fn disorder_within_the_window_is_mended(
+            steps in proptest::collection::vec((0_usize..3, 1_u64..50, 0_u64..900), 1..200),
+        ) {
+            // Each bus by itself is in order; it is read up to 0.9 s late.
+            let mut buses = [Vec::new(), Vec::new(), Vec::new()];
+            let mut now = 0;
+            for (bus, step, late) in steps {
+                now += step * MS;
+                let read = buses[bus].last().map_or(0, |&(_, read)| read).max(now + late * MS);
+                buses[bus].push((now, read));
+            }
+            let mut frames: Vec<_> =
+                buses.iter().enumerate().flat_map(|(bus, of)| of.iter().map(move |&(at, read)| (read, bus, at))).collect();
+            frames.sort_unstable();
+            let frames: Vec<_> = frames.into_iter().map(|(_, bus, at)| (bus, at)).collect();
+            let out = merged(&frames);
+            prop_assert!(out.is_sorted_by_key(|it| it.nanos));
+            prop_assert!(out.iter().all(|it| !it.is_late && it.at == it.nanos));
+        }
+    }
+}

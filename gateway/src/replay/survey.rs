@@ -1,0 +1,356 @@
+//! What a capture holds, found in a first reading: its buses and their cells, what the cells' own counters say that
+//! it lacks, and the state in force where the replay begins.
+
+use std::collections::BTreeMap;
+
+use protocol::can::Format;
+use protocol::candump::Record;
+use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
+use protocol::packet::{Epoch, data_id};
+use protocol::parameters::Parameter;
+use protocol::time::Micros;
+
+use super::state::State;
+use crate::decode::{Decoded, Decoder};
+
+/// A cell that says nothing for so long is not there, in ns.
+const SILENT_NS: u64 = 600_000_000;
+
+/// A part of a capture, in ns after its first frame.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Part {
+    /// From here on.
+    pub from: u64,
+    /// Up to, and without, here.
+    pub to: Option<u64>,
+}
+
+/// A whole capture.
+#[derive(Debug)]
+pub struct Survey {
+    part: Part,
+    /// When the first frame came, in ns since 1970.
+    pub first: Option<u64>,
+    /// The greatest time.
+    pub last: u64,
+    /// Frames.
+    pub frames: u64,
+    /// Frames that whoever took the capture said to have lost.
+    pub dropped: u64,
+    /// Each bus, in the order of their first frames.
+    pub buses: Vec<Bus>,
+    decoder: Decoder,
+}
+
+/// One bus.
+#[derive(Debug)]
+pub struct Bus {
+    /// Its name in the capture.
+    pub name: String,
+    /// Frames on it.
+    pub frames: u64,
+    /// Whether any of them is CAN FD.
+    pub has_fd: bool,
+    /// What packets travel in, by the first one.
+    pub format: Option<Format>,
+    /// Joint broadcasts on it.
+    pub joints: u64,
+    /// Of these, those that were under way when somebody last asked for a report.
+    at_report: u64,
+    /// The state in force where the part begins.
+    pub state: State,
+    /// The first joints in the part.
+    pub first_joints: Option<(Epoch, Joints)>,
+    /// Sums that cells sent.
+    pub sums: u64,
+    /// Its cells.
+    pub cells: BTreeMap<CellId, Cell>,
+}
+
+/// One cell.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    /// The hash of its configuration where the part begins, if that can be known.
+    pub hash: Known<u16>,
+    /// Whether it measured in the part: then its torques cannot come back.
+    pub measured: bool,
+    /// When it was heard, in ns since 1970: first and last.
+    pub heard: (u64, u64),
+    /// From when to when it said nothing, when that was long.
+    pub silences: Vec<(u64, u64)>,
+    /// Packets that it sent and that are not in the capture.
+    pub unrecorded: u64,
+    /// Joints that it did not take or came too late for.
+    pub untaken: u64,
+    /// Since when it claims its number, which it does after each start.
+    claims: Option<u64>,
+    /// Packets since the last heartbeat, which says how many were sent before it.
+    counted: Option<(u16, u64)>,
+    /// Its counters at the last report, and the joints until then.
+    report: Option<(Heard, u64)>,
+}
+
+/// Something that may have been learnt too late.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Known<T> {
+    /// Nothing has been said of it.
+    No,
+    /// It has changed before anything was said of it.
+    TooLate,
+    /// This.
+    Yes(T),
+}
+
+impl Survey {
+    /// Of a part of a capture that has not been read.
+    #[must_use]
+    pub const fn new(part: Part) -> Self {
+        let decoder = Decoder::new(None);
+        Self { part, first: None, last: 0, frames: 0, dropped: 0, buses: Vec::new(), decoder }
+    }
+
+    /// Takes the next frame.
+    pub fn take(&mut self, record: &Record<'_>) {
+        let nanos = record.time.nanos;
+        let first = *self.first.get_or_insert(nanos);
+        self.last = self.last.max(nanos);
+        self.frames += 1;
+        let begins = first.saturating_add(self.part.from);
+        let ends = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
+        let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+        let bus = self.bus(record.interface);
+        bus.frames += 1;
+        bus.has_fd |= record.frame.format() == Format::Fd;
+        if let Ok(id) = data_id(&record.frame)
+            && let Some(cell) = sender(id)
+        {
+            bus.heard(cell, nanos);
+        }
+        match decoded {
+            Decoded::Message(message) => {
+                bus.format.get_or_insert(record.frame.format());
+                bus.take(&message, nanos, nanos < begins, (begins..ends).contains(&nanos));
+            }
+            Decoded::Foreign(_) | Decoded::Half { .. } | Decoded::Refused { .. } | Decoded::Meaningless { .. } => {}
+        }
+    }
+
+    /// Takes in that the capture is at its end.
+    pub fn finish(&mut self) {
+        let last = self.last;
+        for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
+            cell.end(last);
+        }
+    }
+
+    /// The part, in ns since 1970: from, and up to and without.
+    #[must_use]
+    pub fn bounds(&self) -> (u64, u64) {
+        let first = self.first.unwrap_or(0);
+        let end = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
+        (first.saturating_add(self.part.from), end)
+    }
+
+    /// Where a bus stands, by its name in the capture.
+    #[must_use]
+    pub fn bus_named(&self, name: &str) -> Option<usize> {
+        self.buses.iter().position(|bus| bus.name == name)
+    }
+
+    /// The names of the buses, for people.
+    #[must_use]
+    pub fn names(&self) -> String {
+        self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
+    }
+
+    fn bus(&mut self, name: &str) -> &mut Bus {
+        let at = self.bus_named(name).unwrap_or_else(|| {
+            self.buses.push(Bus::new(name));
+            self.buses.len() - 1
+        });
+        self.buses.get_mut(at).expect("found, or just made")
+    }
+}
+
+/// The cell that an identifier names as the sender.
+pub(super) fn sender(id: Id) -> Option<CellId> {
+    let Node::Cell(cell) = Node::from_byte(id.node) else { return None };
+    match id.kind {
+        Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => Some(cell),
+        Kind::Command | Kind::Configure | Kind::Stimulus => None,
+    }
+}
+
+impl Bus {
+    fn new(name: &str) -> Self {
+        Self {
+            name: name.to_owned(),
+            frames: 0,
+            has_fd: false,
+            format: None,
+            joints: 0,
+            at_report: 0,
+            state: State::default(),
+            first_joints: None,
+            sums: 0,
+            cells: BTreeMap::new(),
+        }
+    }
+
+    fn heard(&mut self, cell: CellId, nanos: u64) {
+        self.cells.entry(cell).or_insert_with(|| Cell::new(nanos)).hear(nanos);
+    }
+
+    fn take(&mut self, message: &Message, nanos: u64, is_before: bool, is_in_part: bool) {
+        if is_before {
+            self.state.take(message);
+        }
+        if let Some(cell) = sender(message.encode().id).and_then(|cell| self.cells.get_mut(&cell)) {
+            cell.count();
+        }
+        match *message {
+            Message::Joints { epoch, joints } => {
+                self.joints += 1;
+                if is_in_part {
+                    self.first_joints.get_or_insert((epoch, joints));
+                }
+            }
+            Message::Report => self.at_report = self.joints,
+            Message::Sum { .. } => self.sums += 1,
+            Message::Network { from: Node::Cell(from), page, .. } => {
+                let (at_report, joints) = (self.at_report, self.joints);
+                let Some(cell) = self.cells.get_mut(&from) else { return };
+                match page {
+                    NetworkPage::Heartbeat(heartbeat) => {
+                        cell.claim(&heartbeat, nanos, joints);
+                        cell.heartbeat(&heartbeat, is_before, is_in_part);
+                    }
+                    NetworkPage::Heard(heard) => cell.report(heard, at_report),
+                    NetworkPage::Refused(_) => {}
+                }
+            }
+            // Configured anew before its first heartbeat: what it computed with before, nobody knows.
+            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. }
+                if number == Parameter::Commit.number() =>
+            {
+                if let Some(cell) = self.cells.get_mut(&from)
+                    && (is_before || cell.hash == Known::No)
+                {
+                    cell.hash = if is_before { Known::No } else { Known::TooLate };
+                }
+            }
+            Message::Sensors { .. }
+            | Message::Halt
+            | Message::Sync
+            | Message::Resume
+            | Message::Torque { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
+        }
+    }
+
+    /// The cells that speak in a part of the capture.
+    pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &Cell)> {
+        let speaks = move |cell: &Cell| cell.heard.1 >= from && cell.heard.0 < to;
+        self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
+    }
+}
+
+impl Cell {
+    const fn new(nanos: u64) -> Self {
+        Self {
+            hash: Known::No,
+            measured: false,
+            heard: (nanos, nanos),
+            silences: Vec::new(),
+            unrecorded: 0,
+            untaken: 0,
+            claims: None,
+            counted: None,
+            report: None,
+        }
+    }
+
+    fn hear(&mut self, nanos: u64) {
+        let last = self.heard.1;
+        if nanos > last.saturating_add(SILENT_NS) {
+            self.silences.push((last, nanos));
+        }
+        self.heard.1 = last.max(nanos);
+    }
+
+    /// The capture is at its end.
+    fn end(&mut self, nanos: u64) {
+        let from = self.claims.unwrap_or(self.heard.1);
+        if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
+            self.silences.push((from, u64::MAX));
+        }
+    }
+
+    /// While it claims its number it answers nothing, and after a start its counters begin anew.
+    fn claim(&mut self, heartbeat: &Heartbeat, nanos: u64, joints: u64) {
+        if heartbeat.state.has(Flags::CLAIMING) {
+            self.claims.get_or_insert(nanos);
+            self.counted = None;
+            self.report = Some((Heard::default(), joints));
+        } else if let Some(since) = self.claims.take() {
+            self.silences.push((since, nanos));
+        }
+    }
+
+    /// One packet more.
+    const fn count(&mut self) {
+        if let Some((_, packets)) = &mut self.counted {
+            *packets += 1;
+        }
+    }
+
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, is_before: bool, is_in_part: bool) {
+        let settled = !heartbeat.state.has(Flags::CLAIMING);
+        if let Some((sent, packets)) = self.counted {
+            let difference = u64::from(heartbeat.sent.wrapping_sub(sent));
+            self.unrecorded += difference.saturating_sub(packets);
+        }
+        // The heartbeat itself is the first packet after what it counts.
+        self.counted = Some((heartbeat.sent, 1));
+        if settled && (is_before || self.hash == Known::No) {
+            self.hash = Known::Yes(heartbeat.configuration);
+        }
+        self.measured |= settled && is_in_part && !heartbeat.state.has(Flags::TEST_MODE);
+    }
+
+    fn report(&mut self, heard: Heard, joints: u64) {
+        if let Some((before, joints_before)) = self.report {
+            let taken = heard.joints.wrapping_sub(before.joints);
+            let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
+            let known = u64::from(taken) + u64::from(repeated);
+            self.untaken += joints.saturating_sub(joints_before).saturating_sub(known);
+        }
+        self.report = Some((heard, joints));
+    }
+
+    /// Whether it said nothing for long around a time, in ns since 1970.
+    #[must_use]
+    pub fn is_silent_at(&self, nanos: u64) -> bool {
+        nanos < self.heard.0
+            || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
+    }
+}
+
+/// Whether a frame is of the gateway's side: a command, configuration, a stimulus.
+#[must_use]
+pub const fn is_input(id: Id) -> bool {
+    match id.kind {
+        Kind::Command | Kind::Configure | Kind::Stimulus => true,
+        Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => false,
+    }
+}
+
+/// Whether a frame is of a broadcast of joints, or of half of one.
+#[must_use]
+pub fn is_joints(id: Id) -> bool {
+    id == Id::command(Command::Joints)
+}
