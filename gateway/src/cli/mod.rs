@@ -7,6 +7,7 @@ mod dump;
 mod frame;
 mod output;
 mod print;
+mod replay;
 mod run;
 mod skin;
 
@@ -29,6 +30,7 @@ enum Command {
     Demo(run::Demo),
     Run(run::Run),
     Dump(dump::Dump),
+    Replay(replay::Replay),
     Frame(frame::Frame),
     Ack(ack::Ack),
     Skin(skin::Skin),
@@ -41,6 +43,7 @@ impl Command {
             Self::Demo(command) => command.run(),
             Self::Run(command) => command.run(),
             Self::Dump(command) => command.run(),
+            Self::Replay(command) => command.run(),
             Self::Frame(command) => command.run(),
             Self::Ack(command) => command.run(),
             Self::Skin(command) => command.run(),

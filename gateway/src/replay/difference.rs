@@ -90,7 +90,7 @@ impl Difference {
             What::Acceleration => (Kind::Sensors, 1),
         };
         let packet = Packet { id: Id::new(kind, Node::Cell(self.cell)), words, epoch, count };
-        Message::decode(&packet).map_or_else(|error| error.to_string(), |message| meaning(message))
+        Message::decode(&packet).map_or_else(|error| error.to_string(), meaning)
     }
 
     fn answered(&self, (tag, answer): (u8, Answer)) -> String {
@@ -171,7 +171,8 @@ mod tests {
                 now: Some([-1074, 3193, 0, 0, 0, 0]),
             },
         };
-        let expected = "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
+        let expected =
+            "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
   recorded  torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm
   now       torque 12 epoch 7: -0.2622 0.7795 0.0000 0.0000 0.0000 0.0000 Nm
   joint 1: 1 step more (0.0002 Nm), joint 2: 2 steps less (0.0005 Nm)";

@@ -187,7 +187,15 @@ impl Judge {
         expects: bool,
     ) -> Self {
         let lanes = buses.into_iter().map(|(name, cells)| Lane::new(name, cells)).collect();
-        Self { lanes, expects, is_muted: false, first_nanos, tally: Tally::default(), first: None, rival: None }
+        Self {
+            lanes,
+            expects,
+            is_muted: false,
+            first_nanos,
+            tally: Tally::default(),
+            first: None,
+            rival: None,
+        }
     }
 
     /// Takes in that the capture has joints next; returns the number of their round on their bus, if they will be
@@ -206,7 +214,9 @@ impl Judge {
     /// Takes in a reply of the capture. `is_in_part` says whether it stands in the part that is replayed.
     pub fn record(&mut self, lane: usize, message: &Message, is_in_part: bool) {
         let expects = self.expects;
-        let (Some(lane), tally) = (self.lanes.get_mut(lane).filter(|_| expects), &mut self.tally) else { return };
+        let (Some(lane), tally) = (self.lanes.get_mut(lane).filter(|_| expects), &mut self.tally) else {
+            return;
+        };
         if let (Message::Configured { from, tag, answer }, true) = (*message, is_in_part)
             && is_compared(answer)
         {
@@ -340,9 +350,9 @@ impl Judge {
     /// Cells that are done with the joints announced last, so that progress can be seen.
     #[must_use]
     pub fn done(&self, lane: usize) -> usize {
-        self.lanes.get(lane).map_or(0, |lane| {
-            lane.roll.values().filter(|present| lane.has_done(present)).count()
-        })
+        self.lanes
+            .get(lane)
+            .map_or(0, |lane| lane.roll.values().filter(|present| lane.has_done(present)).count())
     }
 
     /// Gives up those that are not done; returns who they are.
@@ -416,14 +426,7 @@ impl Judge {
         self.first.as_ref()
     }
 
-    fn note(
-        &mut self,
-        lane: usize,
-        how: How,
-        cell: CellId,
-        round: Option<(u64, Epoch, u64)>,
-        said: Said,
-    ) {
+    fn note(&mut self, lane: usize, how: How, cell: CellId, round: Option<(u64, Epoch, u64)>, said: Said) {
         if self.first.is_some() {
             return;
         }
@@ -631,7 +634,8 @@ impl Lane {
 
     /// The cells that are waited for.
     fn undone(&self) -> impl Iterator<Item = CellId> {
-        let waits = |present: &Present| present.is_settled() && !present.is_given_up && !self.has_done(present);
+        let waits =
+            |present: &Present| present.is_settled() && !present.is_given_up && !self.has_done(present);
         self.roll.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
     }
 }

@@ -62,7 +62,10 @@ pub trait Stage {
     /// Waits until the cells of a bus have answered.
     fn wait_for_answers(&mut self, lane: usize, open: &Open);
     /// Brings about a state, bus by bus.
-    fn restore(&mut self, states: &[(usize, Vec<Message>)]);
+    ///
+    /// # Errors
+    /// When the cells are then not as they have to be, or a bus has ended.
+    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String>;
     /// The replay is there, in ns after its first frame.
     fn show(&mut self, at: u64);
 }
@@ -172,7 +175,7 @@ impl Player {
                 Next::Step(Step::Restore(_)) => {
                     self.wait_for_all(stage);
                     if let Some(Step::Restore(states)) = feed.take() {
-                        stage.restore(&states);
+                        self.played.failure = stage.restore(&states).err();
                         self.origin = None;
                     }
                 }
@@ -238,7 +241,8 @@ impl Player {
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
             let Next::Step(Step::Frame(next)) = feed.peek() else { break };
             let next = *next;
-            let waits = self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
+            let waits =
+                self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
             let deadline = self.deadline(&next, now);
             if next.lane != lane || waits || deadline.is_some_and(|deadline| deadline > now) {
                 break;
@@ -252,10 +256,9 @@ impl Player {
         self.batch.extend(sync.into_iter().flatten());
         let sent = stage.send(lane, &self.batch);
         self.account(lane, frames, sent, stage);
-        if self.syncs.is_some() && !self.down.get(lane).copied().unwrap_or(false) {
-            if let (Some(place), Some(_)) = (self.open.get_mut(lane), open) {
-                *place = open;
-            }
+        let is_down = self.down.get(lane).copied().unwrap_or(false);
+        if let Some(place) = self.open.get_mut(lane).filter(|_| self.syncs.is_some() && !is_down) {
+            *place = open.or(*place);
         }
     }
 
@@ -275,7 +278,9 @@ impl Player {
     }
 
     fn account(&mut self, lane: usize, frames: usize, sent: Sent, stage: &mut impl Stage) {
-        let (Some(tally), Some(down)) = (self.played.lanes.get_mut(lane), self.down.get_mut(lane)) else { return };
+        let (Some(tally), Some(down)) = (self.played.lanes.get_mut(lane), self.down.get_mut(lane)) else {
+            return;
+        };
         let (taken, is_down, failure) = match sent {
             Sent::All => (frames, false, None),
             Sent::Full(taken) => (taken.min(frames), false, None),

@@ -208,7 +208,8 @@ impl<'a> Reel<'a> {
         self.cut
     }
 
-    fn skip(&mut self, reason: &'static str) {
+    /// Counts something that is not sent.
+    pub fn skip(&mut self, reason: &'static str) {
         *self.cut.skipped.entry(reason).or_default() += 1;
     }
 

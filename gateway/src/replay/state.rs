@@ -13,7 +13,9 @@ use std::collections::VecDeque;
 
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State as Flags};
+use protocol::message::{
+    From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State as Flags,
+};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 
@@ -154,7 +156,8 @@ impl State {
     /// taken it into use; so what is kept grows with the commits, and with nothing else.
     fn write(&mut self, to: Node, number: u8, message: Message) {
         let commit = Parameter::Commit.number();
-        let since_commit = self.writes.iter().rposition(|(_, number, _)| *number == commit).map_or(0, |at| at + 1);
+        let since_commit =
+            self.writes.iter().rposition(|(_, number, _)| *number == commit).map_or(0, |at| at + 1);
         let stale = |(at, write): (usize, &(Node, u8, Message))| {
             let over = write.0 == to && write.1 == number && number != commit;
             let volatile = number == Parameter::Mode.number();
@@ -171,6 +174,12 @@ impl State {
     pub fn is_fresh(&self) -> bool {
         let felt = self.cells.iter().any(|cell| cell.pages().next().is_some() || !cell.pending.is_empty());
         !felt && self.writes.is_empty() && !self.halted && self.joints.is_none()
+    }
+
+    /// Whether new parameters were taken into use.
+    #[must_use]
+    pub fn configures(&self) -> bool {
+        self.writes.iter().any(|(_, number, _)| *number == Parameter::Commit.number())
     }
 
     /// What has to be said so that `cells` are in this state; `next` are the joints that come first then, for a bus
@@ -306,7 +315,8 @@ mod tests {
             tag: 0,
             request: Request::Write { number, words: [word, 0, 0, 0, 0, 0] },
         };
-        let said = [write(1, 1), write(1, 2), write(127, 9), write(1, 3), mode(Node::Everyone, 1), write(127, 9)];
+        let said =
+            [write(1, 1), write(1, 2), write(127, 9), write(1, 3), mode(Node::Everyone, 1), write(127, 9)];
         let again = [&said[..], &[mode(Node::Everyone, 1), write(1, 4)]].concat();
         let expected = [
             write(1, 2),
@@ -322,7 +332,8 @@ mod tests {
 
     #[test]
     fn what_a_cell_says_of_itself_counts_until_somebody_presses_it() {
-        let says = |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
+        let says =
+            |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
         let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
         assert_eq!(restored(&said), [Message::Resume, joints(0), to(1, From::Next, 1.0), joints(1)]);
     }

@@ -129,10 +129,14 @@ impl Survey {
         }
         match decoded {
             Decoded::Message(message) => {
-                bus.format.get_or_insert(record.frame.format());
+                let format = record.frame.format();
+                bus.format.get_or_insert(format);
                 bus.take(&message, nanos, nanos < begins, (begins..ends).contains(&nanos));
             }
-            Decoded::Foreign(_) | Decoded::Half { .. } | Decoded::Refused { .. } | Decoded::Meaningless { .. } => {}
+            Decoded::Foreign(_)
+            | Decoded::Half { .. }
+            | Decoded::Refused { .. }
+            | Decoded::Meaningless { .. } => {}
         }
     }
 
@@ -335,8 +339,7 @@ impl Cell {
     /// Whether it said nothing for long around a time, in ns since 1970.
     #[must_use]
     pub fn is_silent_at(&self, nanos: u64) -> bool {
-        nanos < self.heard.0
-            || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
+        nanos < self.heard.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
     }
 }
 

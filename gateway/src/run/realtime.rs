@@ -40,7 +40,7 @@ pub fn prepare() -> Granted {
 }
 
 /// The same for a receiver's thread, which may be a little late.
-pub(super) fn prepare_receiver() {
+pub(crate) fn prepare_receiver() {
     super::io::set_fifo(RECEIVER_PRIORITY);
 }
 
@@ -52,7 +52,7 @@ pub fn now() -> u64 {
 }
 
 /// Sleeps until the monotonic clock reads `deadline` ns; a signal wakes nobody early.
-fn sleep_until(deadline: u64) {
+pub(crate) fn sleep_until(deadline: u64) {
     let seconds = i64::try_from(deadline / 1_000_000_000).unwrap_or(i64::MAX);
     let nanos = i64::try_from(deadline % 1_000_000_000).unwrap_or(0);
     let until = Timespec { tv_sec: seconds, tv_nsec: nanos };

@@ -1,0 +1,241 @@
+//! The stage of a real replay: the machine's clock and open buses.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, BusError};
+use protocol::can::{Format, Frame};
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, Request, State as Flags};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Parameter;
+
+use super::hall::{Hall, Voice};
+use super::player::{Open, Sent, Stage};
+use super::start::Checks;
+use crate::run::realtime;
+
+/// How often it is looked whether somebody has said stop.
+const LOOK_NS: u64 = 100_000_000;
+/// How long it is waited for the next step, or an interface that is down.
+const PAUSE: Duration = Duration::from_micros(100);
+const DOWN: Duration = Duration::from_millis(50);
+/// Cells of which none has answered for so long are given up.
+const PATIENCE: Duration = Duration::from_secs(3);
+/// Joints are asked again so often when cells were too late for them.
+const ASK_AGAIN: u32 = 4;
+
+/// One bus.
+#[derive(Debug)]
+pub(super) struct Lane {
+    pub(super) bus: Arc<Bus>,
+    pub(super) format: Format,
+}
+
+impl Lane {
+    pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
+        message.encode().frames(self.format)
+    }
+}
+
+/// The machine's clock, and buses.
+#[derive(Debug)]
+pub(super) struct Live {
+    pub(super) lanes: Arc<Vec<Lane>>,
+    pub(super) hall: Arc<Hall>,
+    pub(super) voice: Voice,
+    /// How long before its time a frame is waited for by spinning, in ns.
+    pub(super) spin_ns: u64,
+    /// Whether nothing is lost by waiting for an interface that is down.
+    pub(super) may_wait: bool,
+    pub(super) expects: bool,
+    /// What has to hold before the first frame is sent.
+    pub(super) checks: Checks,
+    /// Cells that did not answer in lockstep, by bus.
+    pub(super) silent: Vec<(usize, CellId)>,
+    /// Joints that were asked again.
+    pub(super) asked_again: u64,
+    pub(super) down: Vec<bool>,
+}
+
+impl Stage for Live {
+    fn now(&self) -> u64 {
+        realtime::now()
+    }
+
+    fn wait_until(&mut self, at: u64) {
+        let asleep = at.saturating_sub(self.spin_ns);
+        while !self.hall.is_over() {
+            let now = realtime::now();
+            if now >= asleep {
+                break;
+            }
+            realtime::sleep_until(asleep.min(now + LOOK_NS));
+        }
+        while realtime::now() < at && !self.hall.is_over() {
+            core::hint::spin_loop();
+        }
+    }
+
+    fn pause(&mut self) {
+        std::thread::sleep(PAUSE);
+    }
+
+    fn is_over(&self) -> bool {
+        self.hall.is_over()
+    }
+
+    fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch) {
+        self.hall.judge().announce(lane, round, epoch);
+    }
+
+    fn send(&mut self, index: usize, frames: &[Frame]) -> Sent {
+        let (Some(lane), Some(down)) = (self.lanes.get(index), self.down.get_mut(index)) else {
+            return Sent::All;
+        };
+        let sent = lane.bus.send(frames);
+        let taken = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
+        self.hall.sent.fetch_add(taken as u64, Ordering::Relaxed);
+        let name = lane.bus.name();
+        if *down && taken > 0 {
+            *down = false;
+            self.voice.say(format!("{name} works again"));
+        }
+        match sent.map_err(|error| error.cause) {
+            Ok(()) => Sent::All,
+            Err(BusError::Full { .. }) => Sent::Full(taken),
+            Err(error @ BusError::Down { .. }) => {
+                if !*down {
+                    *down = true;
+                    self.hall.judge().is_down(index);
+                    self.voice.say(format!("{error}; what is due meanwhile is lost, and counted"));
+                }
+                if self.may_wait {
+                    std::thread::sleep(DOWN);
+                }
+                Sent::Down(taken)
+            }
+            Err(error) => Sent::Ended(taken, error.to_string()),
+        }
+    }
+
+    fn was_not_sent(&mut self, lane: usize, round: u64) {
+        self.hall.judge().was_not_sent(lane, round);
+    }
+
+    fn wait_for_answers(&mut self, lane: usize, open: &Open) {
+        self.wait_until_done(lane);
+        let Some(round) = open.round.filter(|_| self.expects) else { return };
+        // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
+        // is slower than that. They are asked again under the epoch before, and then under their own.
+        for again in 0..ASK_AGAIN {
+            if self.hall.is_over() || self.hall.judge().unanswered(lane, round) == 0 {
+                return;
+            }
+            let epoch = if again % 2 == 0 { open.epoch.plus(u8::MAX) } else { open.epoch };
+            self.asked_again += 1;
+            self.hall.judge().announce(lane, Some(round), epoch);
+            let joints = Message::Joints { epoch, joints: open.joints };
+            if self.tell(lane, &[joints, Message::Sync]).is_err() {
+                return;
+            }
+            self.wait_until_done(lane);
+        }
+    }
+
+    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String> {
+        for (lane, messages) in states {
+            self.settle(*lane)?;
+            self.hall.judge().mute(true);
+            let mut all = self.forgetting(*lane);
+            all.extend_from_slice(messages);
+            for message in &all {
+                if let Message::Joints { epoch, .. } = *message {
+                    self.hall.judge().announce(*lane, None, epoch);
+                }
+                self.tell(*lane, core::slice::from_ref(message))?;
+            }
+            self.settle(*lane)?;
+            self.hall.judge().mute(false);
+        }
+        self.checks.hashes(&self.hall.judge())
+    }
+
+    fn show(&mut self, at: u64) {
+        self.hall.at.store(at, Ordering::Relaxed);
+    }
+}
+
+impl Live {
+    /// What makes the cells of a bus that are there forget what they felt, and obey what comes.
+    fn forgetting(&self, lane: usize) -> Vec<Message> {
+        let judge = self.hall.judge();
+        let obeys = |cell: &super::judge::Present| {
+            cell.is_settled() && cell.heartbeat.is_some_and(|heartbeat| heartbeat.state.has(Flags::TEST_MODE))
+        };
+        let obeying: Vec<_> =
+            judge.present(lane).filter(|(_, cell)| obeys(cell)).map(|(cell, _)| cell).collect();
+        obeying.into_iter().map(|cell| mode(Node::Cell(cell), true)).collect()
+    }
+
+    /// Sends messages of this replay's own.
+    fn tell(&self, lane: usize, messages: &[Message]) -> Result<(), String> {
+        let Some(line) = self.lanes.get(lane) else { return Ok(()) };
+        let frames: Vec<_> = messages.iter().flat_map(|message| line.frames(message)).collect();
+        match line.bus.send(&frames).map_err(|error| error.cause) {
+            Ok(()) => Ok(()),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// Waits until the cells of a bus have done all that was sent so far.
+    pub(super) fn settle(&mut self, lane: usize) -> Result<(), String> {
+        self.hall.judge().announce_again(lane);
+        self.tell(lane, &[Message::Sync])?;
+        self.wait_until_done(lane);
+        Ok(())
+    }
+
+    /// Asks for counters, and waits for them.
+    pub(super) fn report(&mut self, lane: usize) -> Result<(), String> {
+        self.hall.judge().announce_again(lane);
+        self.tell(lane, &[Message::Report, Message::Sync])?;
+        self.wait_until_done(lane);
+        Ok(())
+    }
+
+    fn wait_until_done(&mut self, lane: usize) {
+        let (mut done, mut progress) = (0, Instant::now());
+        let mut judge = self.hall.judge();
+        while !judge.is_done(lane) && !self.hall.is_over() {
+            let now = judge.done(lane);
+            if now != done {
+                (done, progress) = (now, Instant::now());
+            }
+            if progress.elapsed() > PATIENCE {
+                let late = judge.give_up(lane);
+                self.silent.extend(late.iter().map(|cell| (lane, *cell)));
+                let name = self.lanes.get(lane).map_or("", |lane| lane.bus.name());
+                let (cells, plural) = (super::start::names(&late), if late.len() == 1 { "" } else { "s" });
+                let verb = if late.len() == 1 { "does" } else { "do" };
+                self.voice.say(format!(
+                    "cell{plural} {cells} on {name} {verb} not answer within {} s: the replay goes on without",
+                    PATIENCE.as_secs()
+                ));
+                return;
+            }
+            judge = self.hall.wait(judge, Duration::from_millis(20));
+        }
+    }
+}
+
+/// The message that makes cells obey stimuli, or measure; either way they forget all stimuli.
+pub(super) fn mode(to: Node, obeys: bool) -> Message {
+    let mut words = [0; WORDS];
+    if let Some(word) = words.first_mut() {
+        *word = i16::from(obeys);
+    }
+    let request = Request::Write { number: Parameter::Mode.number(), words };
+    Message::Configure { to, tag: 0, request }
+}
