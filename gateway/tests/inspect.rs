@@ -1,4 +1,4 @@
-//! `gateway dbc` as a process.
+//! `gateway dbc` and the parts of `gateway dump` that are not lines, as processes.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -85,4 +85,76 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     assert_eq!(said, expected);
     let said = refusal(folder, "dbc one.toml --joined", 2);
     assert_eq!(said, "gateway: --joined is for classic buses; on vcan0 a packet is one FD frame");
+}
+
+/// Where a golden log is.
+fn golden(name: &str) -> String {
+    format!("{}/../protocol/tests/golden/{name}", env!("CARGO_MANIFEST_DIR"))
+}
+
+#[test]
+fn a_capture_in_numbers_is_a_table_or_an_object() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let log = "(1.000000) vcan0 001##500001CCFBE28F5C608C000000706BE4E\n\
+               (1.016000) vcan0 20C##5CDFB7B0C000000000000000007014157\n\
+               DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket (total drops 12)\n\
+               (1.020000) vcan0 20C##5CDFB7B0C000000000000000007014158\n\
+               (1.000000) can1 12345678#\n";
+    std::fs::write(folder.join("small.log"), log).unwrap();
+    let Output { status, stdout, stderr } = gateway(folder, "dump small.log --stats --json");
+    let complaint = "small.log:3: 12 frames are missing here: candump lost them\n";
+    assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(0), Ok(complaint)));
+    let numbers: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
+    assert_eq!((&numbers["format"], &numbers["frames"]), (&"candump log".into(), &4.into()));
+    assert_eq!(numbers["times_backwards"], 1);
+    let bus = &numbers["buses"][0];
+    assert_eq!(
+        (&bus["bus"], &bus["dropped"], &bus["refused"]["crc"]),
+        (&"vcan0".into(), &12.into(), &1.into())
+    );
+    assert_eq!((&bus["epochs"]["first"], &bus["cells"][0]["torques"]), (&7.into(), &1.into()));
+    assert_eq!(numbers["buses"][1]["refused"]["extended"], 1);
+    let table = String::from_utf8(gateway(folder, "dump small.log --stats").stdout).unwrap();
+    for part in [
+        "small.log",
+        "candump log, 0.020 s",
+        "4 frames",
+        "12 ",
+        "1 CRC",
+        "1 29-bit identifier",
+        "7 to 7",
+        "7..7",
+    ] {
+        assert!(table.contains(part), "{part}: {table}");
+    }
+    let said = refusal(folder, "dump small.log --stats --kind torque", 2);
+    assert_eq!(said, "gateway: the argument '--stats' cannot be used with '--kind <KIND>'; try '--help'");
+}
+
+#[test]
+fn contacts_alone_are_shown_and_json_is_one_object_a_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let all = output(folder.path(), &format!("dump {} --json", golden("document.log")));
+    let touches = output(folder.path(), &format!("dump {} --json --contact", golden("document.log")));
+    let kinds = |text: &str| {
+        let objects = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+        objects.map(|object| object["kind"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(kinds(&all).len(), 21);
+    assert_eq!(kinds(&touches), ["torque", "stimulus", "torque"]);
+}
+
+#[test]
+fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let log = "(1.000000) vcan0 002##50000000000000000000000000000632A\n(1.000000) vcan0 12#11\n(1.0) x\n";
+    std::fs::write(folder.join("odd.log"), log).unwrap();
+    let Output { status, stdout, stderr } = gateway(folder, "dump odd.log --strict");
+    let said = "gateway: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits\n";
+    assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(1), Ok(said)));
+    assert_eq!(std::str::from_utf8(&stdout).unwrap().lines().count(), 1);
+    let Output { status, stdout, .. } = gateway(folder, "dump odd.log");
+    assert_eq!((status.code(), std::str::from_utf8(&stdout).unwrap().lines().count()), (Some(0), 1));
 }

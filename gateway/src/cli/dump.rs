@@ -1,6 +1,8 @@
 //! `gateway dump`.
 
-use std::fmt::Write as _;
+mod show;
+mod table;
+
 use std::fs::File;
 use std::io::{self, BufWriter, IsTerminal, Read, Write};
 use std::os::fd::AsFd;
@@ -10,34 +12,40 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
-use gateway::decode::lines::Lines;
+use gateway::capture::{self, Entry, Extras, NoteKind, Reader};
+use gateway::decode::Decoder;
 use gateway::decode::pick::{self, Pick, Wanted};
-use gateway::decode::{Decoded, Decoder};
+use gateway::decode::stats::Report;
 use protocol::bus::{Bus, BusError, Choice, Inbox, Options};
-use protocol::can::{self, EXTENDED_MASK, Frame};
-use protocol::candump::{self, Direction, Line, Record, Timestamp};
+use protocol::can::{self, EXTENDED_MASK};
+use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
-use protocol::time::Micros;
-use protocol::usage::{Failure, written};
+use protocol::usage::{Failure, print, written};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use serde::Serialize;
 
+use self::show::{Flow, How, Show};
 use super::output;
 
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(200);
 
-/// Show what is on a bus, or in a candump log, in words beside the raw frames
+/// Show what is on a bus or in a capture, in words beside the raw frames
 ///
 /// One line a frame: the frame as `candump -L` prints it, a tab, a verdict (ok; half, the first frame of two on
 /// a classic bus; foreign, length, CRC or meaning when it is refused), and what the frame says. So `cut -f1`
-/// gives the log back. Lines of a log that cannot be read are named on standard error, and the rest is shown.
+/// gives a candump log. A capture is a candump log or an MCAP recording; what cannot be read of it is named on
+/// standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with
+/// --stats there are tables at the end instead.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway dump vcan0 --kind torque --node 12
   gateway dump run.log --kind joints,sync --from 2 --to 2.5
+  gateway dump run.mcap --contact --json | jq -c 'select(.kind == \"torque\") | [.node, .epoch, .values.torque_nm]'
+  gateway dump can0 --stats --to 10
   candump -L can0 | gateway dump - --max 100")]
 pub(crate) struct Dump {
-    /// A candump log when there is a file of this name, - for standard input, else a bus
+    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else a bus
     #[arg(value_name = "BUS|FILE")]
     source: PathBuf,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
@@ -47,15 +55,31 @@ pub(crate) struct Dump {
     /// Only packets from or to these: a cell's number, gateway, everyone
     #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node)]
     node: Vec<Node>,
+    /// Only what tells of a touch: torques and sums that are not all zero, stimuli and sensors with a contact force
+    /// or a proximity, heartbeats of active cells
+    #[arg(long)]
+    contact: bool,
     /// Only from so many seconds after the first frame on
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     from: Option<u64>,
     /// Only up to, and without, so many seconds after the first frame; ends a live dump
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
-    /// End after N lines
+    /// End after N frames that are shown or counted
     #[arg(long, value_name = "N")]
     max: Option<u64>,
+    /// One JSON object a line; with --stats, one in all
+    #[arg(long)]
+    json: bool,
+    /// At the end, instead of lines: frames and rates by kind, gaps, losses, refused frames, a line for each cell
+    ///
+    /// A live bus is counted until --to, --max or Ctrl-C. Frames that the filters leave out are not counted, and
+    /// what needs them (what is missed, what is lost) would be wrong; so only --from, --to and --max go with it.
+    #[arg(long, conflicts_with_all = ["kind", "node", "contact"])]
+    stats: bool,
+    /// End at the first line of a log that cannot be read
+    #[arg(long)]
+    strict: bool,
     /// What packets travel in; auto takes each frame for what it is
     #[arg(long, value_enum, default_value = "auto")]
     format: Format,
@@ -100,18 +124,79 @@ impl Dump {
         let out = io::stdout();
         let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         let colour = out.is_terminal() && !no_color;
-        let printer = Printer::new(BufWriter::new(out.lock()), &self, colour);
+        let how = match (self.stats, self.json) {
+            (true, _) => How::Stats(Box::default()),
+            (false, true) => How::Json,
+            (false, false) => How::Lines { colour },
+        };
+        let format = match self.format {
+            Format::Auto => None,
+            Format::Fd => Some(can::Format::Fd),
+            Format::Classic => Some(can::Format::Classic),
+        };
+        let Self { kind: kinds, node: nodes, from, to, contact, .. } = self;
+        let pick = Pick { kinds, nodes, from, to, contact };
+        let max = self.max.unwrap_or(u64::MAX);
+        let mut show = Show::new(BufWriter::new(out.lock()), Decoder::new(format), pick, how, max);
         let stopped = stopped()?;
-        match file {
-            Some(file) => log(&name, file, printer, &stopped),
+        let (what, extras, done) = match file {
+            Some(file) => {
+                let input = Interruptible { file, stopped: Arc::clone(&stopped) };
+                let mut reader = Reader::from_read(&name, input).map_err(Failure::usage)?;
+                let done = captured(&mut reader, &mut show, &stopped, self.strict);
+                let what = match reader.format() {
+                    capture::Format::Candump => "candump log",
+                    capture::Format::Mcap => "MCAP",
+                };
+                (what, Some(reader.extras().clone()), done)
+            }
             None => {
                 let bus = open(&name, self.bus_kind, self.format).map_err(|error| {
                     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
                 })?;
-                live(&bus, printer, self.to, &stopped)
+                ("live", None, live(&bus, &mut show, to, &stopped))
+            }
+        };
+        written(show.flush())?;
+        let report = show.report();
+        drop(show);
+        if let Some(report) = report {
+            // What was counted is shown whatever ended it.
+            if self.json {
+                print(&as_json(&name, what, &report, extras.as_ref())?)?;
+            } else {
+                print(&table::text(&name, what, &report, extras.as_ref()))?;
             }
         }
+        done
     }
+}
+
+/// The numbers as JSON.
+fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>) -> Result<String, Failure> {
+    #[derive(Serialize)]
+    struct Whole<'a> {
+        source: &'a str,
+        format: &'a str,
+        #[serde(flatten)]
+        report: &'a Report,
+        other_topics: Vec<Topic<'a>>,
+        attachments: Vec<&'a str>,
+    }
+    #[derive(Serialize)]
+    struct Topic<'a> {
+        topic: &'a str,
+        schema: &'a str,
+        messages: u64,
+    }
+    let topics = extras.iter().flat_map(|extras| &extras.topics);
+    let other_topics =
+        topics.map(|topic| Topic { topic: &topic.name, schema: &topic.schema, messages: topic.messages });
+    let attachments = extras.iter().flat_map(|extras| &extras.attachments).map(|(name, _)| name.as_str());
+    let (other_topics, attachments) = (other_topics.collect(), attachments.collect());
+    let whole = Whole { source, format, report, other_topics, attachments };
+    let text = serde_json::to_string_pretty(&whole).map_err(Failure::run)?;
+    Ok(text + "\n")
 }
 
 /// A flag that SIGINT and SIGTERM set.
@@ -133,66 +218,67 @@ fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
     }
 }
 
-/// Whether there is more to be shown.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Flow {
-    More,
-    Enough,
-}
-
-/// Shows a log.
-fn log(
-    name: &str,
-    file: File,
-    mut printer: Printer<impl Write>,
+/// Shows a capture.
+fn captured(
+    reader: &mut Reader,
+    show: &mut Show<impl Write>,
     stopped: &AtomicBool,
+    strict: bool,
 ) -> Result<(), Failure> {
-    let mut lines = Lines::new(Interruptible { file, stopped });
-    let (mut seen, mut frames, mut bad, mut xl) = (0_u64, 0_u64, 0_u64, 0_u64);
+    let name = reader.name().to_owned();
+    let (mut frames, mut bad, mut xl) = (0_u64, 0_u64, 0_u64);
     let done = loop {
-        if lines.is_drained()
-            && let Err(error) = printer.out.flush()
+        if reader.is_drained()
+            && let Err(error) = show.flush()
         {
             break Err(error);
         }
-        let next = lines.next_line().map_err(|error| Failure::run(format!("{name}: {error}")))?;
-        let Some((number, line)) = next else { break Ok(()) };
-        seen = number;
-        let complaint = match line.map_err(|fault| fault.to_string()).map(|line| (line, candump::parse(line)))
-        {
-            Ok((line, Ok(Line::Frame(record)))) => {
+        let Some(entry) = reader.next().map_err(Failure::run)? else { break Ok(()) };
+        let note = match entry {
+            Entry::Frame(record) => {
                 frames += 1;
-                match printer.recorded(line, &record) {
+                match show.frame(&record) {
                     Ok(Flow::More) => continue,
                     Ok(Flow::Enough) => break Ok(()),
                     Err(error) => break Err(error),
                 }
             }
-            Ok((_, Ok(Line::Other))) => continue,
-            Ok((_, Ok(Line::CanXl))) => {
+            Entry::Note(note) => note,
+        };
+        let complaint = match note.kind {
+            NoteKind::Text => continue,
+            NoteKind::CanXl => {
                 xl += 1;
                 continue;
             }
-            Ok((_, Ok(Line::Dropped { frames }))) => {
-                format!("{frames} frames are missing here: candump lost them")
+            NoteKind::Dropped(lost) => {
+                show.dropped(note.interface, lost);
+                format!("{lost} frames are missing here: candump lost them")
             }
-            Ok((_, Err(error))) => {
+            NoteKind::Unreadable(why) => {
                 bad += 1;
-                error.to_string()
-            }
-            Err(fault) => {
-                bad += 1;
-                fault
+                if strict {
+                    return Err(Failure::run(format!("{name}:{}: {why}", note.line)));
+                }
+                why
             }
         };
-        output::note(format_args!("{name}:{number}: {complaint}"));
+        if note.line == 0 {
+            output::note(format_args!("{name}: {complaint}"));
+        } else {
+            output::note(format_args!("{name}:{}: {complaint}", note.line));
+        }
     };
-    written(done.and_then(|()| printer.out.flush()))?;
+    written(done)?;
+    let seen = reader.lines();
     if bad > 0 {
         output::note(format_args!("{name}: {bad} of {seen} lines could not be read"));
     }
     if xl > 0 {
         output::note(format_args!("{name}: CAN XL frames are not shown: {xl}"));
+    }
+    if let Some(what) = &reader.extras().unfinished {
+        output::note(format_args!("{name}: {what}"));
     }
     if frames == 0 && seen > 0 && !stopped.load(Ordering::Relaxed) {
         let like = "its lines are like `(1700000000.123456) vcan0 123#00`";
@@ -206,7 +292,7 @@ fn log(
 /// Shows a bus until somebody says stop, or it is closed.
 fn live(
     bus: &Bus,
-    mut printer: Printer<impl Write>,
+    show: &mut Show<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
 ) -> Result<(), Failure> {
@@ -233,10 +319,13 @@ fn live(
         end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
         let mut received = inbox.frames();
         let flow = received.try_fold(Flow::More, |flow, received| match flow {
-            Flow::More => printer.received(bus.name(), received.at_nanos, &received.frame),
+            Flow::More => {
+                let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
+                show.frame(&Record { time, interface: bus.name(), frame: received.frame, direction: None })
+            }
             Flow::Enough => Ok(Flow::Enough),
         });
-        match flow.and_then(|flow| printer.out.flush().map(|()| flow)) {
+        match flow.and_then(|flow| show.flush().map(|()| flow)) {
             Ok(Flow::More) => {}
             Ok(Flow::Enough) => break Ok(()),
             Err(error) => break Err(error),
@@ -244,6 +333,7 @@ fn live(
     };
     if inbox.dropped() > 0 {
         let (name, dropped) = (bus.name(), inbox.dropped());
+        show.dropped(name, dropped.into());
         output::note(format_args!(
             "{name}: {dropped} frames are missing: they came faster than they were shown"
         ));
@@ -252,12 +342,12 @@ fn live(
 }
 
 /// A file whose reader can be told to stop: then it is at its end.
-struct Interruptible<'a> {
+struct Interruptible {
     file: File,
-    stopped: &'a AtomicBool,
+    stopped: Arc<AtomicBool>,
 }
 
-impl Read for Interruptible<'_> {
+impl Read for Interruptible {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let timeout = Timespec::try_from(LOOK).ok();
         while !self.stopped.load(Ordering::Relaxed) {
@@ -268,85 +358,5 @@ impl Read for Interruptible<'_> {
             }
         }
         Ok(0)
-    }
-}
-
-/// Colours of a terminal.
-const DIM: &str = "\x1b[2m";
-const RED: &str = "\x1b[31m";
-const YELLOW: &str = "\x1b[33m";
-const PLAIN: &str = "\x1b[0m";
-
-/// Decodes, picks and prints frames.
-struct Printer<W> {
-    out: W,
-    decoder: Decoder,
-    pick: Pick,
-    colour: bool,
-    /// Lines that may still be shown.
-    left: u64,
-    /// When the first frame came.
-    first: Option<u64>,
-    raw: String,
-}
-
-impl<W: Write> Printer<W> {
-    fn new(out: W, dump: &Dump, colour: bool) -> Self {
-        let format = match dump.format {
-            Format::Auto => None,
-            Format::Fd => Some(can::Format::Fd),
-            Format::Classic => Some(can::Format::Classic),
-        };
-        let pick = Pick { kinds: dump.kind.clone(), nodes: dump.node.clone(), from: dump.from, to: dump.to };
-        let left = dump.max.unwrap_or(u64::MAX);
-        Self { out, decoder: Decoder::new(format), pick, colour, left, first: None, raw: String::new() }
-    }
-
-    /// Shows a frame of a log, its time as it stands there.
-    fn recorded(&mut self, line: &str, record: &Record<'_>) -> io::Result<Flow> {
-        self.raw.clear();
-        let time = line.split_inclusive(')').next().unwrap_or_default();
-        let way = match record.direction {
-            None => "",
-            Some(Direction::Sent) => " T",
-            Some(Direction::Received) => " R",
-        };
-        // A string takes everything.
-        let _ = write!(self.raw, "{time} {} {}{way}", record.interface, record.frame);
-        self.show(record.interface, record.time.nanos, &record.frame)
-    }
-
-    /// Shows a frame that has just come.
-    fn received(&mut self, interface: &str, at_nanos: u64, frame: &Frame) -> io::Result<Flow> {
-        self.raw.clear();
-        let time = Timestamp { nanos: at_nanos, nine_digits: false };
-        let record = Record { time, interface, frame: *frame, direction: None };
-        let _ = write!(self.raw, "{record}");
-        self.show(interface, at_nanos, frame)
-    }
-
-    fn show(&mut self, bus: &str, nanos: u64, frame: &Frame) -> io::Result<Flow> {
-        if self.left == 0 {
-            return Ok(Flow::Enough);
-        }
-        let first = *self.first.get_or_insert(nanos);
-        let decoded = self.decoder.decode(Micros(nanos / 1_000), bus, frame);
-        if !self.pick.takes(first, nanos, frame) {
-            return Ok(Flow::More);
-        }
-        let raw = &self.raw;
-        if self.colour {
-            let colour = match decoded {
-                Decoded::Foreign(_) | Decoded::Half { .. } => DIM,
-                Decoded::Refused { .. } | Decoded::Meaningless { .. } => RED,
-                Decoded::Message(_) if decoded.is_saturated() => YELLOW,
-                Decoded::Message(_) => PLAIN,
-            };
-            writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{decoded}{PLAIN}")?;
-        } else {
-            writeln!(self.out, "{raw}\t{decoded}")?;
-        }
-        self.left -= 1;
-        Ok(if self.left == 0 { Flow::Enough } else { Flow::More })
     }
 }

@@ -18,28 +18,37 @@ pub(crate) fn summary(summary: &Summary) -> Result<(), Failure> {
 }
 
 /// What is printed: a name, a value, and what it is to be compared with.
-struct Rows(Table);
+pub(super) struct Rows(Table);
 
 impl Rows {
-    fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+    /// A table with this head and no rows, as wide as the terminal and not wider than is good to read.
+    pub(super) fn new(head: [String; 3]) -> Self {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+        if table.width().is_none_or(|width| width > WIDTH) {
+            table.set_width(WIDTH);
+        }
+        table.set_header(head);
+        Self(table)
+    }
+
+    pub(super) const fn table(&self) -> &Table {
+        &self.0
+    }
+
+    pub(super) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         self.0.add_row([name.to_string(), value.to_string(), beside.to_string()]);
     }
 
-    fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+    pub(super) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         self.0.add_row([format!("  {name}"), value.to_string(), beside.to_string()]);
     }
 }
 
 fn table(summary: &Summary) -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    if table.width().is_none_or(|width| width > WIDTH) {
-        table.set_width(WIDTH);
-    }
     let ended = if summary.interrupted { "interrupted" } else { "done" };
     let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
-    table.set_header([summary.skin.clone(), cells, String::new()]);
-    let mut rows = Rows(table);
+    let mut rows = Rows::new([summary.skin.clone(), cells, String::new()]);
     accuracy(&mut rows, summary);
     control(&mut rows, summary);
     for bus in &summary.buses {

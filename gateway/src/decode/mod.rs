@@ -8,16 +8,17 @@
 //! Each line begins with a verdict of one word, by the names under which cells and the gateway count what
 //! they refuse: `ok`, `half` (the first frame of two; classic buses), `foreign`, `length`, `CRC`, `meaning`.
 
-pub mod lines;
+pub mod json;
 pub mod parameter;
 pub mod pick;
+pub mod stats;
 mod text;
 
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q;
 use protocol::id::Id;
-use protocol::message::{Message, MessageError};
-use protocol::packet::{Half, Packet, PacketError, Paired, data_id};
+use protocol::message::{Message, MessageError, NetworkPage, SensorPage, State};
+use protocol::packet::{Half, Packet, PacketError, Paired, WORDS, data_id};
 use protocol::time::Micros;
 
 /// Classic buses whose halves are paired at the same time; beyond them the oldest is forgotten.
@@ -121,6 +122,37 @@ struct Lane {
     bus: String,
     /// By identifier.
     halves: Vec<Half>,
+}
+
+impl Decoded {
+    /// Whether this tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact
+    /// force or a proximity, a heartbeat of an active cell.
+    #[must_use]
+    pub fn is_contact(&self) -> bool {
+        let felt = |page: &SensorPage| match page {
+            SensorPage::Skin(skin) => skin.contact != [Q::ZERO; 3] || skin.proximity != Q::ZERO,
+            SensorPage::Acceleration(_) => false,
+        };
+        match self {
+            Self::Message(message) => match message {
+                Message::Torque { torque, .. } => *torque != [Q::ZERO; WORDS],
+                Message::Sum { torque, .. } => *torque != [Q::ZERO; WORDS],
+                Message::Sensors { page, .. } | Message::Stimulus { page, .. } => felt(page),
+                Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                    heartbeat.state.has(State::ACTIVE)
+                }
+                Message::Network { .. }
+                | Message::Halt
+                | Message::Joints { .. }
+                | Message::Sync
+                | Message::Resume
+                | Message::Report
+                | Message::Configure { .. }
+                | Message::Configured { .. } => false,
+            },
+            Self::Foreign(_) | Self::Half { .. } | Self::Refused { .. } | Self::Meaningless { .. } => false,
+        }
+    }
 }
 
 impl Decoder {

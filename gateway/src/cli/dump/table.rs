@@ -1,0 +1,124 @@
+//! The numbers of a capture as tables.
+
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use gateway::capture::{Extras, Topic};
+use gateway::decode::stats::{BusReport, CellReport, Epochs, Report};
+
+use crate::cli::print::Rows;
+
+/// All of it: what the capture is, each bus, and each bus' cells.
+pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extras>) -> String {
+    let head = format!("{what}, {:.3} s", report.duration_s);
+    let mut rows = Rows::new([name.to_owned(), head, format!("{} frames", report.frames)]);
+    if report.times_backwards > 0 {
+        rows.row("frames before the one before them", report.times_backwards, "times run backwards");
+    }
+    if report.dropped > 0 {
+        rows.row("frames missing", report.dropped, "lost by whoever took the capture");
+    }
+    if report.frames_of_other_buses > 0 {
+        rows.row("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    }
+    for bus in &report.buses {
+        numbers(&mut rows, bus);
+    }
+    if let Some(extras) = extras {
+        beside(&mut rows, extras);
+    }
+    let mut text = format!("{}\n", rows.table());
+    for bus in report.buses.iter().filter(|bus| !bus.cells.is_empty()) {
+        text += &format!("\n{}\n", cells(bus));
+    }
+    text
+}
+
+fn per_s(rate: Option<f64>) -> String {
+    rate.map(|rate| format!("{rate:.1} a second")).unwrap_or_default()
+}
+
+fn numbers(rows: &mut Rows, bus: &BusReport) {
+    rows.section(&bus.bus, format!("{} frames", bus.frames), per_s(bus.frames_per_s));
+    for kind in &bus.kinds {
+        rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s));
+    }
+    let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
+    if let (Some(first), Some(last)) = (first, last) {
+        let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "begun anew")];
+        let odd = odd.map(|(count, what)| format!("{count} {what}")).join(", ");
+        rows.row("epochs", format!("{first} to {last}"), odd);
+    }
+    let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
+    let reasons: Vec<_> = refused.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
+    let total: u64 = refused.iter().map(|(_, count)| count).sum();
+    rows.row("foreign or refused", total, reasons.join(", "));
+    let why = if bus.dropped > 0 { "lost by whoever took the capture" } else { "" };
+    rows.row("frames missing", bus.dropped, why);
+}
+
+/// What an MCAP recording has beside frames.
+fn beside(rows: &mut Rows, extras: &Extras) {
+    if !extras.topics.is_empty() {
+        rows.section("other topics", "messages", "");
+    }
+    for Topic { name, schema, messages } in &extras.topics {
+        rows.row(name, messages, schema);
+    }
+    if !extras.attachments.is_empty() {
+        rows.section("attachments", "bytes", "");
+    }
+    for (name, bytes) in &extras.attachments {
+        rows.row(name, bytes.len(), "");
+    }
+}
+
+/// One line a cell.
+fn cells(bus: &BusReport) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    let heads = [
+        bus.bus.as_str(),
+        "torques",
+        "per s",
+        "epochs",
+        "missed",
+        "twice",
+        "satur.",
+        "beats",
+        "refused",
+        "lost",
+        "starts",
+        "last state",
+    ];
+    table.set_header(heads);
+    for cell in &bus.cells {
+        table.add_row(line(cell));
+    }
+    for column in table.column_iter_mut().take(heads.len() - 1) {
+        column.set_cell_alignment(CellAlignment::Right);
+        column.set_padding((0, 1));
+    }
+    table
+}
+
+fn line(cell: &CellReport) -> [String; 12] {
+    // What is not there is no zero.
+    let some = |count: u64| if count == 0 { String::new() } else { count.to_string() };
+    let epochs = match (cell.first_epoch, cell.last_epoch) {
+        (Some(first), Some(last)) => format!("{first}..{last}"),
+        (_, _) => String::new(),
+    };
+    [
+        cell.node.to_string(),
+        cell.torques.to_string(),
+        cell.torques_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default(),
+        epochs,
+        some(cell.missed),
+        some(cell.repeated),
+        some(cell.saturated),
+        cell.heartbeats.to_string(),
+        cell.refused.map(|refused| refused.to_string()).unwrap_or_default(),
+        some(cell.lost),
+        some(cell.restarts),
+        cell.state.join(" "),
+    ]
+}

@@ -1,0 +1,521 @@
+//! What frames say as JSON: one object a frame, the unit at the end of each key that has one.
+
+use std::io::{self, Write};
+
+use protocol::can::Format;
+use protocol::candump::{Direction, Record};
+use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
+use protocol::id::{Command, Id, Kind};
+use protocol::message::{
+    Answer, From, Heard, Heartbeat, Message, NetworkPage, Refused, Request, SensorPage, State,
+};
+use protocol::packet::{BYTES, PacketError, WORDS};
+use protocol::parameters::Parameter;
+use serde::Serialize;
+
+use super::parameter::{Name, reason};
+use super::{Decoded, Foreign};
+
+/// A frame and what it says.
+#[derive(Serialize)]
+struct Line<'a> {
+    time_ns: u64,
+    bus: &'a str,
+    /// As candump prints it.
+    id: String,
+    raw: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    direction: Option<&'static str>,
+    verdict: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kind: Option<&'static str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    node: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    epoch: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tag: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    values: Option<Values>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    saturated: Option<bool>,
+    /// What the packet says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    crc: Option<String>,
+    /// What its bytes give, when that is something else.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    crc_expected: Option<String>,
+}
+
+/// What the words say, by kind and page.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Values {
+    Joints {
+        position_rad: Vec<f64>,
+    },
+    Torque {
+        torque_nm: [f64; WORDS],
+    },
+    Sum {
+        torque_nm: [f64; WORDS],
+        cells: u8,
+    },
+    Felt(Felt),
+    Stimulus {
+        from_next: bool,
+        #[serde(flatten)]
+        felt: Felt,
+    },
+    Heartbeat {
+        page: &'static str,
+        serial: u32,
+        configuration: String,
+        sent: u16,
+        refused: u16,
+        #[serde(flatten)]
+        state: Flags,
+    },
+    Heard {
+        page: &'static str,
+        joints: u16,
+        joints_skipped: u16,
+        joints_repeated: u16,
+        stimuli: u16,
+        stimuli_late: u16,
+        torques: u16,
+    },
+    Refused {
+        page: &'static str,
+        length: u16,
+        crc: u16,
+        foreign: u16,
+        meaning: u16,
+        incomplete: u16,
+        stimuli: u16,
+    },
+    Read {
+        parameter: String,
+        write: bool,
+    },
+    Write {
+        parameter: String,
+        write: bool,
+        #[serde(flatten)]
+        value: Value,
+    },
+    Has {
+        parameter: String,
+        written: bool,
+        #[serde(flatten)]
+        value: Value,
+    },
+    Refusal {
+        parameter: String,
+        refusal: i16,
+        because: &'static str,
+    },
+}
+
+/// A page of sensors.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Felt {
+    Skin { page: &'static str, force_n: f64, contact_n: [f64; 3], proximity: f64, temperature_c: [f64; 2] },
+    Acceleration { page: &'static str, acceleration_g: [f64; 3] },
+}
+
+/// A state word.
+#[derive(Serialize)]
+struct Flags {
+    state: Vec<&'static str>,
+    joint: u16,
+    version: u16,
+}
+
+/// The words of a parameter.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Value {
+    Identity {
+        serial: u32,
+        identity_version: u16,
+        configuration: String,
+        #[serde(flatten)]
+        state: Flags,
+    },
+    Mount {
+        joint: i16,
+        joints: i16,
+    },
+    Pose {
+        position_m: [f64; 3],
+        normal: [f64; 3],
+    },
+    Contact {
+        alpha_c: f64,
+        alpha_p_n: f64,
+        contact_threshold_n: f64,
+        proximity_threshold: f64,
+        force_threshold_n: f64,
+    },
+    Timing {
+        period_us: u16,
+    },
+    Mode {
+        mode: i16,
+    },
+    Row {
+        a_m: f64,
+        d_m: f64,
+        alpha_rad: f64,
+        theta_offset_rad: f64,
+    },
+    Commit {
+        hash: String,
+    },
+    Unknown {
+        words: [i16; WORDS],
+    },
+}
+
+/// Writes one frame and the end of its line.
+///
+/// # Errors
+/// When `out` fails.
+pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io::Result<()> {
+    let raw = record.frame.to_string();
+    let id = raw.split('#').next().unwrap_or_default().to_owned();
+    let mut line = Line {
+        time_ns: record.time.nanos,
+        bus: record.interface,
+        id,
+        raw,
+        direction: record.direction.map(|direction| match direction {
+            Direction::Sent => "T",
+            Direction::Received => "R",
+        }),
+        verdict: decoded.verdict(),
+        error: None,
+        kind: None,
+        node: None,
+        epoch: None,
+        tag: None,
+        values: None,
+        saturated: None,
+        crc: None,
+        crc_expected: None,
+    };
+    match *decoded {
+        Decoded::Foreign(foreign) => {
+            line.error = Some(match foreign {
+                Foreign::Extended => "29-bit identifier".to_owned(),
+                Foreign::Remote => "remote frame".to_owned(),
+                Foreign::Error => "error frame of the driver".to_owned(),
+            });
+        }
+        Decoded::Half { id, incomplete } => {
+            line.about(id);
+            line.error = incomplete.then(|| "the half before it dropped: incomplete".to_owned());
+        }
+        Decoded::Refused { id, error } => {
+            line.about(id);
+            if let PacketError::Crc { expected, got } = error {
+                (line.crc, line.crc_expected) = (Some(word(got)), Some(word(expected)));
+            }
+            line.error = Some(error.to_string());
+        }
+        Decoded::Meaningless { packet, error } => {
+            line.about(packet.id);
+            line.error = Some(error.to_string());
+            line.crc = Some(word(last_word(record)));
+        }
+        Decoded::Message(message) => {
+            line.about(message.encode().id);
+            line.crc = Some(word(last_word(record)));
+            line.saturated = matches!(message, Message::Torque { .. } | Message::Sum { .. })
+                .then(|| decoded.is_saturated());
+            line.say(&message);
+        }
+    }
+    serde_json::to_writer(&mut *out, &line)?;
+    out.write_all(b"\n")
+}
+
+/// The CRC of a packet: the last two bytes of its only frame, or of its second one.
+fn last_word(record: &Record<'_>) -> u16 {
+    let end = match record.frame.format() {
+        Format::Fd => BYTES,
+        Format::Classic => BYTES / 2,
+    };
+    match record.frame.data().get(end - 2..end) {
+        Some(&[low, high]) => u16::from_le_bytes([low, high]),
+        Some(_) | None => 0,
+    }
+}
+
+fn word(word: u16) -> String {
+    format!("{word:04X}")
+}
+
+impl Line<'_> {
+    /// Who speaks, and of what.
+    fn about(&mut self, id: Id) {
+        let command = Command::from_byte(id.node).filter(|_| id.kind == Kind::Command);
+        self.kind = Some(command.map_or_else(|| id.kind.name(), Command::name));
+        self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
+    }
+
+    fn say(&mut self, message: &Message) {
+        let values = match *message {
+            Message::Halt | Message::Sync | Message::Resume | Message::Report => return,
+            Message::Joints { epoch, joints } => {
+                self.epoch = Some(epoch.0);
+                let positions = joints.positions.iter().take(usize::from(joints.in_use));
+                Values::Joints { position_rad: positions.map(|word| word.to_radians()).collect() }
+            }
+            Message::Sum { from: _, epoch, torque, count } => {
+                self.epoch = Some(epoch.0);
+                Values::Sum { torque_nm: torque.map(Q::to_f64), cells: count }
+            }
+            Message::Torque { from: _, epoch, torque } => {
+                self.epoch = Some(epoch.0);
+                Values::Torque { torque_nm: torque.map(Q::to_f64) }
+            }
+            Message::Sensors { from: _, epoch, page } => {
+                self.epoch = Some(epoch.0);
+                Values::Felt(felt(page))
+            }
+            Message::Network { from: _, epoch, page } => {
+                self.epoch = Some(epoch.0);
+                network(page)
+            }
+            Message::Configure { to: _, tag, request } => {
+                self.tag = Some(tag);
+                match request {
+                    Request::Read { number } => {
+                        Values::Read { parameter: Name(number).to_string(), write: false }
+                    }
+                    Request::Write { number, words } => Values::Write {
+                        parameter: Name(number).to_string(),
+                        write: true,
+                        value: value(number, words),
+                    },
+                }
+            }
+            Message::Configured { from: _, tag, answer } => {
+                self.tag = Some(tag);
+                match answer {
+                    Answer::Value { number, written, words } => Values::Has {
+                        parameter: Name(number).to_string(),
+                        written,
+                        value: value(number, words),
+                    },
+                    Answer::Refused { number, reason: code } => Values::Refusal {
+                        parameter: Name(number).to_string(),
+                        refusal: code,
+                        because: reason(code),
+                    },
+                }
+            }
+            Message::Stimulus { to: _, from, page } => {
+                if let From::Epoch(epoch) = from {
+                    self.epoch = Some(epoch.0);
+                }
+                Values::Stimulus { from_next: from == From::Next, felt: felt(page) }
+            }
+        };
+        self.values = Some(values);
+    }
+}
+
+fn felt(page: SensorPage) -> Felt {
+    match page {
+        SensorPage::Skin(skin) => {
+            let contact_n = skin.contact.map(Q::to_f64);
+            Felt::Skin {
+                page: "skin",
+                force_n: contact_n.iter().sum(),
+                contact_n,
+                proximity: skin.proximity.to_f64(),
+                temperature_c: skin.temperature.map(Q::to_f64),
+            }
+        }
+        SensorPage::Acceleration(xyz) => {
+            Felt::Acceleration { page: "acceleration", acceleration_g: xyz.map(Q::to_f64) }
+        }
+    }
+}
+
+fn network(page: NetworkPage) -> Values {
+    match page {
+        NetworkPage::Heartbeat(Heartbeat { serial, configuration, sent, rejected, state }) => {
+            Values::Heartbeat {
+                page: "heartbeat",
+                serial,
+                configuration: word(configuration),
+                sent,
+                refused: rejected,
+                state: flags(state),
+            }
+        }
+        NetworkPage::Heard(Heard {
+            joints,
+            joints_late,
+            joints_repeated,
+            stimuli,
+            stimuli_late,
+            torques,
+        }) => {
+            let (joints_skipped, page) = (joints_late, "heard");
+            Values::Heard { page, joints, joints_skipped, joints_repeated, stimuli, stimuli_late, torques }
+        }
+        NetworkPage::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
+            Values::Refused { page: "refused", length, crc, foreign, meaning, incomplete, stimuli }
+        }
+    }
+}
+
+fn flags(state: State) -> Flags {
+    let set = State::NAMES.iter().filter(|(bit, _)| state.has(*bit)).map(|(_, name)| *name);
+    Flags { state: set.collect(), joint: state.joint(), version: state.version() }
+}
+
+fn value(number: u8, words: [i16; WORDS]) -> Value {
+    let [a, b, c, d, e, f] = words;
+    let meters = |word| Q1_14::from_bits(word).to_f64();
+    let radians = |word| Q1_14::from_bits(word).to_radians();
+    let newtons = |word| Q5_10::from_bits(word).to_f64();
+    match Parameter::from_number(number) {
+        Some(Parameter::Identity) => {
+            let [low, high, version, hash, state, _] = words.map(i16::cast_unsigned);
+            Value::Identity {
+                serial: u32::from(low) | u32::from(high) << 16,
+                identity_version: version,
+                configuration: word(hash),
+                state: flags(State(state)),
+            }
+        }
+        Some(Parameter::Mount) => Value::Mount { joint: a, joints: b },
+        Some(Parameter::Pose) => {
+            Value::Pose { position_m: [a, b, c].map(meters), normal: [d, e, f].map(meters) }
+        }
+        Some(Parameter::Contact) => Value::Contact {
+            alpha_c: Q3_12::from_bits(a).to_f64(),
+            alpha_p_n: newtons(b),
+            contact_threshold_n: newtons(c),
+            proximity_threshold: meters(d),
+            force_threshold_n: newtons(e),
+        },
+        Some(Parameter::Timing) => Value::Timing { period_us: a.cast_unsigned() },
+        Some(Parameter::Mode) => Value::Mode { mode: a },
+        Some(Parameter::Row(_)) => {
+            Value::Row { a_m: meters(a), d_m: meters(b), alpha_rad: radians(c), theta_offset_rad: radians(d) }
+        }
+        Some(Parameter::Commit) => Value::Commit { hash: word(a.cast_unsigned()) },
+        None => Value::Unknown { words },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::decode::Decoder;
+    use protocol::candump::{self, Line};
+    use protocol::time::Micros;
+    use serde_json::{Value, json};
+
+    const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
+    const CLASSIC: &str = include_str!("../../../protocol/tests/golden/classic.log");
+    const BAD: &str = include_str!("../../../protocol/tests/golden/bad.log");
+
+    /// Each frame's comment in the log, and its object.
+    fn objects(log: &str) -> Vec<(String, Value)> {
+        let mut decoder = Decoder::new(None);
+        let (mut comment, mut all) = ("", Vec::new());
+        for line in log.lines() {
+            match candump::parse(line).unwrap() {
+                Line::Frame(record) => {
+                    let at = Micros(record.time.nanos / 1_000);
+                    let decoded = decoder.decode(at, record.interface, &record.frame);
+                    let mut text = Vec::new();
+                    write(&mut text, &record, &decoded).unwrap();
+                    assert_eq!(text.iter().filter(|&&byte| byte == b'\n').count(), 1);
+                    all.push((comment.to_owned(), serde_json::from_slice(&text).unwrap()));
+                }
+                Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.trim_start_matches("# "),
+            }
+        }
+        all
+    }
+
+    fn object(log: &str, comment: &str) -> Value {
+        let found: Vec<_> = objects(log).into_iter().filter(|(of, _)| of.starts_with(comment)).collect();
+        assert_eq!(found.len(), 1, "{comment}");
+        found[0].1.clone()
+    }
+
+    #[test]
+    fn a_packet_is_an_object_with_units_in_its_keys() {
+        let torque = object(FD, "torque from=254 epoch=255 torque=7.999755859375,-8,");
+        let expected = json!({
+            "time_ns": torque["time_ns"], "bus": "vcan0", "id": "2FE", "raw": torque["raw"], "verdict": "ok",
+            "kind": "torque", "node": 254, "epoch": 255, "saturated": true, "crc": torque["crc"],
+            "values": { "torque_nm": [7.999755859375, -8.0, 7.99951171875, -7.999755859375, 0.0, -0.000244140625] },
+        });
+        assert_eq!(torque, expected);
+        let raw = torque["raw"].as_str().unwrap();
+        let (last, crc) = (&raw[raw.len() - 4..], torque["crc"].as_str().unwrap());
+        assert_eq!(
+            format!("{}{}", &last[2..], &last[..2]),
+            crc,
+            "the last two bytes, least significant first"
+        );
+    }
+
+    #[test]
+    fn every_kind_has_its_values() {
+        let values = |comment| object(FD, comment)["values"].clone();
+        let heartbeat = values("heartbeat from=12 epoch=7 serial=100001 configuration=BEEF sent=4711");
+        let expected = json!({
+            "page": "heartbeat", "serial": 100_001, "configuration": "BEEF", "sent": 4711, "refused": 3,
+            "state": ["configured", "active"], "joint": 2, "version": 1,
+        });
+        assert_eq!(heartbeat, expected);
+        let felt = json!({
+            "page": "skin", "force_n": 1.998046875, "contact_n": [1.0, 0.9990234375, -0.0009765625],
+            "proximity": 1.0, "temperature_c": [25.0, -40.0],
+        });
+        assert_eq!(values("sensors from=12 epoch=9 contact=1,0.9990234375"), felt);
+        let from_next = values("stimulus to=everyone from=next acceleration=0,0,-8");
+        let expected =
+            json!({ "from_next": true, "page": "acceleration", "acceleration_g": [0.0, 0.0, -8.0] });
+        assert_eq!(from_next, expected);
+        let refusal = values("refusal from=12 tag=200 parameter=1 reason=3");
+        let because = "joint k is not 1 to the robot's joints";
+        assert_eq!(refusal, json!({ "parameter": "mount", "refusal": 3, "because": because }));
+        let write = values("write to=254 tag=0 parameter=99 words=1,-1,32767,-32768,0,256");
+        let words = [1, -1, 32_767, -32_768, 0, 256];
+        assert_eq!(write, json!({ "parameter": "parameter 99", "write": true, "words": words }));
+    }
+
+    #[test]
+    fn what_is_no_packet_says_why() {
+        let wrong = object(BAD, "bad crc expected=9C2A got=E74B");
+        assert_eq!((&wrong["verdict"], &wrong["kind"]), (&json!("CRC"), &json!("torque")));
+        assert_eq!((&wrong["crc"], &wrong["crc_expected"]), (&json!("E74B"), &json!("9C2A")));
+        assert_eq!(wrong["error"], json!("CRC E74B, not 9C2A"));
+        let foreign = objects(BAD).into_iter().find(|(_, object)| object["verdict"] == "foreign").unwrap().1;
+        assert_eq!((foreign.get("node"), &foreign["error"]), (None, &json!("29-bit identifier")));
+    }
+
+    #[test]
+    fn two_classic_frames_say_it_at_the_second() {
+        let whole = objects(CLASSIC).into_iter().find(|(_, object)| object["verdict"] == "ok").unwrap().1;
+        let raw = whole["raw"].as_str().unwrap();
+        let crc = whole["crc"].as_str().unwrap();
+        assert!(raw.ends_with(&format!("{}{}", &crc[2..], &crc[..2])), "{whole}");
+    }
+}
