@@ -135,9 +135,9 @@ impl Dump {
             Format::Classic => Some(can::Format::Classic),
         };
         let Self { kind: kinds, node: nodes, from, to, contact, .. } = self;
-        let pick = Pick { kinds, nodes, from, to, contact };
+        let pick = Pick { kinds, nodes, from, to };
         let max = self.max.unwrap_or(u64::MAX);
-        let mut show = Show::new(BufWriter::new(out.lock()), Decoder::new(format), pick, how, max);
+        let mut show = Show::new(BufWriter::new(out.lock()), Decoder::new(format), pick, contact, how, max);
         let stopped = stopped()?;
         let (what, extras, done) = match file {
             Some(file) => {

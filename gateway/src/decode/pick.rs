@@ -7,8 +7,6 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::packet::data_id;
 use thiserror::Error;
 
-use super::Decoded;
-
 /// A kind of frame that is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Wanted {
@@ -68,17 +66,14 @@ pub struct Pick {
     pub from: Option<u64>,
     /// Up to, and without, so many nanoseconds after the first frame.
     pub to: Option<u64>,
-    /// Only what tells of a touch, [`Decoded::is_contact`].
-    pub contact: bool,
 }
 
 impl Pick {
     /// Whether a frame is shown that came at `nanos`, when the first one came at `first`.
     #[must_use]
-    pub fn takes(&self, first: u64, nanos: u64, frame: &Frame, decoded: &Decoded) -> bool {
+    pub fn takes(&self, first: u64, nanos: u64, frame: &Frame) -> bool {
         let id = data_id(frame).ok();
-        let contact = !self.contact || decoded.is_contact();
-        contact && self.takes_time(first, nanos) && self.takes_kind(id) && self.takes_node(id)
+        self.takes_time(first, nanos) && self.takes_kind(id) && self.takes_node(id)
     }
 
     fn takes_time(&self, first: u64, nanos: u64) -> bool {
@@ -115,12 +110,7 @@ impl Pick {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::decode::{Decoder, Foreign};
     use protocol::can::EXTENDED;
-    use protocol::candump::parse_frame;
-    use protocol::time::Micros;
-
-    const NOTHING: Decoded = Decoded::Foreign(Foreign::Extended);
 
     fn frame(id: u32) -> Frame {
         Frame::classic(id, &[]).unwrap()
@@ -135,7 +125,7 @@ mod tests {
                 nodes: nodes.iter().map(|word| node(word).unwrap()).collect(),
                 ..Pick::default()
             };
-            ids.into_iter().filter(|&id| pick.takes(0, 0, &frame(id), &NOTHING)).collect()
+            ids.into_iter().filter(|&id| pick.takes(0, 0, &frame(id))).collect()
         };
         assert_eq!(taken(&[], &[]), ids);
         assert_eq!(taken(&["command"], &[]), [0x000, 0x001]);
@@ -148,30 +138,8 @@ mod tests {
     #[test]
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
         let pick = Pick { from: Some(10), to: Some(20), ..Pick::default() };
-        let taken: Vec<u64> = (95..=125).filter(|&at| pick.takes(100, at, &frame(1), &NOTHING)).collect();
+        let taken: Vec<u64> = (95..=125).filter(|&at| pick.takes(100, at, &frame(1))).collect();
         assert_eq!(taken, (110..120).collect::<Vec<_>>());
-    }
-
-    #[test]
-    fn contact_is_what_tells_of_a_touch() {
-        let pick = Pick { contact: true, ..Pick::default() };
-        let taken = |text: &str| {
-            let frame = parse_frame(text).unwrap();
-            let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
-            assert_eq!(decoded.verdict(), "ok", "{text}");
-            pick.takes(0, 0, &frame, &decoded)
-        };
-        // A torque and the zeros that end a contact; a stimulus and the one that lets go; halt.
-        let frames = [
-            ("20C##1CDFB7B0C000000000000000007014157", true),
-            ("20C##100000000000000000000000008010C2F", false),
-            ("70C##1000400040004000000000000008047DA", true),
-            ("70C##100000000000000000000000000804212", false),
-            ("000##500000000000000000000000000000A6A", false),
-        ];
-        for (text, expected) in frames {
-            assert_eq!(taken(text), expected, "{text}");
-        }
     }
 
     #[test]

@@ -264,6 +264,23 @@ fn saturation_is_noticed() {
 }
 
 #[test]
+fn contact_is_what_tells_of_a_touch() {
+    // A torque and the zeros that end a contact; a stimulus and the one that lets go; halt.
+    let frames = [
+        ("20C##1CDFB7B0C000000000000000007014157", true),
+        ("20C##100000000000000000000000008010C2F", false),
+        ("70C##1000400040004000000000000008047DA", true),
+        ("70C##100000000000000000000000000804212", false),
+        ("000##500000000000000000000000000000A6A", false),
+    ];
+    for (text, expected) in frames {
+        let frame = candump::parse_frame(text).unwrap();
+        let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
+        assert_eq!((decoded.verdict(), decoded.is_contact()), ("ok", expected), "{text}");
+    }
+}
+
+#[test]
 fn memory_is_bounded_whatever_buses_a_log_names() {
     let mut decoder = Decoder::new(None);
     let frame = candump::parse_frame("20C#001000F801000000").unwrap();

@@ -305,7 +305,7 @@ impl Buses {
             if there > most {
                 (most, progress) = (there, Instant::now());
             }
-            if there == wanted.iter().map(BTreeSet::len).sum() || progress.elapsed() > patience {
+            if there == wanted.iter().map(BTreeSet::len).sum::<usize>() || progress.elapsed() > patience {
                 return Ok(());
             }
         }

@@ -42,6 +42,8 @@ pub(super) struct Show<W> {
     out: W,
     decoder: Decoder,
     pick: Pick,
+    /// Only what tells of a touch.
+    contact: bool,
     how: How,
     /// Frames that may still be shown.
     left: u64,
@@ -51,8 +53,8 @@ pub(super) struct Show<W> {
 }
 
 impl<W: Write> Show<W> {
-    pub(super) const fn new(out: W, decoder: Decoder, pick: Pick, how: How, max: u64) -> Self {
-        Self { out, decoder, pick, how, left: max, first: None, raw: String::new() }
+    pub(super) const fn new(out: W, decoder: Decoder, pick: Pick, contact: bool, how: How, max: u64) -> Self {
+        Self { out, decoder, pick, contact, how, left: max, first: None, raw: String::new() }
     }
 
     /// Shows a frame if it is wanted.
@@ -63,7 +65,7 @@ impl<W: Write> Show<W> {
         let nanos = record.time.nanos;
         let first = *self.first.get_or_insert(nanos);
         let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
-        if !self.pick.takes(first, nanos, &record.frame, &decoded) {
+        if !self.pick.takes(first, nanos, &record.frame) || self.contact && !decoded.is_contact() {
             return Ok(Flow::More);
         }
         match &mut self.how {
