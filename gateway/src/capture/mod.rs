@@ -11,6 +11,7 @@
 
 pub mod log;
 mod magic;
+mod mcap;
 mod reader;
 
 pub use reader::{CaptureError, Extras, Format, Reader, Topic};

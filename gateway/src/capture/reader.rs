@@ -10,6 +10,7 @@ use thiserror::Error;
 use super::Entry;
 use super::log::LogReader;
 use super::magic::{self, Kind};
+use super::mcap::{Fault, McapReader};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -43,7 +44,7 @@ pub enum CaptureError {
         remedy: &'static str,
     },
     /// From here on it is not what it was.
-    #[error("{name}: {what}; {entries} entries before that were read")]
+    #[error("{name} is damaged: {what}; {entries} frames and notes before that were read")]
     Damaged {
         /// Its name.
         name: String,
@@ -82,10 +83,12 @@ pub struct Topic {
 pub struct Reader {
     name: String,
     source: Source,
+    entries: u64,
 }
 
 enum Source {
     Log(LogReader),
+    Mcap(Box<McapReader>),
 }
 
 impl fmt::Debug for Reader {
@@ -127,17 +130,11 @@ impl Reader {
         let (name, mut input) = (name.into(), Box::new(input));
         let source = match magic::look(&mut input) {
             Ok((Kind::Text, head)) => Source::Log(LogReader::new(&head, input)),
-            Ok((Kind::Mcap, _)) => {
-                return Err(CaptureError::Other {
-                    name,
-                    what: "an MCAP recording",
-                    remedy: "not read in this version",
-                });
-            }
+            Ok((Kind::Mcap, head)) => Source::Mcap(Box::new(McapReader::new(&head, input))),
             Ok((Kind::Other(what, remedy), _)) => return Err(CaptureError::Other { name, what, remedy }),
             Err(source) => return Err(CaptureError::Io { name, source }),
         };
-        Ok(Self { name, source })
+        Ok(Self { name, source, entries: 0 })
     }
 
     /// Its name, as errors have it.
@@ -151,6 +148,7 @@ impl Reader {
     pub const fn format(&self) -> Format {
         match self.source {
             Source::Log(_) => Format::Candump,
+            Source::Mcap(_) => Format::Mcap,
         }
     }
 
@@ -163,10 +161,16 @@ impl Reader {
         reason = "an entry borrows from the reader; an iterator's cannot"
     )]
     pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
-        let Self { name, source } = self;
-        match source {
+        let Self { name, source, entries } = self;
+        let next = match source {
             Source::Log(log) => log.next().map_err(|source| CaptureError::Io { name: name.clone(), source }),
-        }
+            Source::Mcap(mcap) => mcap.next().map_err(|fault| match fault {
+                Fault::Io(source) => CaptureError::Io { name: name.clone(), source },
+                Fault::Damaged(what) => CaptureError::Damaged { name: name.clone(), what, entries: *entries },
+            }),
+        }?;
+        *entries += u64::from(next.is_some());
+        Ok(next)
     }
 
     /// Lines of a log so far: the number of the last entry's; 0 in an MCAP recording.
@@ -174,6 +178,7 @@ impl Reader {
     pub const fn lines(&self) -> u64 {
         match &self.source {
             Source::Log(log) => log.lines(),
+            Source::Mcap(_) => 0,
         }
     }
 
@@ -183,6 +188,7 @@ impl Reader {
     pub const fn is_drained(&self) -> bool {
         match &self.source {
             Source::Log(log) => log.is_drained(),
+            Source::Mcap(_) => false,
         }
     }
 
@@ -193,6 +199,7 @@ impl Reader {
             Extras { topics: Vec::new(), attachments: Vec::new(), metadata: Vec::new(), unfinished: None };
         match &self.source {
             Source::Log(_) => &NONE,
+            Source::Mcap(mcap) => mcap.extras(),
         }
     }
 }

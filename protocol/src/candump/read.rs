@@ -1,0 +1,255 @@
+//! A place in a line, and what is read from there on.
+
+use super::{Direction, LineError, Timestamp};
+use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, STANDARD_MASK};
+
+/// What a byte is as a hexadecimal digit; [`NONE`] when it is none.
+#[expect(clippy::indexing_slicing, reason = "when this is compiled")]
+const NIBBLES: [u8; 256] = {
+    let mut nibbles = [NONE; 256];
+    let mut value = 0;
+    while value < 16 {
+        nibbles[b"0123456789ABCDEF"[value as usize] as usize] = value;
+        nibbles[b"0123456789abcdef"[value as usize] as usize] = value;
+        value += 1;
+    }
+    nibbles
+};
+const NONE: u8 = 0xFF;
+
+fn nibble(digit: u8) -> Option<u8> {
+    NIBBLES.get(usize::from(digit)).copied().filter(|&nibble| nibble != NONE)
+}
+
+/// The value of two digits; `None` when one is none.
+fn pair(high: u8, low: u8) -> Option<u8> {
+    let [high, low] = [high, low].map(|digit| NIBBLES.get(usize::from(digit)).copied().unwrap_or(NONE));
+    (high | low < 16).then_some(high << 4 | low)
+}
+
+/// The value of eight decimal digits; `None` when one is none.
+fn eight_digits(text: [u8; 8]) -> Option<u64> {
+    let text = u64::from_le_bytes(text);
+    let digits = text ^ 0x3030_3030_3030_3030;
+    // A digit is 0 to 9: neither it nor it and 6 more has a bit in the upper half.
+    if (digits | digits.wrapping_add(0x0606_0606_0606_0606)) & 0xF0F0_F0F0_F0F0_F0F0 != 0 {
+        return None;
+    }
+    // Neighbours are put together: of one digit each, then of two, then of four.
+    let digits = (digits * 10 + (digits >> 8)) & 0x00FF_00FF_00FF_00FF;
+    let digits = (digits * 100 + (digits >> 16)) & 0x0000_FFFF_0000_FFFF;
+    Some((digits * 10_000 + (digits >> 32)) & 0xFFFF_FFFF)
+}
+
+pub(super) struct Cursor<'a> {
+    text: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Cursor<'a> {
+    pub(super) const fn new(text: &'a [u8], at: usize) -> Self {
+        Self { text, at }
+    }
+
+    pub(super) const fn is_at_end(&self) -> bool {
+        self.at >= self.text.len()
+    }
+
+    pub(super) const fn error(&self, expected: &'static str) -> LineError {
+        LineError { column: self.at + 1, expected }
+    }
+
+    fn rest(&self) -> &'a [u8] {
+        self.text.get(self.at..).unwrap_or_default()
+    }
+
+    fn peek(&self) -> Option<u8> {
+        self.text.get(self.at).copied()
+    }
+
+    fn take(&mut self, byte: u8) -> bool {
+        let there = self.peek() == Some(byte);
+        self.at += usize::from(there);
+        there
+    }
+
+    pub(super) fn expect(&mut self, byte: u8, expected: &'static str) -> Result<(), LineError> {
+        if self.take(byte) { Ok(()) } else { Err(self.error(expected)) }
+    }
+
+    /// At least one space.
+    pub(super) fn spaces(&mut self) -> Result<(), LineError> {
+        self.expect(b' ', "a space")?;
+        while self.take(b' ') {}
+        Ok(())
+    }
+
+    /// Up to the next space.
+    pub(super) fn word(&mut self) -> Result<&'a str, LineError> {
+        let rest = self.rest();
+        let len = rest.iter().position(|&byte| byte == b' ').unwrap_or(rest.len());
+        let word = rest.get(..len).and_then(|word| core::str::from_utf8(word).ok());
+        let word = word.filter(|word| !word.is_empty());
+        let word = word.ok_or_else(|| self.error("the name of an interface"))?;
+        self.at += len;
+        Ok(word)
+    }
+
+    /// Decimal digits: their value and how many there are.
+    fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
+        let start = self.at;
+        let mut value = self.rest().first_chunk().copied().and_then(eight_digits).unwrap_or(0);
+        self.at += if value > 0 { 8 } else { 0 };
+        while let Some(digit @ b'0'..=b'9') = self.peek() {
+            let next = value.checked_mul(10).and_then(|value| value.checked_add(u64::from(digit - b'0')));
+            value = next.ok_or_else(|| self.error(expected))?;
+            self.at += 1;
+        }
+        if self.at == start { Err(self.error(expected)) } else { Ok((value, self.at - start)) }
+    }
+
+    pub(super) fn time(&mut self) -> Result<Timestamp, LineError> {
+        let (seconds, _) = self.digits("seconds since 1970")?;
+        self.expect(b'.', "`.` and the fraction of a second")?;
+        let (fraction, digits) = self.digits("6 or 9 digits of a second")?;
+        let nanos = match digits {
+            6 => fraction * 1_000,
+            9 => fraction,
+            _ => return Err(self.error("6 or 9 digits of a second")),
+        };
+        let whole = seconds.checked_mul(1_000_000_000).and_then(|whole| whole.checked_add(nanos));
+        let nanos = whole.ok_or_else(|| self.error("a time before the year 2554"))?;
+        Ok(Timestamp { nanos, nine_digits: digits == 9 })
+    }
+
+    /// A frame, or `None` for CAN XL, whose text is skipped.
+    pub(super) fn frame(&mut self) -> Result<Option<Frame>, LineError> {
+        let expected = "an identifier of 3 or 8 hexadecimal digits";
+        let start = self.at;
+        let mut id = 0_u32;
+        while let Some(digit) = self.peek().and_then(nibble) {
+            id = id.wrapping_shl(4) | u32::from(digit);
+            self.at += 1;
+        }
+        let digits = self.at - start;
+        if digits == 5 && self.rest().starts_with(b"###") {
+            self.at = self.text.len();
+            return Ok(None);
+        }
+        self.expect(b'#', expected)?;
+        let wrong = |expected| LineError { column: start + 1, expected };
+        let id = match digits {
+            3 if id <= STANDARD_MASK => id,
+            3 => return Err(wrong("an 11-bit identifier, at most 7FF")),
+            8 if id & ERROR != 0 && id & (EXTENDED | REMOTE) == 0 => id,
+            8 if id <= EXTENDED_MASK => id | EXTENDED,
+            8 => return Err(wrong("a 29-bit identifier, at most 1FFFFFFF")),
+            _ => return Err(wrong(expected)),
+        };
+        if self.take(b'#') {
+            let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
+            self.at += 1;
+            return self.data(id, Format::Fd, flags).map(Some);
+        }
+        if matches!(self.peek(), Some(b'R' | b'r')) {
+            self.at += 1;
+            return self.remote(id).map(Some);
+        }
+        self.data(id, Format::Classic, 0).map(Some)
+    }
+
+    fn remote(&mut self, id: u32) -> Result<Frame, LineError> {
+        let length = self.peek().and_then(nibble);
+        self.at += usize::from(length.is_some());
+        let frame = Frame::remote(id, length.unwrap_or(0)).map_err(|_| self.error("a length of 0 to 8"))?;
+        self.raw_dlc(frame)
+    }
+
+    fn data(&mut self, id: u32, format: Format, flags: u8) -> Result<Frame, LineError> {
+        let mut data = [0; 64];
+        let mut len = 0;
+        // Bytes without dots between them, as they nearly always are.
+        for (byte, digits) in data.iter_mut().zip(self.rest().as_chunks().0) {
+            let &[high, low] = digits;
+            let Some(value) = pair(high, low) else { break };
+            *byte = value;
+            len += 1;
+        }
+        self.at += 2 * len;
+        loop {
+            self.take(b'.');
+            let Some(high) = self.peek().and_then(nibble) else {
+                break;
+            };
+            self.at += 1;
+            let low = self.peek().and_then(nibble).ok_or_else(|| self.error("the second digit of a byte"))?;
+            self.at += 1;
+            *data.get_mut(len).ok_or_else(|| self.error("at most 64 bytes"))? = high << 4 | low;
+            len += 1;
+        }
+        let frame = Frame::with_data(id, format, flags, data.get(..len).unwrap_or_default());
+        let frame = frame.map_err(|_| self.error("at most 8 bytes in a classic frame"))?;
+        self.raw_dlc(frame)
+    }
+
+    fn raw_dlc(&mut self, frame: Frame) -> Result<Frame, LineError> {
+        if !self.take(b'_') {
+            return Ok(frame);
+        }
+        match self.peek().and_then(nibble) {
+            Some(dlc @ 9..) if frame.len() == 8 && frame.format() == Format::Classic => {
+                self.at += 1;
+                Ok(frame.with_raw_dlc(dlc))
+            }
+            _ => Err(self.error("a raw DLC of 9 to F, of a classic frame of 8 bytes")),
+        }
+    }
+
+    pub(super) fn direction(&mut self) -> Result<Option<Direction>, LineError> {
+        if self.is_at_end() {
+            return Ok(None);
+        }
+        self.spaces()?;
+        match self.rest() {
+            b"T" => Ok(Some(Direction::Sent)),
+            b"R" => Ok(Some(Direction::Received)),
+            _ => Err(self.error("`T`, `R` or the end of the line")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn every_byte_is_a_digit_or_none() {
+        for byte in 0..=u8::MAX {
+            let expected = char::from(byte).to_digit(16).and_then(|value| u8::try_from(value).ok());
+            assert_eq!(nibble(byte), expected);
+            assert_eq!(pair(b'A', byte), expected.map(|value| 0xA0 | value));
+            assert_eq!(pair(byte, b'5'), expected.map(|value| value << 4 | 5));
+        }
+    }
+
+    #[test]
+    fn one_wrong_byte_among_eight_digits_is_found() {
+        for at in 0..8 {
+            for byte in 0..=u8::MAX {
+                let mut text = *b"98765432";
+                text[at] = byte;
+                let expected = byte.is_ascii_digit().then(|| str::from_utf8(&text).unwrap().parse().unwrap());
+                assert_eq!(eight_digits(text), expected, "{text:?}");
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn eight_digits_are_a_number(value in 0_u64..100_000_000) {
+            let text = format!("{value:08}");
+            prop_assert_eq!(eight_digits(*text.as_bytes().first_chunk().unwrap()), Some(value));
+        }
+    }
+}

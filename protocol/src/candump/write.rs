@@ -1,0 +1,146 @@
+//! Text of frames, put together in a buffer of its own and handed on in few pieces.
+
+use core::fmt::{self, Write};
+
+use super::Record;
+use crate::can::{ERROR, EXTENDED_MASK, Format, Frame};
+
+/// Both digits of each byte.
+#[expect(clippy::indexing_slicing, reason = "when this is compiled")]
+const HEX: [[u8; 2]; 256] = {
+    let digits = *b"0123456789ABCDEF";
+    let mut pairs = [[0; 2]; 256];
+    let mut at = 0;
+    while at < 256 {
+        pairs[at] = [digits[at >> 4], digits[at & 0xF]];
+        at += 1;
+    }
+    pairs
+};
+
+/// 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
+const FRAME: usize = 8 + 2 + 1 + 128 + 2;
+/// Two parentheses, 11 digits of seconds before the year 2554, a point, 9 digits, a space.
+const TIME: usize = 2 + 11 + 1 + 9 + 1;
+
+/// Writes one line without its end: single spaces, upper case, no direction.
+///
+/// # Errors
+/// When `out` fails.
+pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
+    let mut time = Text::<TIME>::new();
+    let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
+    time.push(b'(');
+    time.decimal(seconds, 1);
+    time.push(b'.');
+    if record.time.nine_digits {
+        time.decimal(nanos, 9);
+    } else {
+        time.decimal(nanos / 1_000, 6);
+    }
+    time.push(b')');
+    time.push(b' ');
+    out.write_str(time.as_str())?;
+    out.write_str(record.interface)?;
+    out.write_char(' ')?;
+    write_frame(out, &record.frame)
+}
+
+/// Writes a frame alone, as cansend takes it.
+///
+/// # Errors
+/// When `out` fails.
+pub fn write_frame(out: &mut impl Write, frame: &Frame) -> fmt::Result {
+    let mut text = Text::<FRAME>::new();
+    if frame.is_error() || frame.is_extended() {
+        let id = if frame.is_error() { frame.raw_id() & (ERROR | EXTENDED_MASK) } else { frame.id() };
+        for byte in id.to_be_bytes() {
+            text.byte(byte);
+        }
+    } else {
+        let [.., high, low] = frame.id().to_be_bytes();
+        text.digit(high);
+        text.byte(low);
+    }
+    text.push(b'#');
+    match frame.format() {
+        Format::Classic if frame.is_remote() => {
+            text.push(b'R');
+            if !frame.is_empty() {
+                text.digit(frame.len());
+            }
+        }
+        Format::Classic => {}
+        Format::Fd => {
+            text.push(b'#');
+            text.digit(frame.flags());
+        }
+    }
+    for &byte in frame.data() {
+        text.byte(byte);
+    }
+    if frame.raw_dlc() != 0 {
+        text.push(b'_');
+        text.digit(frame.raw_dlc());
+    }
+    out.write_str(text.as_str())
+}
+
+/// ASCII of at most `N` bytes.
+struct Text<const N: usize> {
+    bytes: [u8; N],
+    len: usize,
+}
+
+impl<const N: usize> Text<N> {
+    const fn new() -> Self {
+        Self { bytes: [0; N], len: 0 }
+    }
+
+    fn push(&mut self, byte: u8) {
+        if let Some(place) = self.bytes.get_mut(self.len) {
+            *place = byte;
+            self.len += 1;
+        }
+    }
+
+    /// The last hexadecimal digit of a value.
+    fn digit(&mut self, value: u8) {
+        let [_, digit] = pair(value);
+        self.push(digit);
+    }
+
+    /// Both hexadecimal digits of a value.
+    fn byte(&mut self, value: u8) {
+        if let Some(place) = self.bytes.get_mut(self.len..).and_then(<[u8]>::first_chunk_mut) {
+            *place = pair(value);
+            self.len += 2;
+        }
+    }
+
+    /// A number in so many decimal digits or more.
+    fn decimal(&mut self, value: u64, least: usize) {
+        let mut digits = [b'0'; 20];
+        let (mut rest, mut from) = (value, digits.len());
+        for digit in digits.iter_mut().rev() {
+            if rest == 0 {
+                break;
+            }
+            *digit += u8::try_from(rest % 10).unwrap_or(0);
+            rest /= 10;
+            from -= 1;
+        }
+        for &digit in digits.get(from.min(digits.len() - least)..).unwrap_or_default() {
+            self.push(digit);
+        }
+    }
+
+    fn as_str(&self) -> &str {
+        let text = self.bytes.get(..self.len).and_then(|text| core::str::from_utf8(text).ok());
+        text.expect("ASCII that fits")
+    }
+}
+
+fn pair(value: u8) -> [u8; 2] {
+    HEX.get(usize::from(value)).copied().unwrap_or_default()
+}
