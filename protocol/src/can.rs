@@ -101,15 +101,28 @@ impl Frame {
     /// # Errors
     /// When the data does not fit the format.
     pub fn with_data(id: u32, format: Format, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
+        let mut bytes = [0; 64];
+        if let Some(bytes) = bytes.get_mut(..data.len()) {
+            bytes.copy_from_slice(data);
+        }
+        Self::filled(id, format, flags, bytes, data.len())
+    }
+
+    /// The same with the data in its place already; what is behind `len` has to be 0.
+    pub(crate) fn filled(
+        id: u32,
+        format: Format,
+        flags: u8,
+        data: [u8; 64],
+        len: usize,
+    ) -> Result<Self, FrameError> {
         let max = match format {
             Format::Classic => 8,
             Format::Fd => 64,
         };
-        let too_long = FrameError::Length { got: data.len(), max };
-        let mut frame = Self { id, format, flags, raw_dlc: 0, len: 0, data: [0; 64] };
-        frame.len = u8::try_from(data.len()).ok().filter(|&len| usize::from(len) <= max).ok_or(too_long)?;
-        frame.data.get_mut(..data.len()).ok_or(too_long)?.copy_from_slice(data);
-        Ok(frame)
+        let short = u8::try_from(len).ok().filter(|_| len <= max);
+        let len = short.ok_or(FrameError::Length { got: len, max })?;
+        Ok(Self { id, format, flags, raw_dlc: 0, len, data })
     }
 
     /// A remote frame that asks for `len` bytes.

@@ -91,6 +91,7 @@ pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
 ///
 /// # Errors
 /// When it begins with a parenthesis and is no frame.
+#[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
     let text = trim_end(line);
     if !text.starts_with(b"(") {

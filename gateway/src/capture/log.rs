@@ -143,15 +143,11 @@ pub(super) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
 }
 
 /// What a line is. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
-pub(super) fn read(text: &[u8], long: bool) -> Result<Line<'_>, String> {
+fn read(text: &[u8], long: bool) -> Result<Line<'_>, String> {
     if long {
         return Err(format!("a line of more than {LONGEST} bytes"));
     }
-    match core::str::from_utf8(text) {
-        Ok(text) => candump::parse(text).map_err(|error| error.to_string()),
-        Err(_) if text.starts_with(b"(") => Err("bytes that are no text".to_owned()),
-        Err(_) => Ok(Line::Other),
-    }
+    candump::parse_bytes(text).map_err(|error| error.to_string())
 }
 
 /// The bus that candump's word about lost frames is about: `... frames on 'vcan0' socket ...`.
@@ -233,7 +229,7 @@ mod tests {
 
     #[test]
     fn bytes_that_are_no_text_are_a_fault_only_in_a_frame() {
-        let fault = NoteKind::Unreadable("bytes that are no text".to_owned());
+        let fault = NoteKind::Unreadable("column 2: seconds since 1970".to_owned());
         assert_eq!(all(b"(\xff\n\xff\n", 100), [(1, b"(\xff".to_vec(), fault), text(2, b"\xFF")]);
     }
 

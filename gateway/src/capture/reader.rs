@@ -163,12 +163,18 @@ impl Reader {
     pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
         let Self { name, source, entries } = self;
         let next = match source {
-            Source::Log(log) => log.next().map_err(|source| CaptureError::Io { name: name.clone(), source }),
-            Source::Mcap(mcap) => mcap.next().map_err(|fault| match fault {
-                Fault::Io(source) => CaptureError::Io { name: name.clone(), source },
-                Fault::Damaged(what) => CaptureError::Damaged { name: name.clone(), what, entries: *entries },
-            }),
-        }?;
+            Source::Log(log) => match log.next() {
+                Ok(next) => next,
+                Err(source) => return Err(CaptureError::Io { name: name.clone(), source }),
+            },
+            Source::Mcap(mcap) => match mcap.next() {
+                Ok(next) => next,
+                Err(Fault::Io(source)) => return Err(CaptureError::Io { name: name.clone(), source }),
+                Err(Fault::Damaged(what)) => {
+                    return Err(CaptureError::Damaged { name: name.clone(), what, entries: *entries });
+                }
+            },
+        };
         *entries += u64::from(next.is_some());
         Ok(next)
     }

@@ -17,29 +17,43 @@ const NIBBLES: [u8; 256] = {
 };
 const NONE: u8 = 0xFF;
 
+/// The value of a digit; [`NONE`] and more when it is none.
+#[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
+const fn value(digit: u8) -> u8 {
+    NIBBLES[digit as usize]
+}
+
 fn nibble(digit: u8) -> Option<u8> {
-    NIBBLES.get(usize::from(digit)).copied().filter(|&nibble| nibble != NONE)
+    Some(value(digit)).filter(|&value| value < 16)
 }
 
-/// The value of two digits; `None` when one is none.
-fn pair(high: u8, low: u8) -> Option<u8> {
-    let [high, low] = [high, low].map(|digit| NIBBLES.get(usize::from(digit)).copied().unwrap_or(NONE));
-    (high | low < 16).then_some(high << 4 | low)
+/// Four bytes of eight digits; `None` when one is none.
+fn four_bytes(digits: &[u8; 8]) -> Option<[u8; 4]> {
+    let &[a, b, c, d, e, f, g, h] = digits;
+    let (a, b, c, d) = (value(a), value(b), value(c), value(d));
+    let (e, f, g, h) = (value(e), value(f), value(g), value(h));
+    let any = a | b | c | d | e | f | g | h;
+    if any > 15 { None } else { Some([a << 4 | b, c << 4 | d, e << 4 | f, g << 4 | h]) }
 }
 
-/// The value of eight decimal digits; `None` when one is none.
-fn eight_digits(text: [u8; 8]) -> Option<u64> {
+/// The number at the beginning of eight bytes, and of how many digits it is.
+fn eight_digits(text: [u8; 8]) -> (u64, usize) {
+    const ZEROS: u64 = 0x3030_3030_3030_3030;
     let text = u64::from_le_bytes(text);
-    let digits = text ^ 0x3030_3030_3030_3030;
+    let digits = text ^ ZEROS;
     // A digit is 0 to 9: neither it nor it and 6 more has a bit in the upper half.
-    if (digits | digits.wrapping_add(0x0606_0606_0606_0606)) & 0xF0F0_F0F0_F0F0_F0F0 != 0 {
-        return None;
-    }
+    let others = (digits | digits.wrapping_add(0x0606_0606_0606_0606)) & 0xF0F0_F0F0_F0F0_F0F0;
+    let bits = others.trailing_zeros() & !7;
+    // Digits that are not there are zeros in front. What a carry may have spoilt is behind the first other byte.
+    let digits = digits.checked_shl(64 - bits).unwrap_or(0);
     // Neighbours are put together: of one digit each, then of two, then of four.
-    let digits = (digits * 10 + (digits >> 8)) & 0x00FF_00FF_00FF_00FF;
-    let digits = (digits * 100 + (digits >> 16)) & 0x0000_FFFF_0000_FFFF;
-    Some((digits * 10_000 + (digits >> 32)) & 0xFFFF_FFFF)
+    let digits = digits.wrapping_mul(10).wrapping_add(digits >> 8) & 0x00FF_00FF_00FF_00FF;
+    let digits = digits.wrapping_mul(100).wrapping_add(digits >> 16) & 0x0000_FFFF_0000_FFFF;
+    (digits.wrapping_mul(10_000).wrapping_add(digits >> 32) & 0xFFFF_FFFF, (bits >> 3) as usize)
 }
+
+/// Powers of ten.
+const TENS: [u64; 9] = [1, 10, 100, 1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000];
 
 pub(super) struct Cursor<'a> {
     text: &'a [u8],
@@ -98,8 +112,18 @@ impl<'a> Cursor<'a> {
     /// Decimal digits: their value and how many there are.
     fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
         let start = self.at;
-        let mut value = self.rest().first_chunk().copied().and_then(eight_digits).unwrap_or(0);
-        self.at += if value > 0 { 8 } else { 0 };
+        let mut value = 0_u64;
+        // Sixteen digits fit whatever they are.
+        for _ in 0..2 {
+            let Some((more, count)) = self.rest().first_chunk().map(|&text| eight_digits(text)) else {
+                break;
+            };
+            value = value * TENS.get(count).copied().unwrap_or(0) + more;
+            self.at += count;
+            if count < 8 {
+                break;
+            }
+        }
         while let Some(digit @ b'0'..=b'9') = self.peek() {
             let next = value.checked_mul(10).and_then(|value| value.checked_add(u64::from(digit - b'0')));
             value = next.ok_or_else(|| self.error(expected))?;
@@ -168,12 +192,12 @@ impl<'a> Cursor<'a> {
     fn data(&mut self, id: u32, format: Format, flags: u8) -> Result<Frame, LineError> {
         let mut data = [0; 64];
         let mut len = 0;
-        // Bytes without dots between them, as they nearly always are.
-        for (byte, digits) in data.iter_mut().zip(self.rest().as_chunks().0) {
-            let &[high, low] = digits;
-            let Some(value) = pair(high, low) else { break };
-            *byte = value;
-            len += 1;
+        // Bytes without dots between them, as they nearly always are; four at once, then one by one.
+        let rest = self.rest();
+        while let Some(four) = rest.get(2 * len..).and_then(<[u8]>::first_chunk).and_then(four_bytes) {
+            let Some(place) = data.get_mut(len..).and_then(<[u8]>::first_chunk_mut) else { break };
+            *place = four;
+            len += 4;
         }
         self.at += 2 * len;
         loop {
@@ -187,7 +211,7 @@ impl<'a> Cursor<'a> {
             *data.get_mut(len).ok_or_else(|| self.error("at most 64 bytes"))? = high << 4 | low;
             len += 1;
         }
-        let frame = Frame::with_data(id, format, flags, data.get(..len).unwrap_or_default());
+        let frame = Frame::filled(id, format, flags, data, len);
         let frame = frame.map_err(|_| self.error("at most 8 bytes in a classic frame"))?;
         self.raw_dlc(frame)
     }
@@ -228,28 +252,32 @@ mod tests {
         for byte in 0..=u8::MAX {
             let expected = char::from(byte).to_digit(16).and_then(|value| u8::try_from(value).ok());
             assert_eq!(nibble(byte), expected);
-            assert_eq!(pair(b'A', byte), expected.map(|value| 0xA0 | value));
-            assert_eq!(pair(byte, b'5'), expected.map(|value| value << 4 | 5));
         }
     }
 
     #[test]
-    fn one_wrong_byte_among_eight_digits_is_found() {
+    fn a_number_ends_before_the_first_byte_that_is_no_digit() {
         for at in 0..8 {
             for byte in 0..=u8::MAX {
                 let mut text = *b"98765432";
                 text[at] = byte;
-                let expected = byte.is_ascii_digit().then(|| str::from_utf8(&text).unwrap().parse().unwrap());
-                assert_eq!(eight_digits(text), expected, "{text:?}");
+                let count = if byte.is_ascii_digit() { 8 } else { at };
+                let value = str::from_utf8(&text[..count]).unwrap().parse().unwrap_or(0);
+                assert_eq!(eight_digits(text), (value, count), "{text:?}");
             }
         }
     }
 
     proptest! {
         #[test]
-        fn eight_digits_are_a_number(value in 0_u64..100_000_000) {
-            let text = format!("{value:08}");
-            prop_assert_eq!(eight_digits(*text.as_bytes().first_chunk().unwrap()), Some(value));
+        fn any_bytes_are_the_number_they_begin_with(text: [u8; 8], digits in 0..=8_usize) {
+            let mut text = text;
+            for byte in &mut text[..digits] {
+                *byte = b'0' + *byte % 10;
+            }
+            let count = text.iter().position(|byte| !byte.is_ascii_digit()).unwrap_or(8);
+            let value = str::from_utf8(&text[..count]).unwrap().parse().unwrap_or(0);
+            prop_assert_eq!(eight_digits(text), (value, count));
         }
     }
 }
