@@ -123,6 +123,13 @@ impl Central {
         self.cells.get(cell).map_or(0.0, |place| force(&place.contact, sensors))
     }
 
+    /// Where a cell is, seen from the base, in m; the base itself for a cell that does not exist.
+    #[must_use]
+    pub fn position(&self, cell: usize, frames: &Frames) -> [f64; 3] {
+        let place = self.cells.get(cell).and_then(|place| Some(frames.0.get(place.joint)? * place.position));
+        place.map_or([0.0; 3], |position| position.coords.into())
+    }
+
     /// The joint torques in Nm of one cell that feels `f_z` (paper, Eq. 8); zero in joints that do not
     /// move it, and for a cell that does not exist. Bounded work, no allocation.
     #[must_use]

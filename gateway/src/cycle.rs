@@ -53,7 +53,9 @@ pub struct Record {
     pub qdot: [f64; WORDS],
     /// The cells' torque in Nm.
     pub torque: [f64; WORDS],
-    /// Cells in it.
+    /// The joint velocities in rad/s that the robot was told.
+    pub command: [f64; WORDS],
+    /// Cells in the torque.
     pub contributing: u32,
     /// Epochs that the oldest of them has missed.
     pub age: u32,
@@ -212,6 +214,7 @@ impl Cycle {
             q,
             qdot,
             torque,
+            command: velocity,
             contributing,
             age,
             stale,

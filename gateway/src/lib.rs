@@ -8,6 +8,7 @@ pub mod dbc;
 pub mod decode;
 pub mod external;
 pub mod generate;
+pub mod record;
 pub mod replay;
 pub mod robot;
 pub mod ros2;

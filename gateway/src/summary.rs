@@ -9,6 +9,7 @@ use protocol::id::Kind;
 use protocol::time::Micros;
 use serde::Serialize;
 
+pub use crate::record::account::{Recording, Written};
 use crate::table::{Accuracy, Errors, Event, Replies, Status, Table, Uplink};
 
 /// A whole run.
@@ -40,7 +41,7 @@ pub struct Summary {
     pub processor: Processor,
     /// Private memory of the largest cell process in KiB, if cells were started.
     pub cell_private_kib: Option<u64>,
-    /// Where frames were recorded, and how many did not make it there.
+    /// What was recorded, and what did not make it there.
     pub recording: Option<Recording>,
 }
 
@@ -163,17 +164,6 @@ pub struct Processor {
     pub cells: f64,
     /// Embedded buses.
     pub buses: f64,
-}
-
-/// Where frames were recorded.
-#[derive(Clone, Debug, Serialize)]
-pub struct Recording {
-    /// The file.
-    pub path: String,
-    /// Frames in it.
-    pub frames: u64,
-    /// Frames that did not make it there.
-    pub lost: u64,
 }
 
 /// Packets from the cells: sent = delivered + rejected + lost, and lost = dropped + backlog + unknown.

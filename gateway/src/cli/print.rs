@@ -187,11 +187,18 @@ fn costs(rows: &mut Rows, summary: &Summary) {
     }
     rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
     if let Some(recording) = &summary.recording {
-        rows.row(
-            "recording",
-            &recording.path,
-            format!("{} frames, {} lost", recording.frames, recording.lost),
-        );
+        for file in &recording.files {
+            rows.row("recording", &file.path, format!("{} frames, {}", file.frames, size(file.bytes)));
+        }
+        rows.row("  frames in every format", recording.frames, format!("{} lost", recording.lost));
+    }
+}
+
+fn size(bytes: u64) -> String {
+    match bytes {
+        0..10_000 => format!("{bytes} bytes"),
+        10_000..10_000_000 => format!("{} KB", bytes / 1_000),
+        _ => format!("{} MB", bytes / 1_000_000),
     }
 }
 

@@ -4,8 +4,11 @@ use std::fs::File;
 use std::io::Write;
 use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Args;
+use gateway::record::series::{Attached, Split};
+use gateway::record::{self, account::Recording as Recorded};
 use gateway::run::file::WholeFile;
 use gateway::run::{self, Options, RunError};
 use gateway::scenario::Scenario;
@@ -21,6 +24,9 @@ use super::print;
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../../examples/demo.toml");
+
+/// Where the demonstration's frames are recorded.
+const DEMO_LOG: &str = "skinbus-demo.log";
 
 /// How long a run without a scenario takes, unless it is told.
 const IDLE: Span = Span::from_millis(10_000);
@@ -46,6 +52,75 @@ struct Common {
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
+    #[command(flatten)]
+    recording: Recording,
+}
+
+/// What is recorded beside frames as text.
+#[derive(Args, Debug)]
+struct Recording {
+    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/recording.md has the topics
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
+    /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
+    #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
+    record_split: Vec<Limit>,
+    /// Overwrite recordings and logs that exist
+    #[arg(long)]
+    force: bool,
+}
+
+/// When another file of a recording is begun.
+#[derive(Clone, Copy, Debug)]
+enum Limit {
+    Bytes(u64),
+    Age(Duration),
+}
+
+fn limit(text: &str) -> Result<Limit, String> {
+    let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
+    let letters = text.find(|letter: char| !letter.is_ascii_digit()).ok_or(allowed)?;
+    let (number, unit) = text.split_at_checked(letters).ok_or(allowed)?;
+    let number: u64 = number.parse().map_err(|_| allowed)?;
+    let times = |factor: u64| number.checked_mul(factor).ok_or(allowed);
+    let limit = match unit {
+        "MB" => Limit::Bytes(times(1_000_000)?),
+        "MiB" => Limit::Bytes(times(1 << 20)?),
+        "GB" => Limit::Bytes(times(1_000_000_000)?),
+        "GiB" => Limit::Bytes(times(1 << 30)?),
+        "s" => Limit::Age(Duration::from_secs(number)),
+        "min" => Limit::Age(Duration::from_secs(times(60)?)),
+        "h" => Limit::Age(Duration::from_secs(times(3_600)?)),
+        _ => return Err(allowed.to_owned()),
+    };
+    if number == 0 { Err(allowed.to_owned()) } else { Ok(limit) }
+}
+
+impl Recording {
+    /// What is recorded where; `skin` and `scenario` are the files that go with it, as they are.
+    fn options(
+        self,
+        candump: Option<PathBuf>,
+        skin: impl FnOnce() -> Result<Vec<u8>, Failure>,
+        scenario: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
+    ) -> Result<record::Options, Failure> {
+        let mut split = Split::default();
+        for limit in self.record_split {
+            match limit {
+                Limit::Bytes(bytes) => split.bytes = bytes,
+                Limit::Age(age) => split.age = age,
+            }
+        }
+        let mcap = self.record.map(|path| {
+            let toml = "application/toml";
+            let attached = |name, bytes| Attached { name, media_type: toml, bytes };
+            let mut attachments = vec![attached("skin.toml", skin()?)];
+            attachments.extend(scenario()?.map(|bytes| attached("scenario.toml", bytes)));
+            let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+            Ok::<_, Failure>(record::Mcap { path, split, attachments, command_line })
+        });
+        Ok(record::Options { candump, mcap: mcap.transpose()?, force: self.force })
+    }
 }
 
 /// Show everything at once: 253 cells on an arm, touched here and there
@@ -58,7 +133,7 @@ pub(crate) struct Demo {
     #[command(flatten)]
     common: Common,
     /// Where the frames are recorded
-    #[arg(long, value_name = "FILE", default_value = "skinbus-demo.log")]
+    #[arg(long, value_name = "FILE", default_value = DEMO_LOG)]
     candump: PathBuf,
     /// embedded, socketcan, or auto for SocketCAN where the kernel has it
     #[arg(long, value_name = "KIND", default_value_t = Choice::Only(BusKind::Embedded))]
@@ -69,7 +144,8 @@ pub(crate) struct Demo {
 ///
 /// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
-/// table. Exit code 0: it came to its end; 1: it did not; 2: wrong use or configuration.
+/// table. Exit code 0: it came to its end; 1: it did not, or its recording is not whole; 2: wrong use or
+/// configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
@@ -122,8 +198,12 @@ impl Demo {
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         let mut options = self.common.options(skin_file, skin, scenario);
         options.kind = self.bus_kind;
-        options.candump = Some(self.candump);
-        bench(&options, self.common.summary.as_deref())
+        let Common { mut recording, summary, .. } = self.common;
+        // Who shows it again wants no other name for it.
+        recording.force |= self.candump == Path::new(DEMO_LOG);
+        let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
+        options.record = recording.options(Some(self.candump), texts.0, texts.1)?;
+        bench(&options, summary.as_deref())
     }
 }
 
@@ -134,13 +214,22 @@ impl Run {
             Some(path) => Scenario::read(path, &skin).map_err(Failure::usage)?,
             None => Scenario::idle(IDLE),
         };
+        let read = |path: &Path| {
+            std::fs::read(path).map_err(|error| Failure::usage(format!("{}: {error}", path.display())))
+        };
+        let (skin_file, scenario_file) = (self.skin.clone(), self.scenario);
         let mut options = self.common.options(self.skin, skin, scenario);
+        let Common { recording, summary, .. } = self.common;
         options.kind = self.bus_kind;
-        options.candump = self.candump;
+        options.record = recording.options(
+            self.candump,
+            || read(&skin_file),
+            || scenario_file.as_deref().map(read).transpose(),
+        )?;
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;
-        bench(&options, self.common.summary.as_deref())
+        bench(&options, summary.as_deref())
     }
 }
 
@@ -161,7 +250,7 @@ impl Common {
             cell_node: self.cell_node.clone(),
             vcan_setup: self.vcan_setup.clone(),
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-            candump: None,
+            record: record::Options::default(),
             quiet: self.quiet,
         }
     }
@@ -169,8 +258,8 @@ impl Common {
 
 fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
     let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
-    if summary_file.is_some() && summary_file == options.candump.as_deref() {
-        return Err(Failure::usage("--summary and --candump name the same file: name two"));
+    if options.record.paths().any(|path| summary_file == Some(path)) {
+        return Err(Failure::usage("--summary and a recording name the same file: name two"));
     }
     // Before the run: nobody wants to hear after an hour that there is nowhere to write.
     let json = summary_file.map(|path| {
@@ -183,7 +272,15 @@ fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> 
         write_json(whole, file, &summary)?;
     }
     print::summary(&summary)?;
-    Ok(())
+    match &summary.recording {
+        Some(Recorded { errors, lost_write, .. }) if !errors.is_empty() || *lost_write > 0 => {
+            let first = errors.first().map_or("", String::as_str);
+            Err(Failure::run(format!(
+                "the recording is not whole, {lost_write} frames were not written: {first}"
+            )))
+        }
+        _ => Ok(()),
+    }
 }
 
 fn write_json(whole: WholeFile, mut file: File, summary: &Summary) -> Result<(), Failure> {

@@ -28,6 +28,7 @@ uint32 nanosec
 "
     };
 }
+pub(super) use header;
 
 const NANOS: u64 = 1_000_000_000;
 

@@ -5,6 +5,8 @@
 
 pub mod cdr;
 pub mod messages;
+pub mod skin;
+pub mod standard;
 
 /// A type of message: what a recording says of it, and how its bytes come about.
 pub trait Message {

@@ -6,7 +6,7 @@
 use std::fs;
 
 /// How many packets the machine has dropped so; nothing where the kernel does not say.
-pub(super) fn dropped() -> Option<u64> {
+pub(crate) fn dropped() -> Option<u64> {
     read(&fs::read_to_string("/proc/net/softnet_stat").ok()?)
 }
 

@@ -8,15 +8,14 @@
 //!       ├─ stimuli ─> bus ─> receiver (one a bus) ────┤
 //!       │              ▲         └─ snapshot ─> control loop (SCHED_FIFO)
 //!       │              └──────────── joints ────────────┘
-//!       └─ progress line, log file, summary
+//!       └─ progress line, summary              recorder: what all of them hand over, into files
 //! ```
 
-mod backlog;
+pub(crate) mod backlog;
 pub mod file;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
 pub mod launch;
-mod log;
 mod measured;
 mod progress;
 pub mod realtime;
@@ -59,8 +58,8 @@ pub struct Options {
     pub vcan_setup: Option<PathBuf>,
     /// Bytes that may wait in the gateway's socket of a bus, as the kernel counts them: about 1 KiB a frame.
     pub receive_buffer: usize,
-    /// Where frames are written as candump text, if they are.
-    pub candump: Option<PathBuf>,
+    /// What is recorded where.
+    pub record: crate::record::Options,
     /// Whether progress is shown.
     pub quiet: bool,
 }

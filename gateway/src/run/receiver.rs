@@ -6,29 +6,21 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, Inbox};
-use protocol::can::Frame;
+use protocol::bus::{Bus, Inbox, Received};
 use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
 use super::turn::Shared;
+use crate::record::feed::{Outlet, Touched, Unrecorded};
+use crate::record::force::Seen;
 use crate::table::{Notice, Said, Snapshot, Status, Table};
 
 /// How often time is let pass when nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(50);
-
-/// A frame for whoever records.
-#[derive(Clone, Copy, Debug)]
-pub struct Captured {
-    /// The kernel's time stamp, ns since 1970.
-    pub at_nanos: u64,
-    /// The frame.
-    pub frame: Frame,
-}
 
 /// What a receiver tells the main thread at once.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -57,8 +49,10 @@ pub struct View {
 pub struct CellView {
     /// Its number.
     pub node: u8,
-    /// Whether it has been heard of and is not dead.
+    /// Whether it has been heard of.
     pub heard: bool,
+    /// Whether it has fallen silent.
+    pub dead: bool,
     /// Whether it can be expected to answer, once nobody halts it.
     pub ready: bool,
     /// Whether it waits for a resume.
@@ -88,8 +82,8 @@ pub struct Receiver {
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
     pub positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
-    /// Where frames go that are to be recorded, if they are.
-    pub captured: Option<rtrb::Producer<Captured>>,
+    /// Where everything goes that is to be recorded, if it is.
+    pub outlet: Option<Outlet>,
     /// What everyone looks at.
     pub shared: Arc<Shared>,
     /// Whether the bus works.
@@ -102,13 +96,13 @@ pub struct Receiver {
 
 /// What a receiver leaves at the end.
 #[derive(Debug)]
-pub struct Received {
+pub struct Left {
     /// All that is known of the bus.
     pub table: Table,
     /// Frames that the bus dropped because we did not take them in time.
     pub dropped: u64,
-    /// Frames that did not fit into the recorder's queue.
-    pub unrecorded: u64,
+    /// What did not fit into the recorder's queues.
+    pub unrecorded: Unrecorded,
     /// Bytes that were no frame.
     pub unreadable: u64,
 }
@@ -116,10 +110,10 @@ pub struct Received {
 impl Receiver {
     /// Receives until someone says stop or the bus is gone.
     #[must_use]
-    pub fn run(mut self) -> Received {
+    pub fn run(mut self) -> Left {
         super::realtime::prepare_receiver();
         let mut inbox = Inbox::new();
-        let mut unrecorded = 0;
+        let (mut dropped, mut newest) = (0_u32, None);
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
             let came = self
@@ -152,14 +146,13 @@ impl Receiver {
                     let queue = &mut self.positions;
                     let mut positions = |epoch| positions_of(queue, epoch);
                     self.table.handle_frame(at, received.own, &received.frame, &mut positions);
-                    let captured = Captured { at_nanos: received.at_nanos, frame: received.frame };
-                    if let Some(queue) = &mut self.captured
-                        && queue.push(captured).is_err()
-                    {
-                        unrecorded += 1;
+                    if let Some(outlet) = &mut self.outlet {
+                        let Received { frame, at_nanos, own } = received;
+                        outlet.frame(Seen { at_nanos, own, frame });
                     }
                 }
             }
+            self.record(&inbox, &mut dropped, &mut newest);
             if count == 0 || looked.elapsed() >= LOOK {
                 looked = Instant::now();
                 self.look();
@@ -171,8 +164,24 @@ impl Receiver {
             }
         }
         self.table.finish();
+        let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
         let (dropped, unreadable) = (u64::from(inbox.dropped()), inbox.unreadable());
-        Received { table: self.table, dropped, unrecorded, unreadable }
+        Left { table: self.table, dropped, unrecorded, unreadable }
+    }
+
+    /// Hands on what is no frame: what the bus dropped, and once an epoch what cells feel.
+    fn record(&mut self, inbox: &Inbox, dropped: &mut u32, newest: &mut Option<u64>) {
+        let Some(outlet) = &mut self.outlet else { return };
+        let more = inbox.dropped().wrapping_sub(*dropped);
+        if more > 0 {
+            *dropped = inbox.dropped();
+            outlet.dropped(wall_nanos(), more.into());
+        }
+        let Some((number, epoch, at)) = self.table.newest() else { return };
+        if outlet.wants_touched() && newest.replace(number) != Some(number) {
+            let cells = self.table.felt(at).collect();
+            outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
+        }
     }
 
     fn publish(&mut self) {
@@ -183,8 +192,7 @@ impl Receiver {
 
     /// Lets time pass, and shows the main thread how things are.
     fn look(&mut self) {
-        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
+        let now = Micros(wall_nanos() / 1_000);
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
@@ -198,6 +206,7 @@ impl Receiver {
             CellView {
                 node: cell.node.get(),
                 heard: state.is_some(),
+                dead: status == Status::Dead,
                 ready,
                 halted: ready && !cell.is_ready(),
                 unconfigured: settled.is_some() && !ready,
@@ -216,6 +225,21 @@ impl Receiver {
         // Nobody listens any more when the run ends.
         let _ = self.news.send((self.index, news));
     }
+}
+
+/// Says what did not fit; the recorder makes room as long as a receiver is there.
+fn last_words(outlet: &mut Outlet) -> Unrecorded {
+    let give_up = Instant::now() + Duration::from_secs(1);
+    while !outlet.tell(wall_nanos()) && Instant::now() < give_up {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    outlet.unrecorded()
+}
+
+/// The wall clock in ns since 1970.
+fn wall_nanos() -> u64 {
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.

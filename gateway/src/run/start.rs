@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver as Inlet};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use hdrhistogram::Histogram;
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Options as BusOptions};
@@ -13,16 +13,20 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, Plan, Processes, ServedBus, program};
-use super::log::Log;
 use super::progress::say;
-use super::receiver::{Captured, CellView, News, Received, Receiver, View};
+use super::receiver::{CellView, Left, News, Receiver, View};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, backlog, realtime};
 use crate::controller;
 use crate::cycle::Cycle;
+use crate::record::account::Recording;
+use crate::record::feed::{self, Feed, Unrecorded};
+use crate::record::layout::Layout;
+use crate::record::series::Head;
+use crate::record::{Mcap, Outputs, Recorder, facts};
 use crate::robot::SimulatedArm;
 use crate::scenario::FaultKind;
 use crate::summary::histogram;
@@ -44,16 +48,13 @@ const SHOWING: Duration = Duration::from_secs(2);
 const IDLE_WAKEUPS: u32 = 100;
 /// Records that wait for the main thread: more than a second of ticks.
 const RECORDS: usize = 1_024;
-/// Frames that wait for the main thread: more than a second of a full bus.
-const CAPTURED: usize = 65_536;
 
 /// One bus of a bench.
 #[derive(Debug)]
 pub(super) struct Lane {
     pub(super) bus: Arc<Bus>,
     pub(super) view: Arc<Mutex<View>>,
-    pub(super) captured: Option<rtrb::Consumer<Captured>>,
-    pub(super) receiver: Option<JoinHandle<Received>>,
+    pub(super) receiver: Option<JoinHandle<Left>>,
 }
 
 /// A bench whose cells are ready and whose loop has not begun.
@@ -72,7 +73,9 @@ pub(super) struct Bench<'a> {
     pub(super) cycle: Option<Cycle>,
     /// The epoch of the first broadcast.
     pub(super) first_epoch: Epoch,
-    pub(super) log: Option<Log>,
+    pub(super) recorder: Option<Recorder>,
+    /// Where the loop's records go that are to be recorded.
+    pub(super) recorded: Option<rtrb::Producer<Timed>>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
     pub(super) served: Vec<ServedBus>,
@@ -87,10 +90,10 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         signal_hook::flag::register(signal, Arc::clone(&signalled))
             .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
     }
-    let log = options.candump.as_deref().map(|path| {
-        Log::create(path).map_err(|error| RunError::Usage(format!("--candump {}: {error}", path.display())))
-    });
-    let log = log.transpose()?;
+    // A file that may have no more bytes is an error like others, and no end.
+    signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
+        .map_err(|error| RunError::Failed(format!("cannot catch signal {SIGXFSZ}: {error}")))?;
+    let outputs = Outputs::claim(&options.record, say).map_err(RunError::Usage)?;
     // An external controller can find its socket from now on, so that it is there when the loop begins.
     let cycle = Some(cycle(options)?);
     let idle = idle_lateness(options.skin.timing.tick_nanos());
@@ -110,11 +113,19 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let shared = Arc::new(Shared::default());
     let (tell, news) = mpsc::channel();
     let (mut lanes, mut lines) = (Vec::new(), Vec::new());
+    let mut feeds = Vec::new();
     for (index, bus) in buses.into_iter().enumerate() {
-        let (lane, line) = listen(options, index, bus, &shared, tell.clone())?;
+        let view = Arc::new(Mutex::new(View::default()));
+        let works = Arc::new(AtomicBool::new(true));
+        let recorded = |()| feed::lane(outputs.wants_all(), Arc::clone(&view), Arc::clone(&works));
+        let (outlet, feed) = (!outputs.is_empty()).then_some(()).map(recorded).unzip();
+        let seat = Seat { index, bus, view, works, outlet };
+        let (lane, line) = listen(options, seat, &shared, tell.clone())?;
         lanes.push(lane);
         lines.push(line);
+        feeds.extend(feed);
     }
+    let (recorder, recorded) = record(options, outputs, feeds, &lanes)?;
     let processes = Processes::default();
     let first_epoch = Epoch(0);
     let mut bench = Bench {
@@ -129,12 +140,13 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         signalled,
         cycle,
         first_epoch,
-        log,
+        recorder,
+        recorded,
         processes,
         served,
     };
     if let Err(error) = bench.begin() {
-        bench.stop_receivers();
+        bench.stop_after_failure();
         return Err(error);
     }
     Ok(bench)
@@ -208,23 +220,76 @@ fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bu
     }
 }
 
+/// Starts the thread that records, if anything is to be recorded; where the loop's records go to it.
+fn record(
+    options: &Options,
+    outputs: Outputs,
+    feeds: Vec<feed::Lane>,
+    lanes: &[Lane],
+) -> Result<(Option<Recorder>, Option<rtrb::Producer<Timed>>), RunError> {
+    if outputs.is_empty() {
+        return Ok((None, None));
+    }
+    let (recorded, ticks) = outputs.wants_all().then(|| rtrb::RingBuffer::new(feed::TICKS)).unzip();
+    let head = options.record.mcap.as_ref().map_or_else(Head::default, |mcap| head(options, mcap, lanes));
+    let feed = Feed { lanes: feeds, ticks };
+    let recorder = outputs.start(feed, Layout::new(&options.skin), head);
+    let recorder = recorder.map_err(|error| RunError::Failed(format!("cannot start a thread: {error}")))?;
+    Ok((Some(recorder), recorded))
+}
+
+/// What each file of a recording begins with.
+fn head(options: &Options, mcap: &Mcap, lanes: &[Lane]) -> Head {
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let nanos = u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX);
+    let mut run = vec![
+        (
+            "duration_s".to_owned(),
+            (Duration::from_micros(options.scenario.duration.0)).as_secs_f64().to_string(),
+        ),
+        ("spawn".to_owned(), options.spawn.to_string()),
+        ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
+    ];
+    for (lane, described) in lanes.iter().zip(&options.skin.buses) {
+        let (kind, bytes) = (lane.bus.kind(), lane.bus.receive_buffer());
+        let format = match described.format {
+            Format::Fd => "fd",
+            Format::Classic => "classic",
+        };
+        run.push((
+            format!("bus/{}", described.name),
+            format!("{kind}, {format}, receive buffer {bytes} bytes"),
+        ));
+    }
+    let metadata = vec![
+        ("program", facts::program(&mcap.command_line, nanos)),
+        ("machine", facts::machine()),
+        ("configuration", facts::configuration(&options.skin, run)),
+        ("configuration_hashes", facts::hashes(&options.skin)),
+    ];
+    Head { nanos, metadata, attachments: mcap.attachments.clone() }
+}
+
+/// What a bus and its receiver have in common with others.
+struct Seat {
+    index: usize,
+    bus: Arc<Bus>,
+    view: Arc<Mutex<View>>,
+    works: Arc<AtomicBool>,
+    outlet: Option<feed::Outlet>,
+}
+
 /// Starts a bus' receiver.
 fn listen(
     options: &Options,
-    index: usize,
-    bus: Arc<Bus>,
+    seat: Seat,
     shared: &Arc<Shared>,
     news: mpsc::Sender<(usize, News)>,
 ) -> Result<(Lane, Line), RunError> {
+    let Seat { index, bus, view, works, outlet } = seat;
     let table = Table::new(&options.skin, index);
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
-    let (captured, frames) = match options.candump {
-        Some(_) => Some(rtrb::RingBuffer::new(CAPTURED)).unzip(),
-        None => (None, None),
-    };
-    let works = Arc::new(AtomicBool::new(true));
-    let view = Arc::new(Mutex::new(View::default()));
     let format = options.skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
     let line = Line { format, snapshot, positions, works: Arc::clone(&works) };
     let receiver = Receiver {
@@ -234,7 +299,7 @@ fn listen(
         table,
         snapshots,
         positions: of_broadcasts,
-        captured,
+        outlet,
         shared: Arc::clone(shared),
         works,
         view: Arc::clone(&view),
@@ -243,7 +308,7 @@ fn listen(
     let name = format!("rx {}", bus.name());
     let thread = thread::Builder::new().name(name).spawn(move || receiver.run());
     let thread = thread.map_err(|error| RunError::Failed(format!("cannot start a thread: {error}")))?;
-    Ok((Lane { bus, view, captured: frames, receiver: Some(thread) }, line))
+    Ok((Lane { bus, view, receiver: Some(thread) }, line))
 }
 
 impl Bench<'_> {
@@ -444,10 +509,33 @@ impl Bench<'_> {
     }
 
     /// Lets the receivers end and takes what they leave.
-    pub(super) fn stop_receivers(&mut self) -> Vec<Option<Received>> {
+    pub(super) fn stop_receivers(&mut self) -> Vec<Option<Left>> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let end = |lane: &mut Lane| lane.receiver.take().and_then(|thread| thread.join().ok());
         self.lanes.iter_mut().map(end).collect()
+    }
+
+    /// Ends the recording, when nobody hands over more.
+    pub(super) fn finish_recording(&mut self, received: &[Option<Left>]) -> Option<Recording> {
+        let add = |all: Unrecorded, one: &Left| Unrecorded {
+            frames: all.frames + one.unrecorded.frames,
+            epochs: all.epochs + one.unrecorded.epochs,
+        };
+        let unrecorded = received.iter().flatten().fold(Unrecorded::default(), add);
+        let ticks = self.shared.records_unrecorded.load(Ordering::Relaxed);
+        self.recorder.take().map(|recorder| recorder.finish(unrecorded, ticks))
+    }
+
+    /// Ends everything after a failure; what led to it is what people want to see.
+    pub(super) fn stop_after_failure(&mut self) {
+        let received = self.stop_receivers();
+        let Some(recording) = self.finish_recording(&received) else { return };
+        if self.options.quiet {
+            return;
+        }
+        for file in recording.files {
+            say(&format!("{} frames until then are in {}", file.frames, file.path));
+        }
     }
 
     /// The queue through which the loop's records come, both ends.

@@ -32,6 +32,8 @@ pub struct Shared {
     pub commands: AtomicU64,
     /// Records that did not fit into their queue.
     pub records_lost: AtomicU64,
+    /// Records that did not fit into the queue to the recorder.
+    pub records_unrecorded: AtomicU64,
     /// Broadcasts that were skipped with their ticks.
     pub broadcasts_skipped: AtomicU64,
     /// Frames that a bus did not take.
@@ -43,7 +45,9 @@ pub struct Shared {
 pub struct Timed {
     /// What the tick was like.
     pub record: Record,
-    /// How long after its time it began, in ns.
+    /// When it should have begun, in ns of the monotonic clock.
+    pub due_ns: u64,
+    /// How long after that it began, in ns.
     pub late_ns: u64,
     /// How long it took, in ns.
     pub took_ns: u64,
@@ -72,6 +76,8 @@ pub struct Turn {
     scenario: Arc<Scenario>,
     shared: Arc<Shared>,
     records: rtrb::Producer<Timed>,
+    /// The same for the recorder, if there is one.
+    recorded: Option<rtrb::Producer<Timed>>,
     /// The halt or resume that each bus has not taken yet: its cells would else not be as the robot is.
     owed: Vec<Option<Message>>,
 }
@@ -87,7 +93,14 @@ impl Turn {
         records: rtrb::Producer<Timed>,
     ) -> Self {
         let owed = vec![None; lines.len()];
-        Self { cycle, lines, scenario, shared, records, owed }
+        Self { cycle, lines, scenario, shared, records, recorded: None, owed }
+    }
+
+    /// Hands every tick to a recorder too.
+    #[must_use]
+    pub fn recorded(mut self, queue: Option<rtrb::Producer<Timed>>) -> Self {
+        self.recorded = queue;
+        self
     }
 
     /// What the controller has counted, by name.
@@ -142,12 +155,18 @@ impl Turn {
         }
         let timed = Timed {
             record: outcome.record,
+            due_ns: due,
             late_ns: began.saturating_sub(due),
             took_ns: now().saturating_sub(began),
             central,
         };
         if self.records.push(timed).is_err() {
             self.shared.records_lost.fetch_add(1, Ordering::Relaxed);
+        }
+        if let Some(queue) = &mut self.recorded
+            && queue.push(timed).is_err()
+        {
+            self.shared.records_unrecorded.fetch_add(1, Ordering::Relaxed);
         }
     }
 

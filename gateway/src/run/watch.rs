@@ -15,14 +15,15 @@ use protocol::skin::Cell;
 use protocol::time::Micros;
 
 use super::measured::Measured;
-use super::progress::{Progress, say};
+use super::progress::Progress;
 use super::realtime::{self, Granted};
-use super::receiver::{News, Received};
+use super::receiver::{Left, News};
 use super::start::{Bench, rival};
 use super::turn::{Timed, Turn};
 use super::{RunError, backlog, usage};
+use crate::record::Recorder;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Recording, Summary};
+use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary};
 use crate::table::{Accuracy, Notice};
 
 /// What a controller counted, by name.
@@ -49,22 +50,9 @@ impl Bench<'_> {
     pub(super) fn watch(mut self) -> Result<Summary, RunError> {
         let outcome = self.drive();
         if outcome.is_err() {
-            let received = self.stop_receivers();
-            // What led to the failure is what people want to see; a second failure adds nothing to it.
-            if let Ok(Some(Recording { path, frames, .. })) = self.finish_log(&received)
-                && !self.options.quiet
-            {
-                say(&format!("{frames} frames until then are in {path}"));
-            }
+            self.stop_after_failure();
         }
         outcome
-    }
-
-    /// Writes what the receivers left, and gives the log its name.
-    fn finish_log(&mut self, received: &[Option<Received>]) -> Result<Option<Recording>, RunError> {
-        self.write_log()?;
-        let lost = received.iter().flatten().map(|received| received.unrecorded).sum();
-        self.log.take().map(|log| log.finish(lost)).transpose()
     }
 
     fn drive(&mut self) -> Result<Summary, RunError> {
@@ -76,7 +64,8 @@ impl Bench<'_> {
             Arc::new(options.scenario.clone()),
             Arc::clone(&self.shared),
             records,
-        );
+        )
+        .recorded(self.recorded.take());
         let mut script =
             Script { touches: Touches::new(&options.scenario, &options.skin), epoch: 0, fault: 0 };
         self.press(&mut script)?;
@@ -116,7 +105,7 @@ impl Bench<'_> {
         let received = self.stop_receivers();
         let backlog_dropped =
             backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
-        let recording = self.finish_log(&received)?;
+        let recording = self.finish_recording(&received);
         Ok(Summary {
             skin: options.skin.name.clone(),
             cells: options.skin.cells.len(),
@@ -180,7 +169,9 @@ impl Bench<'_> {
             (Some(_), None) => progress.note("the robot goes on"),
             (Some(_), Some(_)) | (None, None) => {}
         }
-        self.write_log()?;
+        for line in self.recorder.iter().flat_map(Recorder::said) {
+            progress.note(&line);
+        }
         let shared = Arc::clone(&self.shared);
         progress.show(|| {
             let cells = self.options.skin.cells.len();
@@ -315,20 +306,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Writes what the receivers captured.
-    fn write_log(&mut self) -> Result<(), RunError> {
-        let Some(log) = &mut self.log else { return Ok(()) };
-        for lane in &mut self.lanes {
-            let Some(captured) = &mut lane.captured else { continue };
-            while let Ok(frame) = captured.pop() {
-                log.write(lane.bus.name(), &frame)?;
-            }
-        }
-        Ok(())
-    }
-
     /// Lets late replies come in, and asks all cells for their counters and a last heartbeat.
-    fn last_words(&mut self, interrupted: bool) -> Result<(), RunError> {
+    fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
         thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
         self.wait_until(|bench| bench.has_caught_up())?;
         let alive = self.count(|cell| cell.ready);
@@ -349,11 +328,10 @@ impl Bench<'_> {
     }
 
     /// Waits for something, but not for ever; what is missing then shows in the accounts.
-    fn wait_until(&mut self, done: impl Fn(&Self) -> bool) -> Result<(), RunError> {
+    fn wait_until(&self, done: impl Fn(&Self) -> bool) -> Result<(), RunError> {
         let give_up = Instant::now() + LAST_WORDS;
         while !done(self) && Instant::now() < give_up {
             thread::sleep(LOOK);
-            self.write_log()?;
         }
         Ok(())
     }
@@ -387,11 +365,11 @@ impl Bench<'_> {
         }
     }
 
-    fn bus_summaries(&self, received: &[Option<Received>], backlog_dropped: Option<u64>) -> Vec<BusSummary> {
+    fn bus_summaries(&self, received: &[Option<Left>], backlog_dropped: Option<u64>) -> Vec<BusSummary> {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
         let pairs = self.lanes.iter().zip(received);
-        let summary = |(lane, received): (&super::start::Lane, &Option<Received>)| {
+        let summary = |(lane, received): (&super::start::Lane, &Option<Left>)| {
             let received = received.as_ref()?;
             let (bus, kind) = (&lane.bus, lane.bus.kind().to_string());
             Some(BusSummary::new(
@@ -413,7 +391,7 @@ impl Bench<'_> {
     }
 }
 
-fn accuracy(received: &[Option<Received>]) -> AccuracySummary {
+fn accuracy(received: &[Option<Left>]) -> AccuracySummary {
     let all = received.iter().flatten().map(|received| *received.table.accuracy());
     all.fold(Accuracy::default(), Accuracy::with).into()
 }

@@ -255,6 +255,11 @@ impl Cell {
         self.felt.said(skin);
     }
 
+    /// What it feels; `None` where only the cell knows.
+    pub(super) fn feeling(&self) -> Option<SkinSensors> {
+        self.felt.now().filter(|_| self.obeys())
+    }
+
     /// What the cell feels from the joints of this epoch on; `None` where only the cell knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         let felt = self.felt.latch(epoch);

@@ -38,6 +38,11 @@ impl Felt {
         self.now = Some(SkinSensors::default());
     }
 
+    /// What it feels since the last joints.
+    pub(super) const fn now(&self) -> Option<SkinSensors> {
+        self.now
+    }
+
     /// What the cell feels from the joints of this epoch on; `None` while nobody knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         let due = |from: &From| match from {

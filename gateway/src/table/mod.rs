@@ -514,6 +514,17 @@ impl Table {
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
     }
 
+    /// The joints that cells are answering: their number, their epoch, and when they stood on the bus.
+    #[must_use]
+    pub fn newest(&self) -> Option<(u64, Epoch, Micros)> {
+        self.broadcast.map(|Broadcast { number, epoch, at, .. }| (number, epoch, at))
+    }
+
+    /// What each cell has felt since those joints, as far as anybody knows, and its status now.
+    pub fn felt(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
+        self.statuses(now).map(|(cell, status)| (cell.feeling(), status))
+    }
+
     /// The cells' statuses now.
     pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&Cell, Status)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);

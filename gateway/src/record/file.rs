@@ -1,0 +1,163 @@
+//! One MCAP file as it is written: what it is made of, its channels, its messages.
+//!
+//! The only place, beside [`super::recover`], that knows the crate `mcap` and the settings that a recording needs.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+
+use mcap::records::MessageHeader;
+use mcap::write::{Metadata, NoSeek};
+use mcap::{Attachment, McapError, WriteOptions, Writer};
+
+use crate::ros2::Message;
+
+/// Bytes that are compressed together; larger ones take a writer's time in pieces that queues feel.
+pub const CHUNK: u64 = 256 << 10;
+
+/// Bytes of a message's record beside its own.
+const HEAD: u64 = 31;
+
+/// The settings of every file that is written: no seeking, so that what has been flushed stays readable
+/// whatever happens afterwards; no threads, which cost more than they save.
+#[must_use]
+pub fn options() -> WriteOptions {
+    WriteOptions::new()
+        .profile("ros2")
+        .library(concat!("skinbus ", env!("CARGO_PKG_VERSION")))
+        .compression(Some(mcap::Compression::Zstd))
+        .compression_threads(0)
+        .chunk_size(Some(CHUNK))
+        .disable_seeking(true)
+}
+
+/// What was written cannot go on.
+#[must_use]
+pub fn io_error(error: McapError) -> io::Error {
+    if let McapError::Io(error) = error { error } else { io::Error::other(error.to_string()) }
+}
+
+/// A topic of a file.
+#[derive(Clone, Copy, Debug)]
+pub struct Channel {
+    id: u16,
+    sequence: u32,
+}
+
+/// A file that is being written. After an error it takes nothing more.
+pub struct FileWriter<W: Write> {
+    writer: Writer<NoSeek<W>>,
+    buffer: Vec<u8>,
+    messages: u64,
+    /// Bytes of messages, uncompressed.
+    raw: u64,
+    flushes: u64,
+}
+
+impl<W: Write> core::fmt::Debug for FileWriter<W> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("FileWriter").field("messages", &self.messages).finish_non_exhaustive()
+    }
+}
+
+impl<W: Write> FileWriter<W> {
+    /// Begins a file.
+    ///
+    /// # Errors
+    /// When it cannot be written, as of everything below.
+    pub fn new(out: W) -> io::Result<Self> {
+        let writer = options().create(NoSeek::new(out)).map_err(io_error)?;
+        Ok(Self { writer, buffer: Vec::new(), messages: 0, raw: 0, flushes: 0 })
+    }
+
+    /// Facts by name.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn metadata(&mut self, name: &str, facts: &BTreeMap<String, String>) -> io::Result<()> {
+        let record = Metadata { name: name.to_owned(), metadata: facts.clone() };
+        self.writer.write_metadata(&record).map_err(io_error)
+    }
+
+    /// A file in the file, as it is.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn attach(&mut self, name: &str, media_type: &str, nanos: u64, bytes: &[u8]) -> io::Result<()> {
+        let attachment = Attachment {
+            log_time: nanos,
+            create_time: nanos,
+            name: name.to_owned(),
+            media_type: media_type.to_owned(),
+            data: bytes.into(),
+        };
+        self.writer.attach(&attachment).map_err(io_error)
+    }
+
+    /// A topic for messages of a type; `facts` is what else the file says of it.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn channel<M: Message>(&mut self, topic: &str, facts: &[(&str, &str)]) -> io::Result<Channel> {
+        // Bag tools want to find it, and take it empty.
+        let qos = ("offered_qos_profiles", "");
+        let facts = facts.iter().chain([&qos]).map(|&(key, value)| (key.to_owned(), value.to_owned()));
+        let schema =
+            self.writer.add_schema(M::TYPE, "ros2msg", M::DEFINITION.as_bytes()).map_err(io_error)?;
+        let id = self.writer.add_channel(schema, topic, "cdr", &facts.collect()).map_err(io_error)?;
+        Ok(Channel { id, sequence: 0 })
+    }
+
+    /// A message. Nothing is allocated for it but the chunk's growth.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) -> io::Result<()> {
+        message.encode_into(&mut self.buffer);
+        let header = MessageHeader {
+            channel_id: channel.id,
+            sequence: channel.sequence,
+            log_time: nanos,
+            publish_time: nanos,
+        };
+        self.writer.write_to_known_channel(&header, &self.buffer).map_err(io_error)?;
+        channel.sequence = channel.sequence.wrapping_add(1);
+        self.messages += 1;
+        self.raw += HEAD + self.buffer.len() as u64;
+        Ok(())
+    }
+
+    /// Messages so far.
+    #[must_use]
+    pub const fn messages(&self) -> u64 {
+        self.messages
+    }
+
+    /// At least as many chunks as there are so far.
+    #[must_use]
+    pub const fn chunks(&self) -> u64 {
+        self.flushes + self.raw / CHUNK + 1
+    }
+
+    /// Ends the chunk and hands everything on: what is in the file from here on can be read.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.flushes += 1;
+        self.writer.flush().map_err(io_error)
+    }
+
+    /// Writes the end: indexes and figures, by which readers find their way.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn finish(&mut self) -> io::Result<()> {
+        self.writer.finish().map(|_| ()).map_err(io_error)
+    }
+
+    /// The output, without an end if none was written.
+    #[must_use]
+    pub fn into_inner(self) -> W {
+        self.writer.into_inner().into_inner()
+    }
+}

@@ -1,0 +1,407 @@
+//! A recording's MCAP files, one after the other: each is begun with what makes it readable by itself, flushed,
+//! ended when it is large or old enough, and given its name when it is whole.
+//!
+//! After an error the file takes nothing more. It is kept, mended at the end, and another one is tried every few
+//! seconds; what comes meanwhile is counted.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rustix::fs::statvfs;
+
+use super::account::Written;
+use super::file::FileWriter;
+use super::names::{self, Part};
+use super::repair;
+use super::sink::{Gauge, Sink, folder_of};
+
+/// Bytes that go to the file together; a chunk is larger and goes by itself.
+const BUFFER: usize = 64 << 10;
+/// Between an error and another attempt.
+const RETRY: Duration = Duration::from_secs(5);
+/// Room on a disk that was full before it is tried again.
+const ROOM: u64 = 64 << 20;
+
+/// The writer of a file.
+pub type Writer = FileWriter<BufWriter<Sink>>;
+
+/// When another file is begun.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Split {
+    /// When this one has so many bytes.
+    pub bytes: u64,
+    /// When it is so old.
+    pub age: Duration,
+}
+
+impl Default for Split {
+    /// 1 GiB, or 10 minutes.
+    fn default() -> Self {
+        Self { bytes: 1 << 30, age: Duration::from_secs(600) }
+    }
+}
+
+/// A file in the file.
+#[derive(Clone, Debug)]
+pub struct Attached {
+    /// Its name there.
+    pub name: &'static str,
+    /// What it is.
+    pub media_type: &'static str,
+    /// Its bytes.
+    pub bytes: Vec<u8>,
+}
+
+/// What each file begins with.
+#[derive(Clone, Debug, Default)]
+pub struct Head {
+    /// When the recording began, in ns since 1970.
+    pub nanos: u64,
+    /// Facts by name.
+    pub metadata: Vec<(&'static str, BTreeMap<String, String>)>,
+    /// Files.
+    pub attachments: Vec<Attached>,
+}
+
+impl Head {
+    fn write(&self, writer: &mut Writer, number: u32) -> io::Result<()> {
+        for (name, facts) in &self.metadata {
+            writer.metadata(name, facts)?;
+        }
+        let place = [("number".to_owned(), number.to_string())];
+        writer.metadata("part", &BTreeMap::from(place))?;
+        for Attached { name, media_type, bytes } in &self.attachments {
+            writer.attach(name, media_type, self.nanos, bytes)?;
+        }
+        Ok(())
+    }
+}
+
+/// A file that is being written.
+struct Open<T> {
+    writer: Writer,
+    topics: T,
+    part: Part,
+    gauge: Arc<Gauge>,
+    began: Instant,
+    /// In the file, flushed.
+    kept: Count,
+    /// Written since.
+    pending: Count,
+}
+
+/// A file that broke off, held until it is mended.
+struct Broken {
+    part: Part,
+    file: File,
+    kept: Count,
+}
+
+/// How many.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Count {
+    /// Frames.
+    pub frames: u64,
+    /// Other messages.
+    pub others: u64,
+}
+
+impl Count {
+    fn add(&mut self, other: Self) {
+        self.frames += other.frames;
+        self.others += other.others;
+    }
+}
+
+/// What is written.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum What {
+    /// A frame of a bus.
+    Frame,
+    /// Anything else.
+    Other,
+}
+
+/// The files of a recording; `T` is what a file's channels are kept in.
+pub struct Series<T> {
+    path: PathBuf,
+    force: bool,
+    split: Split,
+    head: Head,
+    /// The number of the file that is open, or was last.
+    number: u32,
+    /// Claimed, and not begun.
+    claimed: Option<(Part, File)>,
+    /// Files of an earlier recording whose places this one takes.
+    stale: Vec<PathBuf>,
+    open: Option<Open<T>>,
+    /// When the last error was.
+    failed: Option<Instant>,
+    broken: Vec<Broken>,
+    written: Vec<Written>,
+    lost: Count,
+    /// What people should know.
+    said: Vec<String>,
+}
+
+impl<T> core::fmt::Debug for Series<T> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Series")
+            .field("path", &self.path)
+            .field("number", &self.number)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<T> Series<T> {
+    /// Claims the first file, so that what makes that impossible is known before there is anything to write.
+    ///
+    /// # Errors
+    /// When somebody else has it, or it cannot be written.
+    pub fn claim(path: &Path, force: bool, split: Split) -> io::Result<Self> {
+        let stale = names::series(path);
+        if let Some(there) = stale.first().filter(|_| !force) {
+            let why = format!("{} exists: name another file, or overwrite it with --force", there.display());
+            return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
+        }
+        Ok(Self {
+            claimed: Some(Part::create(path.to_owned())?),
+            stale,
+            path: path.to_owned(),
+            force,
+            split,
+            head: Head::default(),
+            number: 0,
+            open: None,
+            failed: None,
+            broken: Vec::new(),
+            written: Vec::new(),
+            lost: Count::default(),
+            said: Vec::new(),
+        })
+    }
+
+    /// Begins the first file.
+    pub fn begin(&mut self, head: Head, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
+        self.head = head;
+        let Some((part, file)) = self.claimed.take() else { return };
+        match self.start(part, file, topics) {
+            Ok(open) => self.open = Some(open),
+            Err(error) => self.fail(&error),
+        }
+    }
+
+    fn start(
+        &self,
+        part: Part,
+        file: File,
+        topics: impl FnOnce(&mut Writer) -> io::Result<T>,
+    ) -> io::Result<Open<T>> {
+        let begin = || {
+            let (sink, gauge) = Sink::new(file, &folder_of(&part.path))?;
+            let mut writer = Writer::new(BufWriter::with_capacity(BUFFER, sink))?;
+            self.head.write(&mut writer, self.number)?;
+            let topics = topics(&mut writer)?;
+            writer.flush()?;
+            if gauge.is_full() {
+                return Err(io::ErrorKind::StorageFull.into());
+            }
+            Ok((writer, topics, gauge))
+        };
+        match begin() {
+            Ok((writer, topics, gauge)) => {
+                let (kept, pending) = (Count::default(), Count::default());
+                Ok(Open { writer, topics, part, gauge, began: Instant::now(), kept, pending })
+            }
+            Err(error) => {
+                // There is nothing in it.
+                let _ = std::fs::remove_file(&part.path);
+                Err(error)
+            }
+        }
+    }
+
+    /// Writes something into the file that is open; without one it is counted.
+    pub fn put(&mut self, what: What, write: impl FnOnce(&mut Writer, &mut T) -> io::Result<()>) {
+        let count = match what {
+            What::Frame => Count { frames: 1, others: 0 },
+            What::Other => Count { frames: 0, others: 1 },
+        };
+        let Some(open) = &mut self.open else { return self.lost.add(count) };
+        open.pending.add(count);
+        if let Err(error) = write(&mut open.writer, &mut open.topics) {
+            self.break_off(&error);
+        }
+    }
+
+    /// Hands on what was written; ends a file that is large or old enough, or whose disk is full. Whether another
+    /// file should be begun with [`Series::next`].
+    pub fn flush(&mut self) -> bool {
+        let Some(open) = &mut self.open else {
+            let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
+            return due && has_room(&self.path);
+        };
+        if let Err(error) = open.writer.flush() {
+            self.break_off(&error);
+            return false;
+        }
+        open.kept.add(std::mem::take(&mut open.pending));
+        open.gauge.reserve_for(open.writer.chunks());
+        if open.gauge.is_full() {
+            self.end();
+            self.fail(&io::ErrorKind::StorageFull.into());
+            return false;
+        }
+        let enough = open.gauge.bytes() >= self.split.bytes || open.began.elapsed() >= self.split.age;
+        if enough {
+            self.end();
+        }
+        enough
+    }
+
+    /// Begins another file; whether that was possible.
+    pub fn next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
+        let number = self.number + 1;
+        let goal = names::numbered(&self.path, number);
+        let failed_before = self.failed;
+        let before = std::mem::replace(&mut self.number, number);
+        match Part::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
+            Ok(open) => {
+                if failed_before.is_some() {
+                    self.said.push(format!("recording goes on in {}", open.part.goal.display()));
+                }
+                (self.failed, self.open) = (None, Some(open));
+                true
+            }
+            Err(error) => {
+                self.fail(&error);
+                self.number = before;
+                false
+            }
+        }
+    }
+
+    /// Whether something is being written.
+    #[must_use]
+    pub const fn is_open(&self) -> bool {
+        self.open.is_some()
+    }
+
+    /// Frames and others that were not written.
+    #[must_use]
+    pub const fn lost(&self) -> Count {
+        self.lost
+    }
+
+    /// Bytes of the file that is open.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        self.open.as_ref().map_or(0, |open| open.gauge.bytes())
+    }
+
+    /// What people should know since they were told last.
+    pub fn said(&mut self) -> std::vec::Drain<'_, String> {
+        self.said.drain(..)
+    }
+
+    /// Ends the file and gives it its name.
+    fn end(&mut self) {
+        let Some(mut open) = self.open.take() else { return };
+        if let Err(error) = open.writer.finish() {
+            self.open = Some(open);
+            return self.break_off(&error);
+        }
+        open.kept.add(open.pending);
+        let (kept, gauge, part) = (open.kept, open.gauge, open.part);
+        let path = match part.finish(self.force) {
+            Ok(()) => part.goal,
+            Err(error) => {
+                self.said.push(format!(
+                    "{}: {error}; the recording is {}",
+                    part.goal.display(),
+                    part.path.display()
+                ));
+                part.path
+            }
+        };
+        let path = path.display().to_string();
+        let messages = kept.frames + kept.others;
+        self.written.push(Written {
+            path,
+            format: "mcap",
+            frames: kept.frames,
+            messages,
+            bytes: gauge.bytes(),
+        });
+    }
+
+    /// The file takes nothing more.
+    fn break_off(&mut self, error: &io::Error) {
+        let Some(open) = self.open.take() else { return };
+        self.lost.add(open.pending);
+        // What is buffered is a part of something; the file stays held until it is mended.
+        let (sink, _) = open.writer.into_inner().into_parts();
+        self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });
+        self.fail(error);
+    }
+
+    fn fail(&mut self, error: &io::Error) {
+        if self.failed.replace(Instant::now()).is_none() {
+            let path = names::numbered(&self.path, self.number);
+            self.said.push(format!(
+                "{}: {error}: the run goes on without it; what was recorded so far stays readable, what comes now is counted",
+                path.display()
+            ));
+        }
+    }
+
+    /// Ends the recording: its files, and what was lost.
+    pub fn finish(&mut self) -> (Vec<Written>, Count) {
+        self.end();
+        for Broken { part, file, kept } in std::mem::take(&mut self.broken) {
+            match repair::repair(&part.path, &part.goal) {
+                Ok((recovered, bytes)) => {
+                    // More may have come to the disk than is known of, or less.
+                    self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
+                    let others = recovered.messages - recovered.frames;
+                    self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
+                    let path = part.goal.display().to_string();
+                    let (frames, messages) = (recovered.frames, recovered.messages);
+                    self.written.push(Written { path, format: "mcap", frames, messages, bytes });
+                }
+                Err(error) => {
+                    let path = part.path.display().to_string();
+                    self.said.push(format!("{path}: {error}; mend it with `gateway recover {path}`"));
+                    let messages = kept.frames + kept.others;
+                    let bytes = file.metadata().map_or(0, |about| about.len());
+                    self.written.push(Written { path, format: "mcap", frames: kept.frames, messages, bytes });
+                }
+            }
+        }
+        // One that is longer than this one would seem to go on with the other's files.
+        for stale in std::mem::take(&mut self.stale) {
+            if !self.written.iter().any(|written| Path::new(&written.path) == stale) {
+                // It was to be overwritten; that it is still there harms nobody.
+                let _ = std::fs::remove_file(stale);
+            }
+        }
+        (std::mem::take(&mut self.written), self.lost)
+    }
+}
+
+impl<T> Drop for Series<T> {
+    fn drop(&mut self) {
+        if let Some((part, _)) = &self.claimed {
+            // There is nothing in it.
+            let _ = std::fs::remove_file(&part.path);
+        }
+    }
+}
+
+fn has_room(path: &Path) -> bool {
+    statvfs(folder_of(path)).is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= ROOM)
+}

@@ -1,0 +1,134 @@
+//! The file below a recording: counted, and with room in reserve, so that a disk that becomes full leaves a file
+//! with its end.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, open};
+
+/// What a file without a single chunk may need for its end, a chunk on the way included.
+const RESERVE: u64 = 512 << 10;
+/// What the end grows by with each chunk: its entry in the index.
+const RESERVE_FOR_CHUNK: u64 = 400;
+
+/// What is known of a file from outside of its writer.
+#[derive(Debug, Default)]
+pub struct Gauge {
+    bytes: AtomicU64,
+    full: AtomicBool,
+    reserve: Mutex<Option<Reserve>>,
+}
+
+/// Room on a disk, held by a file without a name.
+#[derive(Debug)]
+struct Reserve {
+    file: File,
+    bytes: u64,
+}
+
+impl Gauge {
+    /// Bytes in the file.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        self.bytes.load(Ordering::Relaxed)
+    }
+
+    /// Whether the disk is full: the file lives on what was in reserve and has to be ended now.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        self.full.load(Ordering::Relaxed)
+    }
+
+    /// Makes sure of the room that the end of a file of so many chunks needs.
+    pub fn reserve_for(&self, chunks: u64) {
+        let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(reserve) = held.as_mut() else { return };
+        let wanted = RESERVE + chunks * RESERVE_FOR_CHUNK;
+        if wanted <= reserve.bytes {
+            return;
+        }
+        let more = wanted.next_multiple_of(RESERVE);
+        match fallocate(&reserve.file, FallocateFlags::empty(), 0, more) {
+            Ok(()) => reserve.bytes = more,
+            Err(_) => {
+                *held = None;
+                self.full.store(true, Ordering::Relaxed);
+            }
+        }
+    }
+
+    /// Lets go of the room; whether there was any.
+    fn use_reserve(&self) -> bool {
+        self.full.store(true, Ordering::Relaxed);
+        self.reserve.lock().unwrap_or_else(PoisonError::into_inner).take().is_some()
+    }
+}
+
+/// A file that is written to its end also when its disk becomes full meanwhile.
+#[derive(Debug)]
+pub struct Sink {
+    file: File,
+    gauge: Arc<Gauge>,
+}
+
+impl Sink {
+    /// Takes a file of a folder over, and room beside it. Where the file system gives none, a full disk is
+    /// like any other error.
+    ///
+    /// # Errors
+    /// When there is not even the room that an end needs.
+    pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<Gauge>)> {
+        let reserve = reserve(folder)?;
+        let gauge = Arc::new(Gauge { reserve: Mutex::new(reserve), ..Gauge::default() });
+        Ok((Self { file, gauge: Arc::clone(&gauge) }, gauge))
+    }
+
+    /// The file.
+    #[must_use]
+    pub fn into_file(self) -> File {
+        self.file
+    }
+}
+
+/// Room for an end; none where the file system has no files without a name, or no room that is held.
+fn reserve(folder: &Path) -> io::Result<Option<Reserve>> {
+    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+    let Ok(file) = open(folder, flags, Mode::from_raw_mode(0o600)) else { return Ok(None) };
+    let file = File::from(file);
+    match fallocate(&file, FallocateFlags::empty(), 0, RESERVE) {
+        Ok(()) => Ok(Some(Reserve { file, bytes: RESERVE })),
+        Err(error) if is_full(&error.into()) => Err(error.into()),
+        Err(_) => Ok(None),
+    }
+}
+
+/// Whether an error says that there is no room.
+#[must_use]
+pub fn is_full(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+}
+
+impl Write for Sink {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = match self.file.write(bytes) {
+            Err(error) if is_full(&error) && self.gauge.use_reserve() => self.file.write(bytes),
+            written => written,
+        }?;
+        self.gauge.bytes.fetch_add(written as u64, Ordering::Relaxed);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// The folder of a file.
+#[must_use]
+pub fn folder_of(path: &Path) -> PathBuf {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    folder.unwrap_or_else(|| Path::new(".")).to_owned()
+}
