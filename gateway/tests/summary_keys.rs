@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use gateway::summary::{
     AccuracySummary, BusSummary, ErrorsSummary, Loop, Processor, Quantiles, Recording, RepliesSummary,
-    Summary, histogram,
+    Summary, Written, histogram,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
@@ -58,7 +58,16 @@ fn summary(bus: BusSummary) -> Summary {
         buses: vec![bus],
         processor: Processor::default(),
         cell_private_kib: Some(768),
-        recording: Some(Recording { path: "run.log".to_owned(), frames: 0, lost: 0 }),
+        recording: Some(Recording {
+            files: vec![Written {
+                path: "run.log".to_owned(),
+                format: "candump",
+                frames: 0,
+                messages: 0,
+                bytes: 0,
+            }],
+            ..Recording::default()
+        }),
     }
 }
 
@@ -72,6 +81,7 @@ fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<
         Value::Array(all) if all.iter().any(Value::is_object) => {
             return all.iter().for_each(|value| keys(&format!("{path}[]"), value, maps, into));
         }
+        Value::Array(_) if path == "recording.errors" => "texts",
         Value::Array(_) => "numbers",
         Value::Object(object) if object.contains_key("p50") => "quantiles",
         Value::Object(object) if object.contains_key("mean_nm") => "errors",

@@ -22,7 +22,7 @@ fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
     let lines = place.read("run.log").lines().count();
     assert_eq!(summary.number("/recording/frames"), u64::try_from(lines).unwrap());
     assert_eq!((lines as u64, summary.number("/recording/lost")), (counted, 0), "{:#}", summary.0);
-    assert_eq!(summary.0["recording"]["path"], "run.log");
+    assert_eq!(summary.0["recording"]["files"][0]["path"], "run.log");
 }
 
 #[test]

@@ -7,6 +7,7 @@ mod dump;
 mod frame;
 mod output;
 mod print;
+mod recover;
 mod replay;
 mod run;
 mod skin;
@@ -29,6 +30,7 @@ struct Arguments {
 enum Command {
     Demo(run::Demo),
     Run(run::Run),
+    Recover(recover::Recover),
     Dump(dump::Dump),
     Replay(replay::Replay),
     Frame(frame::Frame),
@@ -42,6 +44,7 @@ impl Command {
         match self {
             Self::Demo(command) => command.run(),
             Self::Run(command) => command.run(),
+            Self::Recover(command) => command.run(),
             Self::Dump(command) => command.run(),
             Self::Replay(command) => command.run(),
             Self::Frame(command) => command.run(),

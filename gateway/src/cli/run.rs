@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
+use gateway::dbc;
 use gateway::record::series::{Attached, Split};
 use gateway::record::{self, account::Recording as Recorded};
 use gateway::run::file::WholeFile;
@@ -97,12 +98,13 @@ fn limit(text: &str) -> Result<Limit, String> {
 }
 
 impl Recording {
-    /// What is recorded where; `skin` and `scenario` are the files that go with it, as they are.
+    /// What is recorded where; the files go with it as they are.
     fn options(
         self,
         candump: Option<PathBuf>,
-        skin: impl FnOnce() -> Result<Vec<u8>, Failure>,
-        scenario: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
+        skin: &Skin,
+        skin_file: impl FnOnce() -> Result<Vec<u8>, Failure>,
+        scenario_file: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
     ) -> Result<record::Options, Failure> {
         let mut split = Split::default();
         for limit in self.record_split {
@@ -112,10 +114,19 @@ impl Recording {
             }
         }
         let mcap = self.record.map(|path| {
-            let toml = "application/toml";
-            let attached = |name, bytes| Attached { name, media_type: toml, bytes };
-            let mut attachments = vec![attached("skin.toml", skin()?)];
-            attachments.extend(scenario()?.map(|bytes| attached("scenario.toml", bytes)));
+            let toml =
+                |name: &str, bytes| Attached { name: name.to_owned(), media_type: "application/toml", bytes };
+            let mut attachments = vec![toml("skin.toml", skin_file()?)];
+            attachments.extend(scenario_file()?.map(|bytes| toml("scenario.toml", bytes)));
+            attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
+                name: if skin.buses.len() == 1 {
+                    "skin.dbc".to_owned()
+                } else {
+                    format!("skin-{}.dbc", bus.name)
+                },
+                media_type: "text/plain",
+                bytes: dbc::dbc(skin, index).into_bytes(),
+            }));
             let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
             Ok::<_, Failure>(record::Mcap { path, split, attachments, command_line })
         });
@@ -202,7 +213,7 @@ impl Demo {
         // Who shows it again wants no other name for it.
         recording.force |= self.candump == Path::new(DEMO_LOG);
         let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
-        options.record = recording.options(Some(self.candump), texts.0, texts.1)?;
+        options.record = recording.options(Some(self.candump), &options.skin, texts.0, texts.1)?;
         bench(&options, summary.as_deref())
     }
 }
@@ -223,6 +234,7 @@ impl Run {
         options.kind = self.bus_kind;
         options.record = recording.options(
             self.candump,
+            &options.skin,
             || read(&skin_file),
             || scenario_file.as_deref().map(read).transpose(),
         )?;

@@ -13,25 +13,38 @@ use crate::run::file::WholeFile;
 /// # Errors
 /// When nothing can be recovered or written; the file stays as it is.
 pub fn repair(part: &Path, goal: &Path) -> Result<(Recovered, u64), RecoverError> {
-    let repaired = copy(part, goal)?;
+    let (recovered, bytes) = copy(part, goal, |_| true)?;
     fs::remove_file(part).map_err(RecoverError::Write)?;
-    Ok(repaired)
+    Ok((recovered, bytes.unwrap_or(0)))
 }
 
-/// Makes a whole file of another one. What it came to, and the new one's bytes.
+/// Makes a whole file of another one, unless that is whole itself. What it came to, and the new one's bytes if
+/// there is a new one.
 ///
 /// # Errors
 /// When nothing can be recovered or written.
-pub fn copy(from: &Path, to: &Path) -> Result<(Recovered, u64), RecoverError> {
+pub fn copy_unless_sound(from: &Path, to: &Path) -> Result<(Recovered, Option<u64>), RecoverError> {
+    copy(from, to, |recovered| !recovered.is_sound())
+}
+
+fn copy(
+    from: &Path,
+    to: &Path,
+    wanted: impl FnOnce(&Recovered) -> bool,
+) -> Result<(Recovered, Option<u64>), RecoverError> {
     let from = BufReader::with_capacity(1 << 20, File::open(from).map_err(RecoverError::Read)?);
     let (whole, file) = WholeFile::create(to).map_err(RecoverError::Write)?;
     let about = file.try_clone().map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let recovered = recover(from, &mut out)?;
-    let finish = || -> io::Result<u64> {
+    let wanted = wanted(&recovered);
+    let finish = || -> io::Result<Option<u64>> {
+        if !wanted {
+            return Ok(None);
+        }
         out.flush()?;
         whole.finish()?;
-        Ok(about.metadata()?.len())
+        Ok(Some(about.metadata()?.len()))
     };
     Ok((recovered, finish().map_err(RecoverError::Write)?))
 }

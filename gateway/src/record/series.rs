@@ -32,7 +32,7 @@ pub type Writer = FileWriter<BufWriter<Sink>>;
 /// When another file is begun.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Split {
-    /// When this one has so many bytes.
+    /// When this one has so many bytes beside what each file begins with.
     pub bytes: u64,
     /// When it is so old.
     pub age: Duration,
@@ -49,7 +49,7 @@ impl Default for Split {
 #[derive(Clone, Debug)]
 pub struct Attached {
     /// Its name there.
-    pub name: &'static str,
+    pub name: String,
     /// What it is.
     pub media_type: &'static str,
     /// Its bytes.
@@ -87,6 +87,8 @@ struct Open<T> {
     topics: T,
     part: Part,
     gauge: Arc<Gauge>,
+    /// Bytes before the first message.
+    head: u64,
     began: Instant,
     /// In the file, flushed.
     kept: Count,
@@ -122,8 +124,8 @@ impl Count {
 pub enum What {
     /// A frame of a bus.
     Frame,
-    /// Anything else.
-    Other,
+    /// So many other messages.
+    Others(u64),
 }
 
 /// The files of a recording; `T` is what a file's channels are kept in.
@@ -214,8 +216,8 @@ impl<T> Series<T> {
         };
         match begin() {
             Ok((writer, topics, gauge)) => {
-                let (kept, pending) = (Count::default(), Count::default());
-                Ok(Open { writer, topics, part, gauge, began: Instant::now(), kept, pending })
+                let (kept, pending, head) = (Count::default(), Count::default(), gauge.bytes());
+                Ok(Open { writer, topics, part, gauge, head, began: Instant::now(), kept, pending })
             }
             Err(error) => {
                 // There is nothing in it.
@@ -229,7 +231,7 @@ impl<T> Series<T> {
     pub fn put(&mut self, what: What, write: impl FnOnce(&mut Writer, &mut T) -> io::Result<()>) {
         let count = match what {
             What::Frame => Count { frames: 1, others: 0 },
-            What::Other => Count { frames: 0, others: 1 },
+            What::Others(others) => Count { frames: 0, others },
         };
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         open.pending.add(count);
@@ -256,7 +258,8 @@ impl<T> Series<T> {
             self.fail(&io::ErrorKind::StorageFull.into());
             return false;
         }
-        let enough = open.gauge.bytes() >= self.split.bytes || open.began.elapsed() >= self.split.age;
+        let enough =
+            open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
         if enough {
             self.end();
         }

@@ -200,7 +200,8 @@ impl Work {
             self.greatest_late_ns = self.greatest_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             if let Some(series) = &mut self.series {
-                series.put(What::Other, |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
+                series
+                    .put(What::Others(4), |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
             }
         }
     }
@@ -216,7 +217,8 @@ impl Work {
             seen.epochs += 1;
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
-                series.put(What::Other, |writer, topics| {
+                let messages = if q.is_some() { 2 } else { 1 };
+                series.put(What::Others(messages), |writer, topics| {
                     topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -264,7 +266,7 @@ impl Work {
             ],
         });
         let now = wall();
-        series.put(What::Other, |writer, topics| topics.diagnostics(writer, now, &parts));
+        series.put(What::Others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
     }
 
     fn flush(&mut self) {
@@ -275,7 +277,7 @@ impl Work {
         // So that this file can be understood without the one before.
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.in_force.frames() {
-                series.put(What::Other, |writer, topics| topics.in_force(writer, bus, name, &frame));
+                series.put(What::Others(1), |writer, topics| topics.in_force(writer, bus, name, &frame));
             }
         }
         for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
@@ -359,7 +361,7 @@ impl Dropped<'_> {
         if let Some(series) = series {
             let kind = NoteKind::Dropped(frames);
             let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-            series.put(What::Other, |writer, topics| topics.note(writer, &note));
+            series.put(What::Others(1), |writer, topics| topics.note(writer, &note));
         }
     }
 }

@@ -1,0 +1,60 @@
+//! `gateway recover`: makes a recording whole whose writer was killed.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::Args;
+use gateway::record::{names, repair};
+use protocol::usage::Failure;
+
+/// Make a recording whole that ends in the middle
+///
+/// Copies everything that is whole into a new file with its indexes, and says what was not. The recording stays as
+/// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
+/// or nothing was wrong; 1: it cannot be done; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Example:\n  gateway recover run.mcap.part -o run.mcap")]
+pub(crate) struct Recover {
+    /// The recording: an MCAP file, of whomever
+    file: PathBuf,
+    /// The new file; else FILE-recovered.mcap
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Overwrite a file that exists
+    #[arg(long)]
+    force: bool,
+}
+
+impl Recover {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let name = self.file.display();
+        let file = File::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        if names::is_held(&file) {
+            return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
+        }
+        let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
+        let there = fs::symlink_metadata(&output).is_ok_and(|about| about.is_file());
+        let out = output.display();
+        if fs::canonicalize(&output)
+            .is_ok_and(|path| fs::canonicalize(&self.file).is_ok_and(|file| file == path))
+        {
+            return Err(Failure::usage(format!("-o {out} is the recording itself: name another file")));
+        }
+        if there && !self.force {
+            return Err(Failure::usage(format!(
+                "-o {out}: {out} exists: name another file, or overwrite it with --force"
+            )));
+        }
+        let failure = |error| Failure::run(format!("{name}: {error}"));
+        let line = match repair::copy_unless_sound(&self.file, &output).map_err(failure)? {
+            (recovered, None) => {
+                format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
+            }
+            (recovered, Some(bytes)) => format!("{out}, {bytes} bytes: {recovered}"),
+        };
+        // Whoever closed it has seen enough.
+        let _ = writeln!(std::io::stdout(), "{line}");
+        Ok(())
+    }
+}
