@@ -38,6 +38,7 @@ impl Source {
             if if pass == 0 { self.restores.0 } else { self.restores.1 } {
                 self.push(&mut queue, reel.restoring());
             }
+            self.hall.judge().record_begin();
             self.pass(path, &mut reel, &mut queue)?;
             pass = pass.saturating_add(1);
         }

@@ -139,7 +139,8 @@ struct Excuse {
 /// Recorded answers to `configure`, and those that came now, as far as they are not compared yet.
 #[derive(Debug, Default)]
 struct Answers {
-    recorded: VecDeque<(u8, Answer)>,
+    /// With the number of rounds before it.
+    recorded: VecDeque<(u64, u8, Answer)>,
     now: VecDeque<(u8, Answer)>,
 }
 
@@ -158,6 +159,8 @@ struct Lane {
     base: u64,
     rounds: VecDeque<Round>,
     answers: BTreeMap<CellId, Answers>,
+    /// Rounds that were announced.
+    sent: u64,
     /// The round after which the capture has no more joints.
     last_round: Option<u64>,
     is_down: bool,
@@ -179,7 +182,7 @@ pub struct Judge {
 
 impl Judge {
     /// For some buses, by what they are called now and their cells in the capture. Replies are compared if `expects`
-    /// says so.
+    /// says so, once it is no longer muted.
     #[must_use]
     pub fn new(
         buses: impl IntoIterator<Item = (String, BTreeMap<CellId, Surveyed>)>,
@@ -190,7 +193,7 @@ impl Judge {
         Self {
             lanes,
             expects,
-            is_muted: false,
+            is_muted: true,
             first_nanos,
             tally: Tally::default(),
             first: None,
@@ -220,7 +223,8 @@ impl Judge {
         if let (Message::Configured { from, tag, answer }, true) = (*message, is_in_part)
             && is_compared(answer)
         {
-            lane.answers.entry(from).or_default().recorded.push_back((tag, answer));
+            let rounds = lane.base + lane.rounds.len() as u64;
+            lane.answers.entry(from).or_default().recorded.push_back((rounds, tag, answer));
         }
         if matches!(message, Message::Sum { .. }) && is_in_part {
             tally.lacking.sums += 1;
@@ -237,6 +241,13 @@ impl Judge {
                 tally.lacking.joints_unrecorded += 1;
             }
             None => {}
+        }
+    }
+
+    /// Takes in that the capture begins anew: replies before its first joints answer none of the last pass.
+    pub fn record_begin(&mut self) {
+        for lane in &mut self.lanes {
+            lane.recorded.fill(None);
         }
     }
 
@@ -259,6 +270,7 @@ impl Judge {
             present.heartbeats = 0;
         }
         let Some(number) = round else { return };
+        it.sent = it.sent.max(number + 1);
         if let Some(round) = it.round(number) {
             round.fate = Fate::Sent;
         }
@@ -386,9 +398,12 @@ impl Judge {
         }
     }
 
-    /// From now on replies are not those of the capture, or are again.
+    /// From now on replies are not those of the capture, or are again: then to joints that are yet to be sent.
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
+        for asked in self.lanes.iter_mut().flat_map(|lane| lane.asked.iter_mut().flatten()) {
+            asked.round = None;
+        }
     }
 
     /// The bus on which another gateway has spoken.
@@ -402,8 +417,12 @@ impl Judge {
         self.lanes.get(lane).into_iter().flat_map(|lane| lane.roll.iter().map(|(cell, it)| (*cell, it)))
     }
 
-    /// Judges all that has been sent, and what was answered otherwise.
-    pub fn finish(&mut self) {
+    /// Judges all that has been sent, and hears no more; `is_whole` says whether that was all that the capture has.
+    pub fn finish(&mut self, is_whole: bool) {
+        self.is_muted = true;
+        for lane in self.lanes.iter_mut().filter(|_| !is_whole) {
+            lane.forget_the_unsent();
+        }
         for lane in 0..self.lanes.len() {
             while self.lanes.get(lane).is_some_and(|lane| !lane.rounds.is_empty()) {
                 self.close_round(lane);
@@ -498,7 +517,8 @@ impl Judge {
         let Some(lane) = self.lanes.get_mut(index) else { return };
         for (cell, Answers { mut recorded, mut now }) in std::mem::take(&mut lane.answers) {
             loop {
-                let (recorded, now) = (recorded.pop_front(), now.pop_front());
+                let recorded = recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
+                let now = now.pop_front();
                 let (count, how) = match (recorded, now) {
                     (None, None) => break,
                     (Some(recorded), Some(now)) if recorded == now => {
@@ -595,6 +615,7 @@ impl Lane {
             base: 0,
             rounds: VecDeque::new(),
             answers: BTreeMap::new(),
+            sent: 0,
             last_round: None,
             is_down: false,
         }
@@ -603,6 +624,18 @@ impl Lane {
     fn round(&mut self, number: u64) -> Option<&mut Round> {
         let at = number.checked_sub(self.base)?;
         self.rounds.get_mut(usize::try_from(at).ok()?)
+    }
+
+    /// Forgets recorded replies to what was not sent. What was sent after the last joints nobody knows, so replies to
+    /// that are not missed.
+    fn forget_the_unsent(&mut self) {
+        let sent = self.sent;
+        for answers in self.answers.values_mut() {
+            answers.recorded.retain(|(rounds, ..)| *rounds < sent);
+        }
+        if let Some(last) = sent.checked_sub(1).and_then(|last| self.round(last)) {
+            last.replies.retain(|(_, what), pair| *what == What::Torque || pair.now.is_some());
+        }
     }
 
     fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {

@@ -191,6 +191,7 @@ impl<'a> Session<'a> {
                     // Where the counters begin; a bus that is down says so at the first frame.
                     let _ = live.report(lane);
                 }
+                live.hall.judge().mute(false);
             }
             let played = player.play(&mut Queue(steps), &mut live);
             (played, live, granted)
@@ -217,6 +218,7 @@ impl<'a> Session<'a> {
                 }
             }
         }
+        self.hall.judge().finish(!played.was_stopped && played.failure.is_none());
         for line in said.try_iter() {
             self.teller.say(&line);
         }
@@ -271,6 +273,7 @@ impl<'a> Session<'a> {
     /// How long it is, in ms of the capture; none when it has no end.
     fn length(&self) -> Option<u64> {
         let (from, to) = self.survey.bounds();
+        let from = from.max(self.survey.first.unwrap_or(0));
         let one = to.min(self.survey.last).saturating_sub(from) / 1_000_000;
         self.options.passes.map(|passes| one * u64::from(passes))
     }
@@ -294,8 +297,7 @@ impl<'a> Session<'a> {
         unheard: &[u64],
         idle: Option<&Histogram<u64>>,
     ) -> Summary {
-        let mut judge = self.hall.judge();
-        judge.finish();
+        let judge = self.hall.judge();
         let total = |of: fn(&LaneTally) -> u64| played.lanes.iter().map(of).sum();
         let bus = |(index, (bus, name)): (usize, &(usize, String))| {
             let lane = self.buses.lanes.get(index)?;

@@ -113,11 +113,10 @@ impl Survey {
     /// Takes the next frame.
     pub fn take(&mut self, record: &Record<'_>) {
         let nanos = record.time.nanos;
-        let first = *self.first.get_or_insert(nanos);
+        self.first.get_or_insert(nanos);
         self.last = self.last.max(nanos);
         self.frames += 1;
-        let begins = first.saturating_add(self.part.from);
-        let ends = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
+        let (begins, ends) = self.bounds();
         let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         let bus = self.bus(record.interface);
         bus.frames += 1;
@@ -148,12 +147,13 @@ impl Survey {
         }
     }
 
-    /// The part, in ns since 1970: from, and up to and without.
+    /// The part, in ns since 1970: from, and up to and without. From the beginning on means all, also what is older
+    /// than the first frame.
     #[must_use]
     pub fn bounds(&self) -> (u64, u64) {
         let first = self.first.unwrap_or(0);
         let end = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
-        (first.saturating_add(self.part.from), end)
+        (if self.part.from == 0 { 0 } else { first.saturating_add(self.part.from) }, end)
     }
 
     /// Where a bus stands, by its name in the capture.
@@ -210,9 +210,6 @@ impl Bus {
         if is_before {
             self.state.take(message);
         }
-        if let Some(cell) = sender(message.encode().id).and_then(|cell| self.cells.get_mut(&cell)) {
-            cell.count();
-        }
         match *message {
             Message::Joints { epoch, joints } => {
                 self.joints += 1;
@@ -253,6 +250,10 @@ impl Bus {
             | Message::Configure { .. }
             | Message::Configured { .. }
             | Message::Stimulus { .. } => {}
+        }
+        // After a heartbeat has been read: what it says was sent is what was sent before it.
+        if let Some(cell) = sender(message.encode().id).and_then(|cell| self.cells.get_mut(&cell)) {
+            cell.count();
         }
     }
 
@@ -318,8 +319,7 @@ impl Cell {
             let difference = u64::from(heartbeat.sent.wrapping_sub(sent));
             self.unrecorded += difference.saturating_sub(packets);
         }
-        // The heartbeat itself is the first packet after what it counts.
-        self.counted = Some((heartbeat.sent, 1));
+        self.counted = Some((heartbeat.sent, 0));
         if settled && (is_before || self.hash == Known::No) {
             self.hash = Known::Yes(heartbeat.configuration);
         }

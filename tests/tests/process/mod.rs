@@ -12,6 +12,7 @@
 )]
 
 pub(crate) mod log;
+pub(crate) mod replay;
 pub(crate) mod vcan;
 pub(crate) mod whole;
 
@@ -109,6 +110,11 @@ impl Place {
     pub(crate) fn on_vcan() -> Self {
         vcan::needs("vcan0");
         Self { kind: BusKind::SocketCan, ..Self::new() }
+    }
+
+    /// What its benches run on.
+    pub(crate) const fn kind(&self) -> BusKind {
+        self.kind
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {

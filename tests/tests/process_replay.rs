@@ -1,0 +1,475 @@
+//! Runs are recorded, and replayed to cells that were just started, or that have been through something else: what
+//! they answer is what was recorded, bit for bit, or it is said what is not.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod process;
+
+use std::cell::Cell as Counter;
+use std::fs;
+use std::time::Duration;
+
+use gateway::generate::Format;
+use process::replay::{Replayed, cell, changed, is_torque, without};
+use process::{Place, Running, example, skin_of, until};
+use protocol::id::Node;
+use protocol::message::{From, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::parameters::Parameter;
+use rustix::process::Signal;
+
+/// Fresh cells of the skin of the recording.
+const FRESH: &str = "--expect --spawn --skin skin.toml";
+
+#[test]
+fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_can() {
+    let place = Place::new();
+    place.records(8);
+    let mut counts = Vec::new();
+    for way in ["", "--spin 0", "--lockstep --speed 4", "--max", "--max --cells-per-process 8", "--max"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {way}"));
+        place.is_left_clean();
+        let count = if way.contains("--max") || way.contains("--lockstep") {
+            replayed.all_came_back(&ended)
+        } else {
+            replayed.all_came_back_in_time(&ended)
+        };
+        counts.push(count);
+        assert_eq!(replayed.number("/refused") + replayed.number("/lost"), 0);
+        assert!(ended.stdout.contains("bit for bit"), "{}", ended.stdout);
+    }
+    let sent = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap()).number("/sent");
+    // More than the torques of one cell in every epoch.
+    assert!(counts[0] > 300 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
+    let inputs = without(&place.read("run.log"), |message| {
+        !matches!(
+            message,
+            Message::Halt
+                | Message::Joints { .. }
+                | Message::Sync
+                | Message::Resume
+                | Message::Report
+                | Message::Configure { .. }
+                | Message::Stimulus { .. }
+        )
+    });
+    assert_eq!(inputs.lines().count() as u64, sent, "all inputs, and nothing else");
+}
+
+#[test]
+fn two_buses_of_classic_frames_come_back_too() {
+    let place = Place::new();
+    place.write("skin.toml", &skin_of(9, 2, Format::Classic));
+    place.scenario(process::PRESSED);
+    place.bench(2.0, "").end().well();
+    for way in ["--max", "--lockstep --from 1"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {way}"));
+        assert!(replayed.all_came_back(&ended) > 100, "{:#}", replayed.0);
+        assert_eq!(replayed.0["buses"].as_array().unwrap().len(), 2);
+        assert!(replayed.number("/buses/1/sent") > 50, "{:#}", replayed.0);
+        place.is_left_clean();
+    }
+}
+
+#[test]
+fn from_the_middle_on_the_torques_are_the_same() {
+    let place = Place::new();
+    place.records(8);
+    let (ended, all) = place.replayed("run.log", &format!("{FRESH} --max"));
+    let all = all.all_came_back(&ended);
+    let mut before = all;
+    // The second one begins while the cells are halted, the last one after cell 4 was configured anew.
+    for from in ["1.1", "2.1", "2.6", "3.2"] {
+        let (ended, part) = place.replayed("run.log", &format!("{FRESH} --max --from {from}"));
+        let count = part.all_came_back(&ended);
+        assert!(count > 0 && count < before, "{count} of {before} from {from} on");
+        before = count;
+    }
+    let (ended, thrice) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1 --loop 3"));
+    let (again, once) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1"));
+    assert_eq!(thrice.all_came_back(&ended), 3 * once.all_came_back(&again));
+    place.is_left_clean();
+}
+
+/// The embedded bus and the cells of `skin.toml`, started by hand.
+fn by_hand(place: &Place, nodes: &str) -> [Running; 2] {
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let words = format!("--bus vcan0 --bus-kind embedded --nodes {nodes} --skin skin.toml");
+    [place.start("cell-node", &words), server]
+}
+
+#[test]
+fn cells_that_have_been_through_something_else_answer_as_they_did_then() {
+    let place = Place::new();
+    place.records(8);
+    let _bench = by_hand(&place, "1-8");
+    let guest = place.guest();
+    for round in 0..2 {
+        // Pressed, halted, and in an epoch that comes soon.
+        let page = SensorPage::Skin(SkinSensors {
+            contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
+            ..SkinSensors::default()
+        });
+        guest.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+        guest.sends(&Message::Joints {
+            epoch: protocol::packet::Epoch(3),
+            joints: protocol::message::Joints { in_use: 6, ..Default::default() },
+        });
+        guest.sends(&Message::Halt);
+        // The configuration was changed in the middle of the run, and a restart from there has it again.
+        let part = if round == 0 { "--to 1.2" } else { "--from 2" };
+        let (ended, replayed) = place.replayed("run.log", &format!("--expect --max {part}"));
+        assert!(replayed.all_came_back(&ended) > 50, "{:#}", replayed.0);
+    }
+    // Now cell 4 has another configuration than at the beginning.
+    let ended = place.replay("run.log", "--expect --max --quiet").end();
+    let line = ended.refusal(1);
+    assert!(line.contains("cells have another configuration than in the recording: 4 (recorded "), "{line}");
+}
+
+#[test]
+fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
+    let place = Place::new();
+    place.records(8);
+    let text = place.read("skin.toml");
+    // Cell 3 sits 10 cm elsewhere.
+    let third = text.match_indices("\nposition = [").nth(2).unwrap().0;
+    let moved = text[..third].to_owned()
+        + &text[third..].replacen("position = [", "position = [0.1, 0.0, 0.1] # [", 1);
+    place.write("moved.toml", &moved);
+    let ended = place.replay("run.log", "--expect --spawn --skin moved.toml --quiet").end();
+    let line = ended.refusal(1);
+    let said = "gateway: cells have another configuration than in the recording: 3 (recorded ";
+    assert!(
+        line.starts_with(said) && line.ends_with("on vcan0; name the recording's skin with --skin"),
+        "{line}"
+    );
+
+    place.write("other.toml", &text.replace("force_threshold_n = 0.1", "force_threshold_n = 0.3"));
+    let ended = place.replay("run.log", "--expect --spawn --skin other.toml --quiet").end();
+    let line = ended.refusal(1);
+    assert!(
+        line.starts_with("gateway: the recording is of another skin: all 8 cells have another "),
+        "{line}"
+    );
+    place.is_left_clean();
+
+    let bench = by_hand(&place, "1-6");
+    let ended = place.replay("run.log", "--expect --quiet").end();
+    let said = "gateway: cells of the recording are absent: 7, 8 on vcan0; start them with cell-node, or all with \
+                --spawn";
+    assert_eq!(ended.refusal(1), said);
+    let ended = place.replay("run.log", &format!("{FRESH} --quiet")).end();
+    let said =
+        "gateway: cells are on vcan0 already: 1, 2, 3, 4, 5, 6; leave out --spawn to use them, or stop them";
+    assert_eq!(ended.refusal(1), said);
+    drop(bench);
+}
+
+#[test]
+fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
+    let place = Place::new();
+    place.records(8);
+    let log = place.read("run.log");
+    let wrong = changed(&log, 30, |message| is_torque(message, 2), |words| words[1] += 3);
+    place.write("wrong.log", &wrong);
+    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max"));
+    place.is_left_clean();
+    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
+    assert!(
+        ended.stderr.contains("gateway: replies are not as they were recorded: 1 different"),
+        "{ended:#?}"
+    );
+    let text = replayed.text("/expect/first/text");
+    assert!(ended.stdout.contains(text) && text.contains("cell 2 on vcan0, joints "), "{text}");
+    let lines: Vec<_> = text.lines().map(str::trim).collect();
+    assert!(lines[1].starts_with("recorded  torque 2 epoch ") && lines[1].ends_with(" Nm"), "{text}");
+    assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
+    assert_eq!(lines[3], "joint 2: 3 steps less (0.0007 Nm)", "{text}");
+
+    // One that was not recorded, and one that cannot come.
+    let counted = Counter::new(0);
+    let gone = without(&log, |message| {
+        let it = is_torque(message, 2) || is_torque(message, 3);
+        it && counted.replace(counted.get() + 1) == 20
+    });
+    // Nor may the recording have counters that say that it is lacking.
+    let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
+    let beats = Counter::new(0);
+    let heartbeat = |message: &Message| {
+        let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING));
+        it && beats.replace(beats.get() + 1) >= 8
+    };
+    place.write("gone.log", &without(&gone, |message| silent(message) || heartbeat(message)));
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[0, 0, 1][..]), "{:#}", replayed.0);
+    assert_eq!(replayed.text("/expect/first/how"), "extra");
+    // With them it is known that it is the recording's fault.
+    place.write("gone.log", &gone);
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    replayed.all_came_back(&ended);
+    // A machine that was away while it was recorded is another reason, and nobody knows which one it is.
+    let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
+    assert!(lacking.iter().sum::<u64>() >= 1, "{:#}", replayed.0);
+}
+
+#[test]
+fn a_killed_cell_is_named_and_its_replies_are_missing() {
+    let place = Place::new();
+    place.records(8);
+    let replay = place.replay("run.log", &format!("{FRESH} --lockstep"));
+    waits_for_joints(&place, 30);
+    process::signal(replay.cell(1), Signal::KILL);
+    let ended = replay.end();
+    place.is_left_clean();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    assert!(ended.stderr.contains("cell 1 on vcan0 does not answer within "), "{ended:#?}");
+    assert!(ended.stderr.contains("the process of cell 1 ended (signal: 9"), "{ended:#?}");
+    let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+    assert_eq!(replayed.0["lockstep"]["silent_cells"], serde_json::json!(["1 on vcan0"]));
+    let [_, different, missing, extra] = replayed.replies();
+    assert!(different == 0 && missing > 50 && extra == 0, "{:#}", replayed.0);
+}
+
+fn waits_for_joints(place: &Place, epoch: u8) {
+    place.guest().waits_for_epoch(epoch);
+}
+
+#[test]
+fn an_interrupted_replay_says_how_far_it_came_and_leaves_nothing() {
+    let place = Place::new();
+    place.records(8);
+    let replay = place.replay("run.log", &format!("{FRESH} --loop 0"));
+    waits_for_joints(&place, 30);
+    replay.signal(Signal::INT);
+    let ended = replay.end();
+    place.is_left_clean();
+    let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+    assert_eq!(replayed.0["interrupted"], true);
+    replayed.all_came_back_in_time(&ended);
+    assert!(ended.stdout.contains("interrupted"), "{}", ended.stdout);
+}
+
+#[test]
+fn a_bus_that_ends_in_mid_replay_is_one_line_and_a_table() {
+    let place = Place::new();
+    place.records(8);
+    let [cells, server] = by_hand(&place, "1-8");
+    let replay = place.replay("run.log", "--only inputs");
+    place.guest().waits_for_epoch(30);
+    server.signal(Signal::TERM);
+    let ended = replay.end();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    let said = "gateway: the embedded bus vcan0 was closed: its server ended";
+    assert_eq!(ended.stderr.lines().filter(|line| line.contains("was closed")).collect::<Vec<_>>(), [said]);
+    assert!(ended.stdout.contains("sent") && place.files().contains(&"replay.json".to_owned()), "{ended:#?}");
+    drop((cells, server));
+}
+
+#[test]
+fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
+    let place = Place::new();
+    let frames: String =
+        (0..20_000_u32).map(|at| format!("(1.{:06}) vcan0 123##1{at:032X}\n", at * 50)).collect();
+    place.write("many.log", &frames);
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let replay = place.replay("many.log", "--patience 1 --loop 3");
+    let guest = place.guest();
+    until("a frame", || guest.0.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
+    server.signal(Signal::STOP);
+    until("a stopped server", || process::is_stopped(server.pid()).then_some(()));
+    let ended = replay.end();
+    server.signal(Signal::CONT);
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+    let [sent, refused, lost] = ["/sent", "/refused", "/lost"].map(|what| replayed.number(what));
+    assert!(sent > 0 && refused > 0 && lost == 0 && sent + refused == 60_000, "{:#}", replayed.0);
+    assert!(
+        ended.stderr.contains(&format!("{refused} frames were refused: a bus stayed full")),
+        "{ended:#?}"
+    );
+}
+
+#[test]
+fn a_foreign_capture_goes_to_another_bus_as_it_is() {
+    let place = Place::new();
+    let log = "(10.000000) can7 123#DEADBEEF\n(10.001000) can7 1F334455#R4\n# a comment\n\
+               (10.002000) can8 00C##3AABB\n(10.002000) can7 20000004#0001000000000000\n(10.003000) can7 7FF#\n";
+    place.write("foreign.log", log);
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let dump = place.start("gateway", "dump vcan0 --bus-kind embedded --max 4");
+    dump.hears("vcan0 is embedded");
+    let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
+    ended.well();
+    let ended = dump.end().well();
+    let seen: Vec<_> = ended.stdout.lines().map(|line| line.split([' ', '\t']).nth(2).unwrap()).collect();
+    assert_eq!(seen, ["123#DEADBEEF", "1F334455#R4", "00C##7AABB", "7FF#"]);
+    assert_eq!(replayed.number("/sent"), 4);
+    assert_eq!(replayed.0["skipped"], serde_json::json!({"error frame": 1, "note": 1}));
+}
+
+#[test]
+fn a_gateway_and_a_replay_notice_each_other() {
+    let place = Place::new();
+    place.records(8);
+    let bench = place.running_bench(30.0, "");
+    for way in ["", "--expect"] {
+        let ended = place.replay("run.log", &format!("--quiet {way}")).end();
+        let said =
+            "gateway: another gateway is on vcan0: stop it, or send the capture to another bus with --map";
+        assert_eq!(ended.refusal(1), said);
+    }
+    bench.signal(Signal::TERM);
+    bench.end().well();
+    // One that comes while the replay lasts.
+    let replay = place.replay("run.log", FRESH);
+    waits_for_joints(&place, 10);
+    let joints = protocol::message::Joints { in_use: 6, ..Default::default() };
+    place.guest().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
+    let ended = replay.end();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    assert!(ended.stderr.contains("gateway: another gateway is on vcan0"), "{ended:#?}");
+    place.is_left_clean();
+}
+
+#[test]
+fn a_cell_that_measures_obeys_for_the_replay_when_it_is_told_to() {
+    let place = Place::new();
+    place.records(8);
+    let _bench = by_hand(&place, "1-8");
+    let guest = place.guest();
+    let mode = |tag, request| Message::Configure { to: Node::Cell(cell(3)), tag, request };
+    let number = Parameter::Mode.number();
+    let answers = |tag: u8, wanted: i16| {
+        move |message: &Message| {
+            matches!(message, Message::Configured { tag: of, answer: protocol::message::Answer::Value { words, .. }, .. }
+                if *of == tag && words[0] == wanted)
+        }
+    };
+    guest.waits_for("a cell that has settled", |message| {
+        matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
+            if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
+    });
+    guest.sends(&mode(1, Request::Write { number, words: [0; 6] }));
+    guest.waits_for("a cell that measures", answers(1, 0));
+    let ended = place.replay("run.log", "--expect --to 1 --quiet").end();
+    let said = "gateway: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
+                obey while the replay lasts";
+    assert_eq!(ended.refusal(1), said);
+    let (ended, replayed) = place.replayed("run.log", "--expect --max --to 1 --test-mode");
+    assert!(replayed.all_came_back(&ended) > 50);
+    guest.sends(&mode(2, Request::Read { number }));
+    guest.waits_for("a cell that measures again", answers(2, 0));
+}
+
+#[test]
+fn what_cannot_be_is_refused_in_one_line() {
+    let place = Place::new();
+    place.skin(3);
+    place.write("empty.log", "");
+    place.write("none.log", "# nothing\n");
+    place.write("some.log", "(1.000000) vcan0 123#00\n(1.5) vcan0 123#00\n(3.000000) vcan0 123#00\n");
+    place.write("torques.log", "(1.000000) vcan0 20C##5001000F80100000000000000070175D6\n");
+    let zip = place.path("some.zip");
+    fs::write(&zip, b"PK\x03\x04..............").unwrap();
+    for (words, code, said) in [
+        ("empty.log", 2, "gateway: empty.log"),
+        ("none.log", 2, "gateway: none.log: there is no frame in it"),
+        ("nothing.log", 2, "gateway: nothing.log: No such file"),
+        ("some.zip", 2, "gateway: some.zip is a zip"),
+        ("-", 2, "gateway: a capture is read twice, which standard input cannot be"),
+        ("some.log --strict", 1, "gateway: some.log:2: column 5: 6 or 9 digits of a second"),
+        ("some.log --from 5", 2, "gateway: nothing is left to be sent: some.log lasts 2.000 s"),
+        ("some.log --map can0=can1", 2, "gateway: --map can0=can1: some.log has no bus can0; it has vcan0"),
+        ("some.log --bus can0", 2, "gateway: --bus can0: some.log has no bus can0; it has vcan0"),
+        (
+            "some.log --map vcan0",
+            2,
+            "gateway: invalid value 'vcan0' for '--map <FROM=TO>': a bus of the capture and",
+        ),
+        (
+            "some.log --speed 101",
+            2,
+            "gateway: invalid value '101' for '--speed <X>': a number from 0.1 to 100",
+        ),
+        (
+            "some.log --speed 0.01",
+            2,
+            "gateway: invalid value '0.01' for '--speed <X>': a number from 0.1 to 100",
+        ),
+        (
+            "some.log --only replies --expect",
+            2,
+            "gateway: --expect lets cells answer, and --only sends recorded",
+        ),
+        ("some.log --expect --spawn", 2, "gateway: --spawn: some.log has no skin attached"),
+        (
+            "some.log --map vcan0=can9 --spawn --skin skin.toml",
+            2,
+            "gateway: --spawn: the capture goes to can9, and the",
+        ),
+        ("some.log --spawn --skin nothing.toml", 2, "gateway: nothing.toml: "),
+        ("some.log", 2, "gateway: no embedded bus vcan0 is served"),
+    ] {
+        let ended = place
+            .replay(
+                words.split(' ').next().unwrap(),
+                &format!("--quiet {}", words.split_once(' ').map_or("", |(_, more)| more)),
+            )
+            .end();
+        let line = ended.refusal(code);
+        assert!(line.starts_with(said), "{words}: {line}");
+        assert!(!place.files().contains(&"replay.json".to_owned()), "{words}");
+        place.is_left_clean();
+    }
+    // A recording that says nothing of its cells.
+    let ended = place.replay("torques.log", "--expect --spawn --skin skin.toml --quiet").end();
+    assert!(
+        ended.refusal(1).starts_with("gateway: cells of the recording are absent: 12 on vcan0"),
+        "{ended:#?}"
+    );
+}
+
+#[test]
+fn a_line_that_cannot_be_read_is_named_and_left_out_and_times_that_run_backwards_are_said_once() {
+    let place = Place::new();
+    let log = "(5.000000) vcan0 001#\n(1.5) vcan0 123#00\n(5.100000) vcan0 002#00\n(1.000000) vcan0 003#00\n\
+               (2.000000) vcan0 004#00\n(5.150000) vcan0 005#00\nDROPCOUNT: dropped 7 CAN frames on 'vcan0' socket (total drops 7)\n";
+    place.write("odd.log", log);
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let (ended, replayed) = place.replayed("odd.log", "");
+    let ended = ended.well();
+    let said: Vec<_> = ended.stderr.lines().collect();
+    assert_eq!(
+        said[..4],
+        [
+            "odd.log:2: column 5: 6 or 9 digits of a second",
+            "odd.log: lines that could not be read and are left out: 1",
+            "odd.log: 7 frames are missing: whoever took it lost them",
+            "odd.log: times run backwards, first at frame 3 by 4.100 s: what is older than what was sent before it is \
+             sent at once",
+        ]
+    );
+    assert_eq!((replayed.number("/sent"), replayed.number("/sent_at_once")), (5, 2), "{:#}", replayed.0);
+}
+
+/// The whole skin, while it is stroked: a few seconds of it, twice.
+#[test]
+fn two_hundred_and_fifty_three_fresh_cells_answer_as_the_others_did_twice() {
+    let place = Place::new();
+    fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
+    fs::copy(example("demo.toml"), place.path("scenario.toml")).unwrap();
+    place.bench(4.0, "").end().well();
+    place.is_left_clean();
+    let mut counts = Vec::new();
+    for way in ["--lockstep", "--max"] {
+        let replay = place.replay("run.log", &format!("{FRESH} {way}"));
+        let ended = replay.end_after(Duration::from_secs(120));
+        let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+        counts.push(replayed.all_came_back(&ended));
+        place.is_left_clean();
+    }
+    assert!(counts[0] > 1_000 && counts[0] == counts[1], "{counts:?}");
+}
