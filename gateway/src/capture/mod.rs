@@ -9,6 +9,7 @@
 //! An [`Entry`] keeps everything that either format says of a frame, so that a capture comes back from the other
 //! one as it was. Entries stand in the order of the file, which is not always that of their times.
 
+pub mod convert;
 pub mod log;
 mod magic;
 mod mcap;

@@ -1,6 +1,8 @@
-//! Captures as MCAP recordings: the channels of frames and notes are read, other topics are counted.
+//! Captures as MCAP recordings: the channels of frames and notes are read and written, other topics are counted.
 
 mod foreign;
 mod read;
+mod write;
 
 pub(super) use read::{Fault, McapReader};
+pub(super) use write::McapWriter;

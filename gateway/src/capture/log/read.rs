@@ -1,11 +1,11 @@
-//! Captures as candump text: read line by line in bounded memory whatever the file is, and written.
+//! Captures as candump text: read line by line, in bounded memory whatever the file is.
 
 use std::io::{self, Read};
 use std::ops::Range;
 
 use protocol::candump::{self, Line};
 
-use super::{Entry, Note, NoteKind};
+use crate::capture::{Entry, Note, NoteKind};
 
 /// The longest line that is read, with its end: twice that of the longest CAN XL frame.
 pub const LONGEST: usize = 8_192;
@@ -15,7 +15,7 @@ const CHUNK: usize = 1 << 18;
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 /// Reads the entries of a log.
-pub(super) struct LogReader {
+pub(crate) struct LogReader {
     input: Box<dyn Read + Send>,
     buffer: Vec<u8>,
     /// What of the buffer is not used up.
@@ -29,7 +29,7 @@ pub(super) struct LogReader {
 
 impl LogReader {
     /// Goes on behind `head`, which has been read already.
-    pub(super) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
+    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
         let mut buffer = vec![0; CHUNK];
         let head = head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head);
         for (to, from) in buffer.iter_mut().zip(head) {
@@ -38,16 +38,16 @@ impl LogReader {
         Self { input, buffer, rest: 0..head.len(), at_end: false, lines: 0, nanos: 0 }
     }
 
-    pub(super) const fn lines(&self) -> u64 {
+    pub(crate) const fn lines(&self) -> u64 {
         self.lines
     }
 
-    pub(super) const fn is_drained(&self) -> bool {
+    pub(crate) const fn is_drained(&self) -> bool {
         self.rest.start >= self.rest.end
     }
 
     /// The next entry: one for each line. Never panics.
-    pub(super) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
+    pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
         self.lines += 1;
         let text = self.buffer.get(line).unwrap_or_default();
@@ -133,7 +133,7 @@ impl LogReader {
 }
 
 /// Reads what there is, whatever signals come.
-pub(super) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
+pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
     loop {
         match input.read(room) {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}

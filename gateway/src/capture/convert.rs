@@ -1,0 +1,140 @@
+//! A capture of one format into the other, entry by entry.
+
+use std::io::{self, Write};
+
+use super::log::{LogWriter, Style, Wrote};
+use super::mcap::McapWriter;
+use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
+use thiserror::Error;
+
+/// Where entries go.
+#[derive(Debug)]
+pub struct Output<W: Write>(Form<W>);
+
+#[derive(Debug)]
+enum Form<W: Write> {
+    Log(LogWriter<W>),
+    Mcap(Box<McapWriter<W>>),
+}
+
+impl<W: Write> Output<W> {
+    /// A capture of a format; `style` is for a log.
+    ///
+    /// # Errors
+    /// When its beginning cannot be written.
+    pub fn new(out: W, format: Format, style: Style) -> io::Result<Self> {
+        Ok(Self(match format {
+            Format::Candump => Form::Log(LogWriter::new(out, style)),
+            Format::Mcap => Form::Mcap(Box::new(McapWriter::new(out)?)),
+        }))
+    }
+
+    /// Writes an entry.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+        match &mut self.0 {
+            Form::Log(log) => log.write(entry),
+            Form::Mcap(mcap) => mcap.write(entry).map(|()| Wrote::All),
+        }
+    }
+
+    /// Writes what is left, and the end.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn finish(&mut self) -> io::Result<()> {
+        match &mut self.0 {
+            Form::Log(log) => log.flush(),
+            Form::Mcap(mcap) => mcap.finish(),
+        }
+    }
+}
+
+/// What a conversion came to.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Converted {
+    /// Frames that were written.
+    pub frames: u64,
+    /// Other lines and words that were written.
+    pub notes: u64,
+    /// Lines or messages that begin like a frame and are none.
+    pub unreadable: u64,
+    /// CAN XL frames, kept as text.
+    pub can_xl: u64,
+    /// Frames that whoever took the capture lost.
+    pub dropped: u64,
+    /// Frames whose line says less than the capture.
+    pub shortened: u64,
+    /// Notes that are not in the output.
+    pub left_out: u64,
+    /// How often a frame is older than the one before it, and the first of them, counted from 1.
+    pub backwards: Option<(u64, u64)>,
+}
+
+/// Why a conversion ended before its time.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConvertError {
+    /// The capture cannot be read further.
+    #[error(transparent)]
+    Read(#[from] CaptureError),
+    /// The output cannot be written.
+    #[error(transparent)]
+    Write(io::Error),
+    /// Something is unreadable, and nothing of that kind is let through.
+    #[error("{0}")]
+    Strict(String),
+}
+
+/// Copies all entries in their order. `unreadable` is told of each line that is no frame; what it returns
+/// says whether to go on.
+///
+/// # Errors
+/// When one side fails, or `unreadable` says so.
+pub fn convert<W: Write>(
+    from: &mut Reader,
+    to: &mut Output<W>,
+    mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
+) -> Result<Converted, ConvertError> {
+    let mut done = Converted::default();
+    let mut newest = 0;
+    while let Some(entry) = from.next()? {
+        let mut is_frame = false;
+        match &entry {
+            Entry::Frame(record) => {
+                is_frame = true;
+                done.frames += 1;
+                let nanos = record.time.nanos;
+                if nanos < newest {
+                    let (times, _) = done.backwards.get_or_insert((0, done.frames));
+                    *times += 1;
+                }
+                newest = nanos;
+            }
+            Entry::Note(note) => {
+                done.notes += 1;
+                match &note.kind {
+                    NoteKind::Text => {}
+                    NoteKind::Dropped(frames) => done.dropped = done.dropped.saturating_add(*frames),
+                    NoteKind::CanXl => done.can_xl += 1,
+                    NoteKind::Unreadable(why) => {
+                        done.unreadable += 1;
+                        unreadable(note, why).map_err(ConvertError::Strict)?;
+                    }
+                }
+            }
+        }
+        match to.write(&entry).map_err(ConvertError::Write)? {
+            Wrote::All => {}
+            Wrote::Less => done.shortened += 1,
+            Wrote::Nothing if is_frame => done.frames -= 1,
+            Wrote::Nothing => {
+                done.notes -= 1;
+                done.left_out += 1;
+            }
+        }
+    }
+    Ok(done)
+}

@@ -1,0 +1,8 @@
+//! Captures as candump text.
+
+mod read;
+mod write;
+
+pub use read::LONGEST;
+pub(super) use read::{LogReader, read_some};
+pub use write::{Digits, LogWriter, Style, Wrote};
