@@ -40,6 +40,17 @@ impl<W: Write> Output<W> {
         }
     }
 
+    /// Hands lines on that wait for more; a recording is written in its own pieces.
+    ///
+    /// # Errors
+    /// When they cannot be written.
+    pub fn pass_on(&mut self) -> io::Result<()> {
+        match &mut self.0 {
+            Form::Log(log) => log.flush(),
+            Form::Mcap(_) => Ok(()),
+        }
+    }
+
     /// Writes what is left, and the end.
     ///
     /// # Errors
@@ -126,7 +137,8 @@ pub fn convert<W: Write>(
                 }
             }
         }
-        match to.write(&entry).map_err(ConvertError::Write)? {
+        let wrote = to.write(&entry).map_err(ConvertError::Write)?;
+        match wrote {
             Wrote::All => {}
             Wrote::Less => done.shortened += 1,
             Wrote::Nothing if is_frame => done.frames -= 1,
@@ -134,6 +146,10 @@ pub fn convert<W: Write>(
                 done.notes -= 1;
                 done.left_out += 1;
             }
+        }
+        if from.is_drained() {
+            // Somebody may be reading along.
+            to.pass_on().map_err(ConvertError::Write)?;
         }
     }
     Ok(done)

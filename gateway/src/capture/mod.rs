@@ -15,7 +15,7 @@ mod magic;
 mod mcap;
 mod reader;
 
-pub use reader::{CaptureError, Extras, Format, Reader, Topic};
+pub use reader::{CaptureError, Extras, Format, InForce, Reader, Topic};
 
 use protocol::candump::Record;
 

@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+use protocol::can::Frame;
 use thiserror::Error;
 
 use super::Entry;
@@ -60,12 +61,25 @@ pub enum CaptureError {
 pub struct Extras {
     /// Topics that are no frames and no notes, in the order in which they came.
     pub topics: Vec<Topic>,
+    /// Frames of before, that are in force when the recording begins.
+    pub in_force: Vec<InForce>,
     /// Attachments by name; the largest without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
     /// Metadata by name.
     pub metadata: Vec<(String, Vec<(String, String)>)>,
     /// What is missing at its end, when it was never finished.
     pub unfinished: Option<String>,
+}
+
+/// A frame that was on a bus before a recording began, and still says what holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InForce {
+    /// Its bus.
+    pub bus: String,
+    /// What it is.
+    pub frame: Frame,
+    /// When it was on the bus, in ns since 1970.
+    pub nanos: u64,
 }
 
 /// A topic that is neither frames nor notes.
@@ -201,8 +215,13 @@ impl Reader {
     /// What it has beside frames and notes, as far as it has been read. A log has nothing.
     #[must_use]
     pub fn extras(&self) -> &Extras {
-        static NONE: Extras =
-            Extras { topics: Vec::new(), attachments: Vec::new(), metadata: Vec::new(), unfinished: None };
+        static NONE: Extras = Extras {
+            topics: Vec::new(),
+            in_force: Vec::new(),
+            attachments: Vec::new(),
+            metadata: Vec::new(),
+            unfinished: None,
+        };
         match &self.source {
             Source::Log(_) => &NONE,
             Source::Mcap(mcap) => mcap.extras(),

@@ -4,7 +4,7 @@ mod show;
 mod table;
 
 use std::fs::File;
-use std::io::{self, BufWriter, IsTerminal, Read, Write};
+use std::io::{self, BufWriter, IsTerminal, Write};
 use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -21,14 +21,11 @@ use protocol::can::{self, EXTENDED_MASK};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
 use protocol::usage::{Failure, print, written};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::Serialize;
 
 use self::show::{Flow, How, Show};
+use super::input::{Interruptible, LOOK, stopped};
 use super::output;
-
-/// How long a signal to end may wait, when nothing comes.
-const LOOK: Duration = Duration::from_millis(200);
 
 /// Show what is on a bus or in a capture, in words beside the raw frames
 ///
@@ -199,16 +196,6 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>)
     Ok(text + "\n")
 }
 
-/// A flag that SIGINT and SIGTERM set.
-fn stopped() -> Result<Arc<AtomicBool>, Failure> {
-    let stopped = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stopped))
-            .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;
-    }
-    Ok(stopped)
-}
-
 /// Opens a bus to hear all of it; a classic interface too, unless FD is asked for.
 fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
     let options = |fd| Options { fd, error_mask: EXTENDED_MASK, ..Options::default() };
@@ -339,24 +326,4 @@ fn live(
         ));
     }
     written(done)
-}
-
-/// A file whose reader can be told to stop: then it is at its end.
-struct Interruptible {
-    file: File,
-    stopped: Arc<AtomicBool>,
-}
-
-impl Read for Interruptible {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let timeout = Timespec::try_from(LOOK).ok();
-        while !self.stopped.load(Ordering::Relaxed) {
-            match poll(&mut [PollFd::new(&self.file, PollFlags::IN)], timeout.as_ref()) {
-                Ok(0) | Err(rustix::io::Errno::INTR) => {}
-                Ok(_) => return self.file.read(buffer),
-                Err(errno) => return Err(errno.into()),
-            }
-        }
-        Ok(0)
-    }
 }

@@ -2,9 +2,11 @@
 //! 1 (the run failed) and 2 (wrong use or configuration).
 
 mod ack;
+mod convert;
 mod dbc;
 mod dump;
 mod frame;
+mod input;
 mod output;
 mod print;
 mod recover;
@@ -32,6 +34,7 @@ enum Command {
     Run(run::Run),
     Recover(recover::Recover),
     Dump(dump::Dump),
+    Convert(convert::Convert),
     Replay(replay::Replay),
     Frame(frame::Frame),
     Ack(ack::Ack),
@@ -46,6 +49,7 @@ impl Command {
             Self::Run(command) => command.run(),
             Self::Recover(command) => command.run(),
             Self::Dump(command) => command.run(),
+            Self::Convert(command) => command.run(),
             Self::Replay(command) => command.run(),
             Self::Frame(command) => command.run(),
             Self::Ack(command) => command.run(),

@@ -145,7 +145,7 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
 /// What a line is. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
 fn read(text: &[u8], long: bool) -> Result<Line<'_>, String> {
     if long {
-        return Err(format!("a line of more than {LONGEST} bytes"));
+        return Err(format!("a line of more than {LONGEST} bytes, whose rest is left out"));
     }
     candump::parse_bytes(text).map_err(|error| error.to_string())
 }
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
-        let long = || Err::<(), _>(format!("a line of more than {LONGEST} bytes"));
+        let long = || Err::<(), _>(format!("a line of more than {LONGEST} bytes, whose rest is left out"));
         for piece in [4097, CHUNK] {
             let mut bytes = vec![b'('; 3 * CHUNK];
             bytes.extend_from_slice(b"\nnext\n");

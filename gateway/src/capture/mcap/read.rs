@@ -10,7 +10,8 @@ use protocol::candump::Timestamp;
 
 use super::foreign::Foreign;
 use crate::capture::log::read_some;
-use crate::capture::{Entry, Extras, Note, NoteKind, Topic};
+use crate::capture::{Entry, Extras, InForce, Note, NoteKind, Topic};
+use crate::record::TOPIC_OF_STATE;
 use crate::ros2::Message;
 use crate::ros2::messages::{CanFrame, CaptureNote};
 
@@ -58,6 +59,8 @@ enum What {
     Frames {
         nine_digits: bool,
     },
+    /// Frames of before, that are in force when the recording begins.
+    InForce,
     Notes,
     Foreign(Foreign),
     /// They are counted, here in the list of topics.
@@ -132,11 +135,26 @@ impl McapReader {
                 let lane = lane.ok_or_else(|| {
                     damaged(format!("a message belongs to channel {channel}, which it has not"))
                 })?;
-                if let What::Counted(topic) = lane.what {
-                    if let Some(topic) = self.extras.topics.get_mut(topic) {
-                        topic.messages += 1;
+                match lane.what {
+                    What::Counted(topic) => {
+                        if let Some(topic) = self.extras.topics.get_mut(topic) {
+                            topic.messages += 1;
+                        }
+                        return Ok(None);
                     }
-                    return Ok(None);
+                    What::InForce => {
+                        let time = Timestamp { nanos: log_time, nine_digits: true };
+                        let frame = CanFrame::decode(data, time);
+                        let frame = frame
+                            .map_err(|error| damaged(format!("a message of {}: {error}", lane.topic)))?;
+                        let CanFrame(record) = frame;
+                        let (bus, frame) = (record.interface.to_owned(), record.frame);
+                        self.keep(size_of::<InForce>(), |extras| {
+                            extras.in_force.push(InForce { bus, frame, nanos: log_time })
+                        });
+                        return Ok(None);
+                    }
+                    What::Frames { .. } | What::Notes | What::Foreign(_) => {}
                 }
                 self.message.clear();
                 self.message.extend_from_slice(data);
@@ -207,6 +225,8 @@ impl McapReader {
         let nine_digits = channel.metadata.get("time_digits").is_none_or(|digits| digits != "6");
         let what = if channel.message_encoding != "cdr" {
             None
+        } else if schema == CanFrame::TYPE && channel.topic.starts_with(TOPIC_OF_STATE) {
+            Some(What::InForce)
         } else if schema == CanFrame::TYPE {
             Some(What::Frames { nine_digits })
         } else if schema == CaptureNote::TYPE {
@@ -244,7 +264,9 @@ impl McapReader {
                 }
                 Entry::Note(note)
             }),
-            What::Counted(_) => return unreadable("", log_time, message, "it is not looked at"),
+            What::Counted(_) | What::InForce => {
+                return unreadable("", log_time, message, "it is not looked at");
+            }
         };
         match decoded {
             Ok(entry) => {

@@ -1,0 +1,260 @@
+//! `gateway convert`.
+
+use std::ffi::OsStr;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, IsTerminal};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use clap::{Args, ValueEnum};
+use gateway::capture::convert::{ConvertError, Converted, Output, convert};
+use gateway::capture::log::{self, Style};
+use gateway::capture::{Format, Reader};
+use gateway::run::file::WholeFile;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::usage::Failure;
+
+use super::input::{Interruptible, stopped};
+use super::output::note;
+
+/// Lines that cannot be read and are named; further ones are counted.
+const NAMED: u64 = 100;
+/// Bytes that are written at once.
+const PIECE: usize = 1 << 18;
+
+/// Convert a capture: a candump log to an MCAP recording, or back
+///
+/// What IN is, is told by its first bytes; OUT by the end of its name: .mcap is a recording, .log or .txt a candump
+/// log, - a log on standard output. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
+/// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
+/// place for is named. OUT appears when it is whole. Exit code 0: done, 1: it cannot be done, 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway convert run.mcap run.log
+  gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
+  candump -L can0 | gateway convert - can0.mcap")]
+pub(crate) struct Convert {
+    /// A candump log or an MCAP recording; - for standard input
+    #[arg(value_name = "IN")]
+    from: PathBuf,
+    /// The new capture; - for candump text on standard output
+    #[arg(value_name = "OUT")]
+    to: PathBuf,
+    /// Overwrite a file that exists
+    #[arg(long)]
+    force: bool,
+    /// End at the first line that is no frame though it begins like one, or when IN has no end; write nothing then
+    #[arg(long)]
+    strict: bool,
+    /// Digits of a second in a log: 6 or 9; else as many as IN has
+    #[arg(long, value_enum, value_name = "N")]
+    digits: Option<Digits>,
+    /// Write only what every tool reads: frames, without direction and raw DLC, no comments
+    #[arg(long)]
+    plain: bool,
+}
+
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+enum Digits {
+    #[value(name = "6")]
+    Six,
+    #[value(name = "9")]
+    Nine,
+}
+
+impl Convert {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let format = self.format()?;
+        let text = format == Format::Candump;
+        if !text && (self.digits.is_some() || self.plain) {
+            let option = if self.plain { "--plain" } else { "--digits" };
+            return Err(Failure::usage(format!(
+                "{option} is for a candump log: a recording keeps everything"
+            )));
+        }
+        let to = self.to.display();
+        if fs::symlink_metadata(&self.to).is_ok_and(|there| there.is_file()) && !self.force {
+            return Err(Failure::usage(format!(
+                "{to} exists: name another file, or overwrite it with --force"
+            )));
+        }
+        let name = if is_standard(&self.from) {
+            "standard input".to_owned()
+        } else {
+            self.from.display().to_string()
+        };
+        let (file, size) = open(&self.from).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        let stopped = stopped()?;
+        let live = size.is_none();
+        let bar = bar(size);
+        let input = Interruptible { file, stopped: Arc::clone(&stopped) };
+        let mut reader = Reader::from_read(&name, bar.wrap_read(input)).map_err(Failure::usage)?;
+        if !text && reader.format() == Format::Mcap {
+            return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
+        }
+        let digits = match self.digits {
+            None => log::Digits::Own,
+            Some(Digits::Six) => log::Digits::Six,
+            Some(Digits::Nine) => log::Digits::Nine,
+        };
+        let style = Style { digits, plain: self.plain };
+        let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
+        let (whole, out) = create(&self.to).map_err(failed)?;
+        let mut output = Output::new(out, format, style).map_err(failed)?;
+        let mut named = 0;
+        let done = convert(&mut reader, &mut output, |line, why| {
+            named += 1;
+            let place = if line.line > 0 { format!("{name}:{}", line.line) } else { name.clone() };
+            if self.strict {
+                return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
+            }
+            if named <= NAMED {
+                bar.suspend(|| note(format_args!("{place}: {why}")));
+            }
+            if named == NAMED {
+                bar.suspend(|| note(format_args!("{name}: further lines of that kind are counted")));
+            }
+            Ok(())
+        });
+        bar.finish_and_clear();
+        let done = match done {
+            Ok(done) => done,
+            Err(ConvertError::Write(error)) => return written(&self.to, error),
+            Err(error) => return Err(Failure::run(error)),
+        };
+        if done.frames == 0 {
+            return Err(Failure::run(nothing(&name, &reader)));
+        }
+        if stopped.load(Ordering::Relaxed) && !live {
+            let frames = done.frames;
+            return Err(Failure::run(format!("interrupted after {frames} frames: {to} is not written")));
+        }
+        if let Some(why) = &reader.extras().unfinished {
+            let said = format!("{name}: {why}");
+            if self.strict {
+                return Err(Failure::run(said));
+            }
+            note(said);
+        }
+        if let Err(error) = output.finish() {
+            return written(&self.to, error);
+        }
+        if let Some(whole) = whole {
+            whole.finish().map_err(failed)?;
+        }
+        for line in remarks(&reader, &done) {
+            note(format_args!("{name}: {line}"));
+        }
+        note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
+        Ok(())
+    }
+
+    /// What OUT is to be, by its name.
+    fn format(&self) -> Result<Format, Failure> {
+        let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
+        match self.to.extension().and_then(OsStr::to_str) {
+            Some("mcap") => Ok(Format::Mcap),
+            Some("log" | "txt") => Ok(Format::Candump),
+            _ if is_standard(&self.to) || other => Ok(Format::Candump),
+            _ => Err(Failure::usage(format!(
+                "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, and - is standard output",
+                self.to.display()
+            ))),
+        }
+    }
+}
+
+fn is_standard(path: &Path) -> bool {
+    path.as_os_str() == "-"
+}
+
+/// The input, and how many bytes it has when that is known.
+fn open(path: &Path) -> io::Result<(File, Option<u64>)> {
+    if is_standard(path) {
+        return Ok((io::stdin().as_fd().try_clone_to_owned()?.into(), None));
+    }
+    let file = File::open(path)?;
+    let about = file.metadata()?;
+    if about.is_dir() {
+        return Err(io::ErrorKind::IsADirectory.into());
+    }
+    Ok((file, about.is_file().then_some(about.len())))
+}
+
+/// The output; standard output is written to as it is.
+fn create(path: &Path) -> io::Result<(Option<WholeFile>, BufWriter<File>)> {
+    let (whole, file) = if is_standard(path) {
+        (None, io::stdout().as_fd().try_clone_to_owned()?.into())
+    } else {
+        let (whole, file) = WholeFile::create(path)?;
+        (Some(whole), file)
+    };
+    Ok((whole, BufWriter::with_capacity(PIECE, file)))
+}
+
+/// What becomes of an error of the output: who read it may have left, as `head` does.
+fn written(to: &Path, error: io::Error) -> Result<(), Failure> {
+    if is_standard(to) {
+        return protocol::usage::written(Err(error));
+    }
+    Err(Failure::run(format!("{}: {error}; nothing is left of it", to.display())))
+}
+
+/// Progress by bytes of the input, on a terminal.
+fn bar(size: Option<u64>) -> ProgressBar {
+    let Some(size) = size.filter(|_| io::stderr().is_terminal()) else { return ProgressBar::hidden() };
+    let bar = ProgressBar::with_draw_target(Some(size), ProgressDrawTarget::stderr());
+    let style = "{bar:40} {bytes} of {total_bytes}, {binary_bytes_per_sec}, {eta} left";
+    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// Why there is nothing to convert.
+fn nothing(name: &str, reader: &Reader) -> String {
+    match (reader.format(), reader.lines()) {
+        (Format::Candump, 0) => format!("{name} is empty: there is nothing to convert"),
+        (Format::Candump, lines) => format!(
+            "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
+             `(1700000000.123456) vcan0 123#00`"
+        ),
+        (Format::Mcap, _) => match others(reader) {
+            others if others.is_empty() => format!("{name}: there is no frame in it"),
+            others => format!("{name}: there is no frame in it, only {others}"),
+        },
+    }
+}
+
+/// What is in a recording beside frames and notes.
+fn others(reader: &Reader) -> String {
+    let extras = reader.extras();
+    let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
+    let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
+    let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
+    let facts = extras.metadata.iter().map(|(name, _)| format!("metadata {name}"));
+    topics.chain(attached).chain(facts).collect::<Vec<_>>().join(", ")
+}
+
+/// What somebody may want to know of a conversion, a line each.
+fn remarks(reader: &Reader, done: &Converted) -> Vec<String> {
+    let mut lines = Vec::new();
+    if let Some((times, first)) = done.backwards {
+        lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
+    }
+    for (count, what) in [
+        (done.unreadable, "begin like a frame and are none: not read"),
+        (done.can_xl, "are CAN XL frames: not read"),
+        (done.dropped, "frames are missing: whoever took the capture lost them"),
+        (done.shortened, "frames are written without something that a log cannot have or was not to have"),
+        (done.left_out, "notes are left out"),
+    ] {
+        if count > 0 {
+            lines.push(format!("{count} {what}"));
+        }
+    }
+    match others(reader) {
+        others if others.is_empty() => {}
+        others => lines.push(format!("a log has no place for {others}")),
+    }
+    lines
+}

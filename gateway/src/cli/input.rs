@@ -1,0 +1,43 @@
+//! Where commands read from, when somebody may say stop meanwhile.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use protocol::usage::Failure;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+/// How long a signal to end may wait, when nothing comes.
+pub(crate) const LOOK: Duration = Duration::from_millis(200);
+
+/// A flag that SIGINT and SIGTERM set.
+pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
+    let stopped = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stopped))
+            .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;
+    }
+    Ok(stopped)
+}
+
+/// A file whose reader can be told to stop: then it is at its end.
+pub(crate) struct Interruptible {
+    pub(crate) file: File,
+    pub(crate) stopped: Arc<AtomicBool>,
+}
+
+impl Read for Interruptible {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let timeout = Timespec::try_from(LOOK).ok();
+        while !self.stopped.load(Ordering::Relaxed) {
+            match poll(&mut [PollFd::new(&self.file, PollFlags::IN)], timeout.as_ref()) {
+                Ok(0) | Err(rustix::io::Errno::INTR) => {}
+                Ok(_) => return self.file.read(buffer),
+                Err(errno) => return Err(errno.into()),
+            }
+        }
+        Ok(0)
+    }
+}
