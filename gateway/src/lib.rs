@@ -6,6 +6,7 @@ pub mod controller;
 pub mod cycle;
 pub mod dbc;
 pub mod decode;
+pub mod explain;
 pub mod external;
 pub mod generate;
 pub mod record;

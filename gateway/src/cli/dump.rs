@@ -97,7 +97,7 @@ enum Format {
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
-fn nanos(text: &str) -> Result<u64, String> {
+pub(super) fn nanos(text: &str) -> Result<u64, String> {
     match text.parse::<f64>() {
         Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
         _ => Err("a number of seconds from 0 to 1e9".to_owned()),

@@ -5,6 +5,7 @@ mod ack;
 mod convert;
 mod dbc;
 mod dump;
+mod explain;
 mod frame;
 mod input;
 mod output;
@@ -40,6 +41,7 @@ enum Command {
     Ack(ack::Ack),
     Skin(skin::Skin),
     Dbc(dbc::Dbc),
+    Explain(explain::Explain),
 }
 
 impl Command {
@@ -55,6 +57,7 @@ impl Command {
             Self::Ack(command) => command.run(),
             Self::Skin(command) => command.run(),
             Self::Dbc(command) => command.run(),
+            Self::Explain(command) => command.run(),
         }
     }
 }

@@ -1,0 +1,374 @@
+//! Finds the joints that are asked about, and what each cell felt and answered then.
+
+use protocol::fixed::Q3_12;
+use protocol::id::{CellId, Node};
+use protocol::message::{Answer, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Parameter;
+use protocol::skin::Skin;
+use thiserror::Error;
+
+use super::felt::{Felt, Origin};
+
+/// Joints after the ones that are asked about, within which a torque may come.
+const LATE: u32 = 4;
+/// Joints after them, within which the configurations of cells that have not said theirs are waited for.
+const PATIENCE: u32 = 32;
+/// Runs of epochs that an error names.
+const RUNS: usize = 8;
+
+/// Which joints.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Asked {
+    /// Their epoch.
+    pub epoch: Epoch,
+    /// Only from so many ns after the first frame on.
+    pub from_ns: u64,
+    /// Which of them, from 1.
+    pub occurrence: u32,
+}
+
+/// Why there is nothing to explain.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum NotFound {
+    /// No bus of the capture is one of the skin's.
+    #[error("none of its buses ({capture}) is one of the skin's ({skin})")]
+    Buses {
+        /// Those of the capture.
+        capture: String,
+        /// Those of the skin.
+        skin: String,
+    },
+    /// There are no joints at all.
+    #[error("there are no joints on {buses}, and cells answer nothing else")]
+    Joints {
+        /// The skin's buses that are in the capture.
+        buses: String,
+    },
+    /// The epoch is not there, or not so often, or not so late.
+    #[error("no joints {asked}; there are {runs}")]
+    Epoch {
+        /// What was asked for.
+        asked: String,
+        /// Epochs that are there, in their order, and from when to when.
+        runs: String,
+    },
+}
+
+/// What one bus' cells were told and answered.
+#[derive(Clone, Debug)]
+pub struct Moment {
+    /// When the joints came.
+    pub at_ns: u64,
+    /// The joints.
+    pub joints: Joints,
+    /// Whether the bus was halted.
+    pub halted: bool,
+    /// By the cell's place.
+    pub cells: Vec<CellMoment>,
+}
+
+/// One cell at that moment.
+#[derive(Clone, Debug, Default)]
+pub struct CellMoment {
+    /// What it felt and how that is known.
+    pub felt: Option<(SkinSensors, Origin)>,
+    /// Whether it obeys stimuli; `None` when it has not said.
+    pub test_mode: Option<bool>,
+    /// Hash of its configuration; `None` when it has not said.
+    pub hash: Option<u16>,
+    /// The torque that it answered, and when.
+    pub answer: Option<(u64, [Q3_12; WORDS])>,
+    /// Further torques of this epoch, which nobody uses.
+    pub repeated: u32,
+}
+
+/// Reads a capture up to a moment.
+#[derive(Debug)]
+pub struct Watch<'a> {
+    skin: &'a Skin,
+    asked: Asked,
+    first: Option<u64>,
+    /// By the skin's bus.
+    lanes: Vec<Lane>,
+    /// Buses that are not the skin's.
+    others: Vec<String>,
+}
+
+#[derive(Debug, Default)]
+struct Lane {
+    /// Whether the capture has it.
+    there: bool,
+    /// Whether the skin has cells on it.
+    cells_here: bool,
+    last: Option<Epoch>,
+    halted: bool,
+    /// How many there were of those that are asked about.
+    occurrences: u32,
+    moment: Option<Moment>,
+    /// Joints since the moment.
+    since: u32,
+    cells: Vec<Cell>,
+    runs: Vec<Run>,
+    /// Runs beyond those that are kept.
+    further_runs: u64,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Cell {
+    felt: Felt,
+    test_mode: Option<bool>,
+    hash: Option<u16>,
+}
+
+/// Joints whose epochs follow each other.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    first: (Epoch, u64),
+    last: (Epoch, u64),
+    joints: u64,
+}
+
+impl<'a> Watch<'a> {
+    /// Begins before the first frame.
+    #[must_use]
+    pub fn new(skin: &'a Skin, asked: Asked) -> Self {
+        let lane = |bus| Lane {
+            cells_here: skin.cells_of(bus).next().is_some(),
+            cells: vec![Cell::default(); CellId::COUNT],
+            ..Lane::default()
+        };
+        let lanes = (0..skin.buses.len()).map(lane).collect();
+        Self { skin, asked, first: None, lanes, others: Vec::new() }
+    }
+
+    /// Takes in the next frame; `message` is what it says, when that is anything. Whether all is known now.
+    pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
+        let first = *self.first.get_or_insert(nanos);
+        let Some(lane) = self.skin.bus_named(bus).and_then(|at| self.lanes.get_mut(at)) else {
+            if self.others.len() < RUNS && !self.others.iter().any(|other| other == bus) {
+                self.others.push(bus.to_owned());
+            }
+            return false;
+        };
+        lane.there = true;
+        if let Some(message) = message {
+            lane.take(nanos, nanos.saturating_sub(first), message, self.asked, self.skin.robot.joints.len());
+        }
+        self.is_complete()
+    }
+
+    /// Whether nothing more is waited for.
+    fn is_complete(&self) -> bool {
+        self.lanes.iter().filter(|lane| lane.cells_here).all(Lane::is_complete)
+    }
+
+    /// What was found, by the skin's bus; a bus that has no such joints has none. The capture is at its end, or
+    /// all is known.
+    ///
+    /// # Errors
+    /// When no bus has them.
+    pub fn moments(self) -> Result<Vec<Option<Moment>>, NotFound> {
+        let names = |there: bool| {
+            let buses = self.skin.buses.iter().zip(&self.lanes).filter(|(_, lane)| lane.there || !there);
+            buses.map(|(bus, _)| bus.name.as_str()).collect::<Vec<_>>().join(", ")
+        };
+        if !self.lanes.iter().any(|lane| lane.there) {
+            let capture = if self.others.is_empty() { "none".to_owned() } else { self.others.join(", ") };
+            return Err(NotFound::Buses { capture, skin: names(false) });
+        }
+        if self.lanes.iter().all(|lane| lane.moment.is_none()) {
+            let first = self.first.unwrap_or_default();
+            let Some(lane) = self.lanes.iter().find(|lane| !lane.runs.is_empty()) else {
+                return Err(NotFound::Joints { buses: names(true) });
+            };
+            let Asked { epoch, from_ns, occurrence } = self.asked;
+            let mut asked = format!("of epoch {epoch}");
+            if occurrence > 1 {
+                asked += &format!(" for the {occurrence}. time");
+            }
+            if from_ns > 0 {
+                asked += &format!(" at {} s or later", seconds(from_ns));
+            }
+            let mut runs: Vec<_> = lane.runs.iter().map(|run| run.text(first)).collect();
+            if lane.further_runs > 0 {
+                runs.push(format!("and {} further runs", lane.further_runs));
+            }
+            return Err(NotFound::Epoch { asked, runs: runs.join(", ") });
+        }
+        Ok(self.lanes.into_iter().map(|lane| lane.moment).collect())
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "to be read")]
+fn seconds(nanos: u64) -> String {
+    format!("{:.3}", nanos as f64 / 1e9)
+}
+
+impl Run {
+    fn text(&self, began: u64) -> String {
+        let Self { first, last, joints } = *self;
+        let [from, to] = [first, last].map(|(_, at)| seconds(at.saturating_sub(began)));
+        format!("{joints} of epochs {} to {} from {from} to {to} s", first.0, last.0)
+    }
+}
+
+impl Lane {
+    fn is_complete(&self) -> bool {
+        let known = |moment: &Moment| {
+            let answered = |cell: &&CellMoment| cell.answer.is_some();
+            moment.cells.iter().filter(answered).all(|cell| cell.hash.is_some())
+        };
+        self.moment
+            .as_ref()
+            .is_some_and(|moment| self.since >= PATIENCE || self.since >= LATE && known(moment))
+    }
+
+    fn take(&mut self, nanos: u64, after: u64, message: &Message, asked: Asked, robot: usize) {
+        let last = self.last;
+        match *message {
+            Message::Halt => self.halted = true,
+            Message::Resume => self.halted = false,
+            // Other counts are not this robot's, and a cell drops joints of the last epoch.
+            Message::Joints { epoch, joints } => {
+                if usize::from(joints.in_use) == robot && last != Some(epoch) {
+                    self.joints(nanos, after, epoch, joints, asked);
+                }
+            }
+            Message::Stimulus { to, from, page } => {
+                self.each(to, |cell| {
+                    if cell.test_mode != Some(false) {
+                        cell.felt.push(nanos, from, page, last);
+                    }
+                });
+            }
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                if Parameter::from_number(number) == Some(Parameter::Mode) {
+                    let obeys = words.first() == Some(&1);
+                    self.each(to, |cell| cell.mode(obeys, Origin::Mode { at_ns: nanos }));
+                }
+            }
+            Message::Configured { from, answer: Answer::Value { number, written, words }, .. } => {
+                let [commit, _, _, identity, ..] = words.map(i16::cast_unsigned);
+                let hash = match Parameter::from_number(number) {
+                    Some(Parameter::Commit) if written => commit,
+                    Some(Parameter::Identity) => identity,
+                    Some(_) | None => return,
+                };
+                self.each(Node::Cell(from), |cell| cell.hash = Some(hash));
+                self.learn(from, hash);
+            }
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                let state = heartbeat.state;
+                let obeys = state.has(State::TEST_MODE);
+                self.each(Node::Cell(from), |cell| {
+                    if state.has(State::CLAIMING) && heartbeat.sent == 0 {
+                        cell.mode(obeys, Origin::Start { at_ns: nanos });
+                    } else if !obeys {
+                        cell.felt.forget();
+                    }
+                    cell.test_mode = Some(obeys);
+                    cell.hash = Some(heartbeat.configuration);
+                });
+                self.learn(from, heartbeat.configuration);
+            }
+            Message::Sensors { from, epoch, page: SensorPage::Skin(skin) } => {
+                if last == Some(epoch) || last.is_none() {
+                    self.each(Node::Cell(from), |cell| {
+                        if cell.test_mode != Some(false) {
+                            cell.felt.said(nanos, skin);
+                        }
+                    });
+                }
+                // A cell that measures has read its sensors at these very joints.
+                if let Some(cell) = self.answering(from, epoch, asked) {
+                    cell.felt.get_or_insert((skin, Origin::Said { at_ns: nanos }));
+                }
+            }
+            Message::Torque { from, epoch, torque } => {
+                if let Some(cell) = self.answering(from, epoch, asked) {
+                    cell.repeated += u32::from(cell.answer.is_some());
+                    cell.answer.get_or_insert((nanos, torque));
+                }
+            }
+            Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, asked: Asked) {
+        self.run(nanos, epoch);
+        self.last = Some(epoch);
+        for cell in &mut self.cells {
+            cell.felt.latch(epoch);
+        }
+        if self.moment.is_some() {
+            self.since += 1;
+        } else if epoch == asked.epoch && after >= asked.from_ns {
+            self.occurrences += 1;
+            if self.occurrences == asked.occurrence {
+                let cells = self.cells.iter().map(|Cell { felt, test_mode, hash }| CellMoment {
+                    felt: felt.now(),
+                    test_mode: *test_mode,
+                    hash: *hash,
+                    ..CellMoment::default()
+                });
+                self.moment =
+                    Some(Moment { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() });
+            }
+        }
+    }
+
+    /// Notes which epochs there are.
+    fn run(&mut self, nanos: u64, epoch: Epoch) {
+        let follows = self.last.is_some_and(|last| last.next() == epoch);
+        if !follows && self.runs.len() == RUNS {
+            self.further_runs += 1;
+        } else if !follows {
+            self.runs.push(Run { first: (epoch, nanos), last: (epoch, nanos), joints: 1 });
+        } else if let Some(run) = self.runs.last_mut().filter(|_| self.further_runs == 0) {
+            run.last = (epoch, nanos);
+            run.joints += 1;
+        }
+    }
+
+    /// The cell at the moment, when it speaks of it and in time.
+    fn answering(&mut self, from: CellId, epoch: Epoch, asked: Asked) -> Option<&mut CellMoment> {
+        let in_time = epoch == asked.epoch && self.since < LATE;
+        self.moment.as_mut().filter(|_| in_time)?.cells.get_mut(from.index())
+    }
+
+    /// What a cell computes with became known only after the moment; it was the same then.
+    fn learn(&mut self, from: CellId, hash: u16) {
+        let cell = self.moment.as_mut().and_then(|moment| moment.cells.get_mut(from.index()));
+        if let Some(cell) = cell {
+            cell.hash.get_or_insert(hash);
+        }
+    }
+
+    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Cell)) {
+        for (cell, state) in CellId::all().zip(&mut self.cells) {
+            if to.names(cell) {
+                act(state);
+            }
+        }
+    }
+}
+
+impl Cell {
+    /// It begins to obey stimuli, or to measure.
+    fn mode(&mut self, obeys: bool, origin: Origin) {
+        self.test_mode = Some(obeys);
+        if obeys {
+            self.felt.clear(origin);
+        } else {
+            self.felt.forget();
+        }
+    }
+}
