@@ -164,6 +164,8 @@ pub struct Total {
     pub difference_nm: f64,
     /// Cells with a saturated word: the sum is no better than that.
     pub saturated: u32,
+    /// Cells of which the word or what it should be is not known: the sums do not mean the same.
+    pub open: u32,
 }
 
 /// Explains what was found, by the skin's bus.
@@ -234,6 +236,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
             });
             let rows: Vec<_> = rows.collect();
             for (at, sum) in sums.iter_mut().enumerate().take(joints) {
+                sum.open += u32::from(force.is_none() || words.is_none());
                 let of = |values: &[f64; WORDS]| values.get(at).copied().unwrap_or_default();
                 sum.central += of(&exact);
                 sum.unrounded += of(&unrounded);
@@ -270,6 +273,7 @@ struct Sum {
     central: f64,
     unrounded: f64,
     saturated: u32,
+    open: u32,
 }
 
 impl Sum {
@@ -285,6 +289,7 @@ impl Sum {
             unrounded_nm: self.unrounded,
             difference_nm: words_nm - self.central,
             saturated: self.saturated,
+            open: self.open,
         }
     }
 }

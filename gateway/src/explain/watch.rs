@@ -47,7 +47,7 @@ pub enum NotFound {
         buses: String,
     },
     /// The epoch is not there, or not so often, or not so late.
-    #[error("no joints {asked}; there are {runs}")]
+    #[error("there are no joints {asked}; there are {runs}")]
     Epoch {
         /// What was asked for.
         asked: String,
@@ -193,9 +193,9 @@ impl<'a> Watch<'a> {
             }
             let mut runs: Vec<_> = lane.runs.iter().map(|run| run.text(first)).collect();
             if lane.further_runs > 0 {
-                runs.push(format!("and {} further runs", lane.further_runs));
+                runs.push(format!("{} further rows", lane.further_runs));
             }
-            return Err(NotFound::Epoch { asked, runs: runs.join(", ") });
+            return Err(NotFound::Epoch { asked, runs: runs.join("; ") });
         }
         Ok(self.lanes.into_iter().map(|lane| lane.moment).collect())
     }
@@ -210,7 +210,11 @@ impl Run {
     fn text(&self, began: u64) -> String {
         let Self { first, last, joints } = *self;
         let [from, to] = [first, last].map(|(_, at)| seconds(at.saturating_sub(began)));
-        format!("{joints} of epochs {} to {} from {from} to {to} s", first.0, last.0)
+        let (first, last) = (first.0, last.0);
+        if joints == 1 {
+            return format!("those of epoch {first} at {from} s");
+        }
+        format!("{joints} joints in a row, from epoch {first} at {from} s to epoch {last} at {to} s")
     }
 }
 

@@ -45,7 +45,7 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
         }
         (What::All, _) => text += &one_line_each(cells),
     }
-    if what != What::Cells {
+    if what != What::Cells && !cells.is_empty() {
         text += &totals(&explanation.total);
     }
     if !explanation.missing.is_empty() {
@@ -267,10 +267,14 @@ fn totals(total: &[Total]) -> String {
         unrounded_nm,
         difference_nm,
         saturated,
+        open,
     } in total
     {
-        let difference =
-            if *saturated == 0 { format!("{difference_nm:+.6}") } else { format!("{saturated} saturated") };
+        let difference = match (open, saturated) {
+            (0, 0) => format!("{difference_nm:+.6}"),
+            (0, saturated) => format!("{saturated} saturated"),
+            (open, _) => format!("{open} not known"),
+        };
         table.add_row([
             joint.to_string(),
             word_steps.to_string(),
