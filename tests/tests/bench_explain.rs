@@ -148,7 +148,7 @@ fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
 }
 
 #[test]
-fn a_cell_that_started_anew_feels_nothing_and_one_that_lets_go_says_zeros() {
+fn a_cell_that_has_just_started_says_nothing_and_one_that_lets_go_says_zeros() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
     (0..4).for_each(|place| bench.press(place, 2.0));
     bench.run_epochs(5);
@@ -161,7 +161,13 @@ fn a_cell_that_started_anew_feels_nothing_and_one_that_lets_go_says_zeros() {
     let explanation = explained(&bench, &bench.wire, epoch);
     let node = |place: usize| bench.skin.cells[place].node.get();
     let cell = |place: usize| explanation.cells.iter().find(|cell| cell.node == node(place));
-    assert!(cell(0).is_some() && cell(2).is_none(), "it has started anew and claims its number");
+    // It was told again what it feels, and answers nothing while it claims its number.
+    assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
+    let why = format!(
+        "vcan0 {}: no torque of this epoch came: it had just started and claimed its number; the words are without it",
+        node(2)
+    );
+    assert_eq!(explanation.missing, [why]);
     let let_go = cell(3).unwrap();
     assert_eq!(let_go.force.unwrap().force_steps, 0);
     assert!(let_go.rows.iter().all(|row| row.word == Some(0) && row.verdict == Verdict::Nearest));

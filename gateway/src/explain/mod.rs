@@ -18,7 +18,7 @@ pub use felt::Origin;
 pub use watch::{Asked, CellMoment, Moment, NotFound, Watch};
 
 use protocol::fixed::{Q, Q3_12};
-use protocol::message::SkinSensors;
+use protocol::message::{SkinSensors, State};
 use protocol::packet::WORDS;
 use protocol::skin::{Cell, Reply, Skin};
 use serde::Serialize;
@@ -215,11 +215,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                 continue;
             }
             if active && said.answer.is_none() {
-                let why = if moment.halted {
-                    "the bus was halted"
-                } else {
-                    "lost, late, or the cell was not there"
-                };
+                let why = silence(moment.halted, said.state);
                 let node = cell.node;
                 explanation.missing.push(format!(
                     "{name} {node}: no torque of this epoch came: {why}; the words are without it"
@@ -291,6 +287,20 @@ impl Sum {
             saturated: self.saturated,
             open: self.open,
         }
+    }
+}
+
+/// Why a cell in contact says nothing, as far as is known.
+fn silence(halted: bool, state: Option<State>) -> &'static str {
+    let has = |bit| state.is_some_and(|state| state.has(bit));
+    if halted || has(State::HALTED) {
+        "it was halted"
+    } else if has(State::CLAIMING) {
+        "it had just started and claimed its number"
+    } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
+        "it had no configuration"
+    } else {
+        "lost, late, or the cell was not there"
     }
 }
 

@@ -76,6 +76,8 @@ pub struct CellMoment {
     pub felt: Option<(SkinSensors, Origin)>,
     /// Whether it obeys stimuli; `None` when it has not said.
     pub test_mode: Option<bool>,
+    /// How it was, by its last heartbeat.
+    pub state: Option<State>,
     /// Hash of its configuration; `None` when it has not said.
     pub hash: Option<u16>,
     /// The torque that it answered, and when.
@@ -119,6 +121,7 @@ struct Lane {
 struct Cell {
     felt: Felt,
     test_mode: Option<bool>,
+    state: Option<State>,
     hash: Option<u16>,
 }
 
@@ -273,6 +276,7 @@ impl Lane {
                         cell.felt.forget();
                     }
                     cell.test_mode = Some(obeys);
+                    cell.state = Some(state);
                     cell.hash = Some(heartbeat.configuration);
                 });
                 self.learn(from, heartbeat.configuration);
@@ -317,9 +321,10 @@ impl Lane {
         } else if epoch == asked.epoch && after >= asked.from_ns {
             self.occurrences += 1;
             if self.occurrences == asked.occurrence {
-                let cells = self.cells.iter().map(|Cell { felt, test_mode, hash }| CellMoment {
+                let cells = self.cells.iter().map(|Cell { felt, test_mode, state, hash }| CellMoment {
                     felt: felt.now(),
                     test_mode: *test_mode,
+                    state: *state,
                     hash: *hash,
                     ..CellMoment::default()
                 });
