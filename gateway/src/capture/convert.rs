@@ -111,7 +111,16 @@ pub fn convert<W: Write>(
 ) -> Result<Converted, ConvertError> {
     let mut done = Converted::default();
     let mut newest = 0;
-    while let Some(entry) = from.next()? {
+    loop {
+        let entry = match from.next() {
+            Ok(Some(entry)) => entry,
+            Ok(None) => return Ok(done),
+            Err(error) => {
+                // Who reads along has what came before.
+                to.pass_on().map_err(ConvertError::Write)?;
+                return Err(error.into());
+            }
+        };
         let mut is_frame = false;
         match &entry {
             Entry::Frame(record) => {
@@ -152,5 +161,4 @@ pub fn convert<W: Write>(
             to.pass_on().map_err(ConvertError::Write)?;
         }
     }
-    Ok(done)
 }

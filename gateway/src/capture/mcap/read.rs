@@ -71,8 +71,10 @@ impl McapReader {
     /// Goes on behind `head`, which has been read already.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
         // A chunk is checked before anything of it is believed.
-        let options =
-            LinearReaderOptions::default().with_prevalidate_chunk_crcs(true).with_record_length_limit(LIMIT);
+        let options = LinearReaderOptions::default()
+            .with_prevalidate_chunk_crcs(true)
+            .with_validate_data_section_crc(true)
+            .with_record_length_limit(LIMIT);
         let mut linear = LinearReader::new_with_options(options);
         for (to, from) in linear.insert(head.len()).iter_mut().zip(head) {
             *to = *from;
