@@ -317,3 +317,6 @@ pub mod reason {
     /// What stands between frames.
     pub const NOTE: &str = "note";
 }
+
+#[cfg(test)]
+mod tests;

@@ -4,10 +4,11 @@
 //!   messages up to there ──> take ──> [ State ] ──> restoring ──> messages before the first replayed one
 //! ```
 //!
-//! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it. So a replay that
-//! begins in the middle says first, in this order: the configuration as it was written; resume; the stimuli in force;
-//! the last joints, so that their epoch and who was in contact are as they were; halt, if that was in force; and the
-//! stimuli that still waited for their epoch.
+//! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it; and the end of a
+//! contact is said once, by a cell that was in contact at the joints before. So a replay that begins in the middle
+//! says again, in this order: the configuration as it was written; resume; the stimuli in force before the last
+//! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
+//! were said.
 
 use std::collections::VecDeque;
 
@@ -21,6 +22,8 @@ use protocol::parameters::Parameter;
 
 /// Stimuli that a cell lets wait.
 const PENDING: usize = 8;
+/// Messages since the last joints that are kept as they were said.
+const SINCE: usize = 16_384;
 
 /// What one cell feels, by the protocol's rules.
 #[derive(Clone, Debug, Default)]
@@ -83,64 +86,62 @@ impl Feeling {
     }
 }
 
-/// What holds on one bus.
+/// What held on a bus before its last joints.
 #[derive(Clone, Debug)]
-pub struct State {
+struct Before {
     /// Parameters that were written, in order, without those that were written over.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
-    joints: Option<(Epoch, Joints)>,
     /// By the cell's place.
     cells: Vec<Feeling>,
+}
+
+/// What holds on one bus.
+#[derive(Clone, Debug)]
+pub struct State {
+    before: Before,
+    /// The last joints. Whether a cell was in contact at them depends on what held before.
+    joints: Option<(Epoch, Joints)>,
+    /// What was said since then, as it was said.
+    since: Vec<Message>,
 }
 
 impl Default for State {
     fn default() -> Self {
         let cells = vec![Feeling::default(); CellId::COUNT];
-        Self { writes: Vec::new(), halted: false, joints: None, cells }
+        let before = Before { writes: Vec::new(), halted: false, cells };
+        Self { before, joints: None, since: Vec::new() }
     }
 }
 
-impl State {
-    /// Takes in the bus' next message.
-    pub fn take(&mut self, message: &Message) {
+impl Before {
+    /// Takes in what was said after the joints `last`.
+    fn take(&mut self, message: &Message, last: Option<Epoch>) {
         match *message {
             Message::Halt => self.halted = true,
             Message::Resume => self.halted = false,
-            Message::Joints { epoch, joints } => {
-                self.joints = Some((epoch, joints));
-                for cell in &mut self.cells {
-                    cell.latch(epoch);
-                }
-            }
-            Message::Stimulus { to, from, page } => {
-                let last = self.joints.map(|(epoch, _)| epoch);
-                self.each(to, |cell| cell.push(from, page, last));
-            }
+            Message::Stimulus { to, from, page } => self.each(to, |cell| cell.push(from, page, last)),
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
                 self.write(to, number, *message);
                 if number == Parameter::Mode.number() {
                     self.each(to, |cell| cell.clear(words.first() != Some(&1)));
                 }
             }
-            Message::Sensors { from, epoch, page } => {
-                if self.joints.is_none_or(|(last, _)| last == epoch) {
-                    self.each(Node::Cell(from), |cell| cell.learn(page));
-                }
-            }
-            // A cell that has started anew has forgotten what it felt.
-            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. }
-                if heartbeat.state.has(Flags::CLAIMING) =>
-            {
-                self.each(from, |cell| cell.clear(false));
-            }
             Message::Configure { .. }
+            | Message::Joints { .. }
             | Message::Network { .. }
             | Message::Sync
             | Message::Report
             | Message::Sum { .. }
             | Message::Torque { .. }
+            | Message::Sensors { .. }
             | Message::Configured { .. } => {}
+        }
+    }
+
+    fn latch(&mut self, epoch: Epoch) {
+        for cell in &mut self.cells {
+            cell.latch(epoch);
         }
     }
 
@@ -168,50 +169,111 @@ impl State {
         }
         self.writes.push((to, number, message));
     }
+}
+
+impl State {
+    /// Takes in the bus' next message.
+    pub fn take(&mut self, message: &Message) {
+        match *message {
+            Message::Joints { epoch, joints } => {
+                self.fold();
+                self.joints = Some((epoch, joints));
+            }
+            Message::Halt
+            | Message::Resume
+            | Message::Stimulus { .. }
+            | Message::Configure { request: Request::Write { .. }, .. } => {
+                if self.since.len() == SINCE {
+                    self.fold();
+                }
+                self.since.push(*message);
+            }
+            Message::Sensors { from, epoch, page } => {
+                if self.joints.is_none_or(|(last, _)| last == epoch) {
+                    self.before.each(Node::Cell(from), |cell| cell.learn(page));
+                }
+            }
+            // A cell that has started anew has forgotten what it felt.
+            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. }
+                if heartbeat.state.has(Flags::CLAIMING) =>
+            {
+                self.before.each(from, |cell| cell.clear(false));
+                let to_it = |it: &Message| matches!(it, Message::Stimulus { to, .. } if *to == from);
+                self.since.retain(|message| !to_it(message));
+            }
+            Message::Configure { .. }
+            | Message::Network { .. }
+            | Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    /// What was said until now holds before what comes.
+    fn fold(&mut self) {
+        let last = self.joints.map(|(epoch, _)| epoch);
+        if let Some(epoch) = last {
+            self.before.latch(epoch);
+        }
+        for message in self.since.drain(..) {
+            self.before.take(&message, last);
+        }
+    }
 
     /// Whether a cell that has just started is in this state already.
     #[must_use]
     pub fn is_fresh(&self) -> bool {
-        let felt = self.cells.iter().any(|cell| cell.pages().next().is_some() || !cell.pending.is_empty());
-        !felt && self.writes.is_empty() && !self.halted && self.joints.is_none()
+        let Before { writes, halted, cells } = &self.before;
+        let felt = cells.iter().any(|cell| cell.pages().next().is_some() || !cell.pending.is_empty());
+        !felt && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
     }
 
     /// Whether new parameters were taken into use.
     #[must_use]
     pub fn configures(&self) -> bool {
-        self.writes.iter().any(|(_, number, _)| *number == Parameter::Commit.number())
+        let commit = Parameter::Commit.number();
+        let commits = |message: &Message| matches!(message, Message::Configure { request: Request::Write { number, .. }, .. } if *number == commit);
+        self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
     }
 
     /// What has to be said so that `cells` are in this state; `next` are the joints that come first then, for a bus
     /// that has had none yet: the cells then forget the epoch of whoever spoke to them before.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
-        let mut messages: Vec<_> = self.writes.iter().map(|(_, _, message)| *message).collect();
+        let Before { writes, halted, cells: feelings } = &self.before;
+        let mut messages: Vec<_> = writes.iter().map(|(_, _, message)| *message).collect();
         messages.push(Message::Resume);
-        let known: Vec<_> = CellId::all().zip(&self.cells).filter(|(cell, _)| cells(*cell)).collect();
+        let known: Vec<_> = CellId::all().zip(feelings).filter(|(cell, _)| cells(*cell)).collect();
         let stimulus = |cell, from, page| Message::Stimulus { to: Node::Cell(cell), from, page };
         let felt: Vec<_> = known
             .iter()
             .flat_map(|(cell, feeling)| feeling.pages().map(|page| stimulus(*cell, From::Next, page)))
             .collect();
-        let before = |(epoch, joints): (Epoch, Joints)| (epoch.plus(u8::MAX), joints);
-        if let Some((epoch, joints)) = self.joints.or_else(|| next.map(before)) {
-            if !felt.is_empty() {
-                // Joints of the cells' last epoch would be dropped, and with them the stimuli would wait.
-                let (epoch, joints) = before((epoch, joints));
-                messages.push(Message::Joints { epoch, joints });
-            }
+        let pending = known
+            .iter()
+            .flat_map(|(cell, it)| it.pending.iter().map(|&(from, page)| stimulus(*cell, from, page)));
+        let pending: Vec<_> = pending.collect();
+        let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
+            epoch: epoch.plus(0_u8.wrapping_sub(steps)),
+            joints,
+        };
+        let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.plus(u8::MAX), joints)));
+        if let Some(last) = last.filter(|_| !felt.is_empty() || !pending.is_empty()) {
+            // Joints of a cell's last epoch would be dropped, and so those that matter may not be the first.
+            messages.push(steps_before(2, last));
             messages.extend(felt);
-            messages.push(Message::Joints { epoch, joints });
+            messages.push(steps_before(1, last));
         } else {
             messages.extend(felt);
         }
-        if self.halted {
+        messages.extend(pending);
+        if *halted {
             messages.push(Message::Halt);
         }
-        for (cell, feeling) in known {
-            messages.extend(feeling.pending.iter().map(|&(from, page)| stimulus(cell, from, page)));
-        }
+        messages.extend(last.map(|last| steps_before(0, last)));
+        messages.extend(&self.since);
         messages
     }
 }
@@ -252,13 +314,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_force_and_what_waits_are_told_apart() {
-        let next = From::Epoch;
+    fn what_was_in_force_what_waited_and_what_was_said_since_are_told_apart() {
+        let at = |epoch| From::Epoch(Epoch(epoch));
         let said = [
             joints(10),
-            to(1, next(Epoch(11)), 1.0),
-            to(1, next(Epoch(13)), 2.0),
+            to(1, at(11), 1.0),
             joints(11),
+            to(1, at(13), 2.0),
+            joints(12),
             to(2, From::Next, 3.0),
         ];
         let expected = [
@@ -266,7 +329,8 @@ mod tests {
             joints(10),
             to(1, From::Next, 1.0),
             joints(11),
-            to(1, next(Epoch(13)), 2.0),
+            to(1, at(13), 2.0),
+            joints(12),
             to(2, From::Next, 3.0),
         ];
         assert_eq!(restored(&said), expected);
@@ -274,24 +338,21 @@ mod tests {
 
     #[test]
     fn a_late_stimulus_waits_for_the_next_joints() {
-        let said = [joints(11), to(1, From::Epoch(Epoch(11)), 1.0)];
-        assert_eq!(restored(&said), [Message::Resume, joints(11), to(1, From::Next, 1.0)]);
+        let late = to(1, From::Epoch(Epoch(11)), 1.0);
+        assert_eq!(restored(&[joints(11), late]), [Message::Resume, joints(11), late]);
+        let next = to(1, From::Next, 1.0);
+        let expected = [Message::Resume, joints(10), joints(11), next, joints(12)];
+        assert_eq!(restored(&[joints(11), late, joints(12)]), expected);
     }
 
     #[test]
-    fn halted_cells_have_felt_and_are_halted_again_before_what_waits() {
-        let said = [to(1, From::Next, 1.0), joints(1), Message::Halt, to(1, From::Next, 2.0)];
-        let expected = [
-            Message::Resume,
-            joints(0),
-            to(1, From::Next, 1.0),
-            joints(1),
-            Message::Halt,
-            to(1, From::Next, 2.0),
-        ];
-        assert_eq!(restored(&said), expected);
-        let resumed = [&said[..], &[Message::Resume]].concat();
-        assert!(!restored(&resumed).contains(&Message::Halt));
+    fn halted_cells_are_halted_before_the_last_joints_or_after_them_as_it_was() {
+        let said =
+            [Message::Halt, joints(1), Message::Resume, joints(2), Message::Halt, joints(3), Message::Resume];
+        assert_eq!(restored(&said[..2]), [Message::Resume, Message::Halt, joints(1)]);
+        assert_eq!(restored(&said[..4]), [Message::Resume, joints(2)]);
+        assert_eq!(restored(&said[..5]), [Message::Resume, joints(2), Message::Halt]);
+        assert_eq!(restored(&said), [Message::Resume, Message::Halt, joints(3), Message::Resume]);
     }
 
     #[test]
@@ -300,12 +361,12 @@ mod tests {
         let page = NetworkPage::Heartbeat(heartbeat);
         let anew = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
         for end in [to(1, From::Next, 0.0), anew] {
-            let said = [to(1, From::Next, 1.0), joints(1), end, joints(2)];
-            assert_eq!(restored(&said), [Message::Resume, joints(2)]);
+            let said = [to(1, From::Next, 1.0), joints(1), end, joints(2), joints(3)];
+            assert_eq!(restored(&said), [Message::Resume, joints(3)]);
         }
         let measure = mode(Node::Everyone, 0);
-        let said = [to(1, From::Next, 1.0), joints(1), measure, to(1, From::Next, 1.0), joints(2)];
-        assert_eq!(restored(&said), [measure, Message::Resume, joints(2)]);
+        let said = [to(1, From::Next, 1.0), joints(1), measure, to(1, From::Next, 1.0), joints(2), joints(3)];
+        assert_eq!(restored(&said), [measure, Message::Resume, joints(3)]);
     }
 
     #[test]
@@ -317,7 +378,7 @@ mod tests {
         };
         let said =
             [write(1, 1), write(1, 2), write(127, 9), write(1, 3), mode(Node::Everyone, 1), write(127, 9)];
-        let again = [&said[..], &[mode(Node::Everyone, 1), write(1, 4)]].concat();
+        let again = [&said[..], &[mode(Node::Everyone, 1), write(1, 4), joints(1)]].concat();
         let expected = [
             write(1, 2),
             write(127, 9),
@@ -326,6 +387,7 @@ mod tests {
             mode(Node::Everyone, 1),
             write(1, 4),
             Message::Resume,
+            joints(1),
         ];
         assert_eq!(restored(&again), expected);
     }
@@ -335,7 +397,8 @@ mod tests {
         let says =
             |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
         let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
-        assert_eq!(restored(&said), [Message::Resume, joints(0), to(1, From::Next, 1.0), joints(1)]);
+        let expected = [Message::Resume, joints(255), to(1, From::Next, 1.0), joints(0), joints(1)];
+        assert_eq!(restored(&said), expected);
     }
 
     #[test]
@@ -352,6 +415,6 @@ mod tests {
         state.take(&Message::Stimulus { to: Node::Everyone, from: From::Next, page: press(1.0) });
         state.take(&joints(1));
         let messages = state.restoring(|it| it.get() == 7, None);
-        assert_eq!(messages, [Message::Resume, joints(0), to(7, From::Next, 1.0), joints(1)]);
+        assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, From::Next, 1.0), joints(1)]);
     }
 }

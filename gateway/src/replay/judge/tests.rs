@@ -1,1 +1,294 @@
+use super::*;
+use crate::replay::survey::{Part, Survey};
+use protocol::can::Format;
+use protocol::candump::{Record, Timestamp};
+use protocol::fixed::Q3_12;
+use protocol::message::Joints;
+use protocol::parameters::Parameter as P;
 
+const MS: u64 = 1_000_000;
+
+fn cell(number: i64) -> CellId {
+    CellId::new(number).unwrap()
+}
+
+fn torque(number: i64, epoch: u8, bits: i16) -> Message {
+    let mut torque = [Q3_12::ZERO; WORDS];
+    torque[0] = Q3_12::from_bits(bits);
+    Message::Torque { from: cell(number), epoch: Epoch(epoch), torque }
+}
+
+fn heartbeat(number: i64, epoch: u8, sent: u16, state: Flags) -> Message {
+    let page = NetworkPage::Heartbeat(Heartbeat { sent, state, configuration: 7, ..Heartbeat::default() });
+    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(epoch), page }
+}
+
+fn heard(number: i64, joints: u16) -> Message {
+    let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
+    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(0), page }
+}
+
+fn joints(epoch: u8) -> Message {
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } }
+}
+
+/// A recording, 1 ms from one message to the next, and what is heard now to the same joints.
+fn judged(recording: &[Message], now: &[Message]) -> Judge {
+    let mut survey = Survey::new(Part::default());
+    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let times = (1_u64..).map(|at| at * MS);
+    for (nanos, message) in times.clone().zip(recording) {
+        let time = Timestamp { nanos, nine_digits: false };
+        for frame in message.encode().frames(Format::Fd) {
+            survey.take(&Record { time, interface: "vcan0", frame, direction: None });
+        }
+    }
+    survey.finish();
+    let cells = survey.buses[0].cells.clone();
+    judge.lanes[0].excuses =
+        cells.into_iter().map(|(node, cell)| (node, Excuse { cell, ended_earlier: false })).collect();
+    judge.mute(false);
+    for (nanos, message) in times.zip(recording) {
+        match *message {
+            Message::Joints { epoch, .. } => {
+                judge.record_joints(0, nanos, epoch, true);
+            }
+            ref other => judge.record(0, other, true),
+        }
+    }
+    judge.record_end();
+    let mut round = 0;
+    for message in now {
+        match *message {
+            Message::Joints { epoch, .. } => {
+                judge.announce(0, Some(round), epoch);
+                round += 1;
+            }
+            ref other => judge.hear(0, other),
+        }
+    }
+    judge.finish(true);
+    judge
+}
+
+fn counts(judge: &Judge) -> [u64; 4] {
+    let Tally { equal, different, missing, extra, .. } = judge.tally;
+    [equal, different, missing, extra]
+}
+
+/// A run in which cell 1 was in contact from epoch 1 to 3.
+fn run() -> Vec<Message> {
+    vec![
+        heartbeat(1, 0, 10, Flags::TEST_MODE),
+        joints(0),
+        joints(1),
+        torque(1, 1, 5),
+        joints(2),
+        torque(1, 2, 6),
+        joints(3),
+        torque(1, 3, 0),
+        joints(4),
+        heartbeat(1, 4, 14, Flags::TEST_MODE),
+    ]
+}
+
+#[test]
+fn the_same_again_is_equal_in_whatever_order_cells_speak() {
+    assert_eq!(counts(&judged(&run(), &run())), [3, 0, 0, 0]);
+    // Late, but it says which joints it answers.
+    let mut late = run();
+    late.swap(3, 4);
+    assert_eq!(counts(&judged(&run(), &late)), [3, 0, 0, 0]);
+    assert_eq!(counts(&judged(&late, &run())), [3, 0, 0, 0]);
+}
+
+#[test]
+fn one_step_is_a_difference() {
+    let mut now = run();
+    now[5] = torque(1, 2, 7);
+    let judge = judged(&run(), &now);
+    assert_eq!(counts(&judge), [2, 1, 0, 0]);
+    let first = judge.first().unwrap();
+    assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (How::Different, Some((2, 2))));
+    assert!(first.to_string().ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first}");
+}
+
+#[test]
+fn a_reply_that_does_not_come_and_one_that_nobody_recorded_are_told_apart() {
+    let mut now = run();
+    now.remove(5);
+    let judge = judged(&run(), &now);
+    assert_eq!((counts(&judge), judge.first().unwrap().how), ([2, 0, 1, 0], How::Missing));
+    let mut now = run();
+    now.insert(9, torque(1, 4, 9));
+    let judge = judged(&[&run()[..], &[joints(5)]].concat(), &now);
+    assert_eq!((counts(&judge), judge.first().unwrap().how), ([3, 0, 0, 1], How::Extra));
+    // Twice the same is one answer, as of joints that were asked again; twice otherwise is not.
+    let mut now = run();
+    now.insert(4, torque(1, 1, 5));
+    assert_eq!(counts(&judged(&run(), &now)), [3, 0, 0, 0]);
+    now[4] = torque(1, 1, 4);
+    assert_eq!(counts(&judged(&run(), &now)), [3, 0, 0, 1]);
+}
+
+#[test]
+fn what_the_recording_lost_is_not_blamed_on_the_cell() {
+    // The heartbeats say that it had sent one packet more.
+    let mut lossy = run();
+    lossy.remove(5);
+    let judge = judged(&lossy, &run());
+    assert_eq!((counts(&judge), judge.tally.lacking.unrecorded), ([2, 0, 0, 0], 1));
+    // But only as many as they say.
+    lossy.remove(3);
+    lossy[7] = heartbeat(1, 4, 13, Flags::TEST_MODE);
+    let judge = judged(&lossy, &run());
+    assert_eq!((counts(&judge), judge.tally.lacking.unrecorded), ([1, 0, 0, 1], 1));
+}
+
+#[test]
+fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
+    // It did not take joints 3, and so said the end of the contact one later.
+    let recording = [
+        Message::Report,
+        heard(1, 100),
+        joints(0),
+        joints(1),
+        torque(1, 1, 5),
+        joints(2),
+        torque(1, 2, 6),
+        joints(3),
+        joints(4),
+        torque(1, 4, 0),
+        joints(5),
+        Message::Report,
+        heard(1, 105),
+    ];
+    let judge = judged(&recording, &run());
+    let Lacking { untaken, said_later, .. } = judge.tally.lacking;
+    assert_eq!((counts(&judge), untaken, said_later), ([2, 0, 0, 0], 1, 1));
+    let mut knows = recording;
+    knows[12] = heard(1, 106);
+    assert_eq!(counts(&judged(&knows, &run())), [2, 0, 1, 1], "it took all, by its own counters");
+}
+
+#[test]
+fn a_cell_that_was_silent_then_may_speak_now() {
+    let mut recording = run();
+    recording.extend(std::iter::repeat_n(Message::Sync, 700));
+    recording.extend([joints(5), joints(6)]);
+    let now = [&run()[..], &[joints(5), torque(1, 5, 5), torque(2, 5, 1), joints(6)]].concat();
+    let judge = judged(&recording, &now);
+    // Cell 2 is not in the recording at all.
+    assert_eq!((counts(&judge), judge.tally.lacking.silent), ([3, 0, 0, 0], 2));
+}
+
+#[test]
+fn the_end_of_a_recording_may_come_before_the_answers() {
+    let recording = &run()[..7];
+    let judge = judged(recording, &run()[..8]);
+    assert_eq!((counts(&judge), judge.tally.lacking.ended), ([2, 0, 0, 0], 1));
+}
+
+#[test]
+fn answers_to_joints_that_were_not_recorded_are_named() {
+    let mut recording = run();
+    recording.remove(4);
+    let judge = judged(&recording, &run());
+    assert_eq!(judge.tally.lacking.joints_unrecorded, 1);
+}
+
+#[test]
+fn a_cell_that_measured_is_not_compared() {
+    let mut recording = run();
+    recording[0] = heartbeat(1, 0, 10, Flags::default());
+    let mut now = run();
+    now[5] = torque(1, 2, 7);
+    let judge = judged(&recording, &now);
+    assert_eq!((counts(&judge), judge.tally.lacking.measured), ([0, 0, 0, 0], 3));
+}
+
+#[test]
+fn joints_that_a_bus_did_not_take_have_no_answer() {
+    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    judge.mute(false);
+    judge.record_joints(0, 1, Epoch(1), true);
+    judge.record(0, &torque(1, 1, 5), true);
+    judge.announce(0, Some(0), Epoch(1));
+    judge.was_not_sent(0, 0);
+    judge.finish(true);
+    assert_eq!((counts(&judge), judge.tally.not_asked), ([0, 0, 0, 0], 1));
+    assert!(!judge.tally.is_good());
+}
+
+#[test]
+fn answers_to_configure_are_compared_in_their_order() {
+    let value = |number: P, word| Answer::Value {
+        number: number.number(),
+        written: true,
+        words: [word, 0, 0, 0, 0, 0],
+    };
+    let says = |answer| Message::Configured { from: cell(1), tag: 3, answer };
+    let recording =
+        [joints(0), says(value(P::Pose, 1)), says(value(P::Identity, 1)), says(value(P::Pose, 2))];
+    let now = [joints(0), says(value(P::Identity, 9)), says(value(P::Pose, 1)), says(value(P::Pose, 3))];
+    let judge = judged(&recording, &now);
+    assert_eq!(counts(&judge), [1, 1, 0, 0], "who a cell is, is not compared");
+    let text = judge.first().unwrap().to_string();
+    assert!(text.contains("recorded  configured 1 tag 3: wrote pose"), "{text}");
+}
+
+#[test]
+fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
+    let mut all = Vec::new();
+    for number in 0..1_000_i16 {
+        let epoch = number.to_le_bytes()[0];
+        all.extend([joints(epoch), torque(1, epoch, number)]);
+    }
+    let judge = judged(&all, &all);
+    assert_eq!(counts(&judge), [1_000, 0, 0, 0]);
+    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    for number in 0..1_000_u64 {
+        let epoch = Epoch(number.to_le_bytes()[0]);
+        judge.record_joints(0, number, epoch, true);
+        judge.announce(0, Some(number), epoch);
+        assert!(judge.lanes[0].rounds.len() <= 102);
+    }
+}
+
+#[test]
+fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
+    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let beat = |number, epoch| heartbeat(number, epoch, 0, Flags::TEST_MODE);
+    judge.hear(0, &beat(1, 0));
+    judge.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
+    assert!(judge.is_done(0), "nothing was asked");
+    judge.announce(0, None, Epoch(9));
+    assert!(!judge.is_done(0));
+    judge.hear(0, &beat(1, 8));
+    assert!(!judge.is_done(0), "said before it took them");
+    judge.hear(0, &beat(1, 9));
+    assert!(judge.is_done(0), "who claims its number is not waited for");
+    judge.announce(0, None, Epoch(10));
+    // One that refuses these joints says its old epoch: once because its time had come, once because of the sync.
+    judge.hear(0, &beat(1, 9));
+    assert!(!judge.is_done(0));
+    judge.hear(0, &beat(1, 9));
+    assert!(judge.is_done(0));
+    judge.announce(0, None, Epoch(11));
+    assert_eq!(judge.give_up(0), [cell(1)]);
+    assert!(judge.is_done(0), "given up");
+    judge.hear(0, &beat(1, 10));
+    assert!(!judge.is_done(0), "it speaks again");
+    judge.is_down(0);
+    assert!(judge.is_done(0), "nobody is waited for on a bus that is down");
+}
+
+#[test]
+fn somebody_else_who_sends_joints_is_a_rival() {
+    let mut judge =
+        Judge::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, false);
+    judge.hear(1, &Message::Resume);
+    assert_eq!(judge.rival(), None, "anybody may resume");
+    judge.hear(1, &joints(0));
+    assert_eq!(judge.rival(), Some(1));
+}

@@ -1,1 +1,246 @@
+use super::*;
+use proptest::prelude::*;
 
+/// A clock and buses that are variables.
+#[derive(Debug, Default)]
+struct Fake {
+    clock: u64,
+    /// How long a send takes.
+    takes: u64,
+    /// What the next sends come to; then all is taken.
+    outcomes: Vec<Sent>,
+    /// What was sent, when and where.
+    sent: Vec<(u64, usize, Vec<Frame>)>,
+    announced: Vec<(usize, Option<u64>)>,
+    unsent: Vec<(usize, u64)>,
+    /// Where in `sent` answers were waited for, and on which bus.
+    waited: Vec<(usize, usize)>,
+    restored: usize,
+    stops_at: Option<u64>,
+}
+
+impl Stage for Fake {
+    fn now(&self) -> u64 {
+        self.clock
+    }
+    fn wait_until(&mut self, at: u64) {
+        self.clock = self.clock.max(at);
+    }
+    fn pause(&mut self) {
+        panic!("everything is there");
+    }
+    fn is_over(&self) -> bool {
+        self.stops_at.is_some_and(|at| self.clock >= at)
+    }
+    fn announce(&mut self, lane: usize, round: Option<u64>, _: Epoch) {
+        self.announced.push((lane, round));
+    }
+    fn send(&mut self, lane: usize, frames: &[Frame]) -> Sent {
+        self.sent.push((self.clock, lane, frames.to_vec()));
+        self.clock += self.takes;
+        if self.outcomes.is_empty() { Sent::All } else { self.outcomes.remove(0) }
+    }
+    fn was_not_sent(&mut self, lane: usize, round: u64) {
+        self.unsent.push((lane, round));
+    }
+    fn wait_for_answers(&mut self, lane: usize, _: &Open) {
+        self.waited.push((self.sent.len(), lane));
+    }
+    fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), String> {
+        self.restored += 1;
+        self.clock += 1_000_000_000;
+        Ok(())
+    }
+    fn show(&mut self, _: u64) {}
+}
+
+/// Steps that are all there.
+struct All(std::collections::VecDeque<Step>);
+
+impl Feed for All {
+    fn peek(&mut self) -> Next<'_> {
+        self.0.front().map_or(Next::End, Next::Step)
+    }
+    fn take(&mut self) -> Option<Step> {
+        self.0.pop_front()
+    }
+}
+
+fn frame(id: u32) -> Frame {
+    Frame::classic(id, &[]).unwrap()
+}
+
+fn plain(at_us: u64, lane: usize, id: u32) -> Step {
+    Step::Frame(Due { at: at_us * 1_000, lane, frame: frame(id), role: Role::Plain, is_late: false })
+}
+
+fn joints(at_us: u64, lane: usize, round: u64) -> Step {
+    let role = Role::Joints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) };
+    Step::Frame(Due { at: at_us * 1_000, lane, frame: frame(1), role, is_late: false })
+}
+
+fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = Step>) -> Played {
+    player.play(&mut All(steps.into_iter().collect()), stage)
+}
+
+fn identifiers(stage: &Fake) -> Vec<Vec<u32>> {
+    stage.sent.iter().map(|(_, _, frames)| frames.iter().map(Frame::id).collect()).collect()
+}
+
+#[test]
+fn frames_come_at_their_times_and_those_of_the_same_time_together() {
+    for (speed, last) in [(1.0, 5_000), (0.1, 50_000), (100.0, 50)] {
+        let mut stage = Fake { clock: 42, ..Fake::default() };
+        let steps = [plain(100, 0, 1), plain(100, 0, 2), plain(5_100, 0, 3)];
+        let played = play(Player::new(1, Pace::Timed(speed), None), &mut stage, steps);
+        assert_eq!(identifiers(&stage), [vec![1, 2], vec![3]]);
+        assert_eq!(stage.sent[1].0 - stage.sent[0].0, last * 1_000);
+        assert_eq!((played.late.len(), played.late.max(), played.lanes[0].sent), (3, 0, 3));
+    }
+}
+
+#[test]
+fn a_bus_that_is_slow_delays_what_is_due_and_not_what_comes_after() {
+    let mut stage = Fake { takes: 3_000_000, ..Fake::default() };
+    let steps = (0..4).map(|n| plain(n * 2_000, 0, u32::try_from(n).unwrap()));
+    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    // The second one waits 1 ms for the first, the third and the fourth go together.
+    assert_eq!(identifiers(&stage), [vec![0], vec![1], vec![2, 3]]);
+    assert_eq!(played.late.max() / 1_000, 2_000, "the third one, within three digits");
+}
+
+#[test]
+fn buses_are_served_in_turn_and_no_batch_is_larger_than_the_kernel_takes() {
+    let mut stage = Fake::default();
+    let many = (0..100).map(|id| plain(0, 0, id));
+    let steps = many.chain([plain(0, 1, 0x100), plain(0, 0, 0x200)]);
+    play(Player::new(2, Pace::Max, None), &mut stage, steps);
+    let sizes: Vec<_> = stage.sent.iter().map(|(_, lane, frames)| (*lane, frames.len())).collect();
+    assert_eq!(sizes, [(0, 64), (0, 36), (1, 1), (0, 1)]);
+}
+
+#[test]
+fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
+    let sync = vec![vec![frame(2)], vec![frame(2)]];
+    let mut stage = Fake::default();
+    let steps = [
+        plain(0, 0, 0x70C),
+        joints(0, 0, 0),
+        joints(0, 1, 0),
+        plain(0, 0, 0x70D),
+        plain(0, 0, 0x70E),
+        joints(0, 0, 1),
+        joints(0, 1, 1),
+    ];
+    play(Player::new(2, Pace::Max, Some(sync)), &mut stage, steps);
+    // A sync goes with each; what comes after joints does not wait, the next ones do, each for its own bus.
+    let expected = [vec![0x70C, 1, 2], vec![1, 2], vec![0x70D, 0x70E], vec![1, 2], vec![1, 2]];
+    assert_eq!(identifiers(&stage), expected);
+    assert_eq!(stage.waited, [(3, 0), (4, 1), (5, 0), (5, 1)]);
+    assert_eq!(stage.announced, [(0, Some(0)), (1, Some(0)), (0, Some(1)), (1, Some(1))]);
+}
+
+#[test]
+fn the_first_half_of_joints_waits_too() {
+    let half = Step::Frame(Due { at: 0, lane: 0, frame: frame(1), role: Role::HalfOfJoints, is_late: false });
+    let sync = vec![vec![frame(2), frame(2)]];
+    let mut stage = Fake::default();
+    play(
+        Player::new(1, Pace::Max, Some(sync)),
+        &mut stage,
+        [half.clone(), joints(0, 0, 0), half, joints(0, 0, 1)],
+    );
+    assert_eq!(identifiers(&stage), [vec![1, 1, 2, 2], vec![1, 1, 2, 2]]);
+    assert_eq!(stage.waited, [(1, 0), (2, 0)]);
+}
+
+#[test]
+fn what_a_bus_does_not_take_is_counted_by_its_reason() {
+    let outcomes =
+        vec![Sent::Full(1), Sent::Down(0), Sent::Down(0), Sent::All, Sent::Ended(0, "gone".to_owned())];
+    let mut stage = Fake { outcomes, ..Fake::default() };
+    let steps = [
+        plain(0, 0, 1),
+        joints(0, 0, 0),
+        joints(1_000, 0, 1),
+        plain(2_000, 0, 4),
+        plain(3_000, 0, 5),
+        plain(4_000, 0, 6),
+        plain(5_000, 0, 7),
+    ];
+    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    assert_eq!(played.lanes, [LaneTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
+    assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
+    assert_eq!(played.failure.as_deref(), Some("gone"));
+    assert_eq!(stage.sent.len(), 5, "nothing is sent after the end");
+}
+
+#[test]
+fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
+    let mut stage = Fake::default();
+    let steps = [
+        Step::Restore(Vec::new()),
+        plain(0, 0, 1),
+        plain(500, 0, 2),
+        Step::Restore(Vec::new()),
+        plain(1_000, 0, 3),
+    ];
+    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    assert_eq!((stage.restored, played.late.max()), (2, 0));
+    assert!(stage.sent[2].0 - stage.sent[1].0 > 1_000_000_000);
+}
+
+#[test]
+fn what_is_older_than_what_was_sent_does_not_wait_and_is_not_late() {
+    let late = Due { at: 9_000_000, lane: 0, frame: frame(9), role: Role::Plain, is_late: true };
+    let mut stage = Fake::default();
+    let played =
+        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), Step::Frame(late)]);
+    assert_eq!((identifiers(&stage), played.late.len()), (vec![vec![1, 9]], 1));
+}
+
+#[test]
+fn somebody_may_say_stop() {
+    let mut stage = Fake { stops_at: Some(5_000_000), ..Fake::default() };
+    let played =
+        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, (0..100).map(|n| plain(n * 1_000, 0, 1)));
+    assert!(played.was_stopped && played.lanes[0].sent < 10, "{played:?}");
+}
+
+proptest! {
+    #[test]
+    fn every_frame_is_sent_once_in_order_never_early_and_the_counts_add_up(
+        steps in proptest::collection::vec((0_u64..3_000, 0_usize..3, any::<bool>()), 0..150),
+        takes in 0_u64..2_000_000,
+        outcomes in proptest::collection::vec(prop_oneof![
+            Just(Sent::All), (0_usize..70).prop_map(Sent::Full), (0_usize..70).prop_map(Sent::Down)], 0..20),
+        lockstep: bool,
+    ) {
+        let mut at = 0;
+        let mut rounds = [0; 3];
+        let steps: Vec<_> = (0_u32..).zip(steps).map(|(id, (step, lane, is_joints))| {
+            at += step;
+            let mut due = if is_joints { joints(at, lane, rounds[lane]) } else { plain(at, lane, 0) };
+            rounds[lane] += u64::from(is_joints);
+            if let Step::Frame(due) = &mut due {
+                due.frame = frame(id);
+            }
+            due
+        }).collect();
+        let syncs = lockstep.then(|| vec![vec![frame(0x7FF)]; 3]);
+        let mut stage = Fake { takes, outcomes, ..Fake::default() };
+        let played = play(Player::new(3, Pace::Timed(1.0), syncs), &mut stage, steps.clone());
+        let tried: Vec<_> = stage.sent.iter()
+            .flat_map(|(at, lane, frames)| frames.iter().map(move |frame| (*at, *lane, *frame)))
+            .filter(|(_, _, frame)| frame.id() != 0x7FF).collect();
+        prop_assert_eq!(tried.len(), steps.len());
+        let first = match &steps.first() { Some(Step::Frame(due)) => due.at, _ => 0 };
+        for ((at, lane, frame), step) in tried.iter().zip(&steps) {
+            let Step::Frame(due) = step else { unreachable!() };
+            prop_assert_eq!((*lane, *frame), (due.lane, due.frame));
+            prop_assert!(*at >= due.at - first + LEAD_NS, "early");
+        }
+        let total: u64 = played.lanes.iter().map(|lane| lane.sent + lane.refused + lane.lost).sum();
+        prop_assert_eq!(total, steps.len() as u64);
+    }
+}
