@@ -1,6 +1,12 @@
 //! A cell that is brought into the state of the middle of a recording answers the rest as the recorded one did: real
 //! cells, in virtual time, hundreds of scripts, each cut somewhere.
-#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "a test may stop"
+)]
 
 use cell_node::node::{Flash, Identity, Node};
 use gateway::generate::{Wanted, generate};

@@ -49,22 +49,20 @@ fn judged(recording: &[Message], now: &[Message]) -> Judge {
         cells.into_iter().map(|(node, cell)| (node, Excuse { cell, ended_earlier: false })).collect();
     judge.mute(false);
     for (nanos, message) in times.zip(recording) {
-        match *message {
-            Message::Joints { epoch, .. } => {
-                judge.record_joints(0, nanos, epoch, true);
-            }
-            ref other => judge.record(0, other, true),
+        if let Message::Joints { epoch, .. } = *message {
+            judge.record_joints(0, nanos, epoch, true);
+        } else {
+            judge.record(0, message, true);
         }
     }
     judge.record_end();
     let mut round = 0;
     for message in now {
-        match *message {
-            Message::Joints { epoch, .. } => {
-                judge.announce(0, Some(round), epoch);
-                round += 1;
-            }
-            ref other => judge.hear(0, other),
+        if let Message::Joints { epoch, .. } = *message {
+            judge.announce(0, Some(round), epoch);
+            round += 1;
+        } else {
+            judge.hear(0, message);
         }
     }
     judge.finish(true);
