@@ -270,8 +270,12 @@ impl Common {
 
 fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
     let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
-    if options.record.paths().any(|path| summary_file == Some(path)) {
-        return Err(Failure::usage("--summary and a recording name the same file: name two"));
+    let recorded = [
+        ("--candump", options.record.candump.as_deref()),
+        ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
+    ];
+    if let Some((option, _)) = recorded.iter().find(|(_, path)| path.is_some() && *path == summary_file) {
+        return Err(Failure::usage(format!("--summary and {option} name the same file: name two")));
     }
     // Before the run: nobody wants to hear after an hour that there is nowhere to write.
     let json = summary_file.map(|path| {

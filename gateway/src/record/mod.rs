@@ -68,13 +68,6 @@ pub struct Mcap {
     pub command_line: Vec<String>,
 }
 
-impl Options {
-    /// The files that are to be written.
-    pub fn paths(&self) -> impl Iterator<Item = &PathBuf> {
-        self.candump.iter().chain(self.mcap.iter().map(|mcap| &mcap.path))
-    }
-}
-
 /// Files that are claimed, and not begun.
 #[derive(Debug)]
 pub struct Outputs {

@@ -129,7 +129,7 @@ pub fn is_held(file: &File) -> bool {
 pub fn orphans(path: &Path) -> io::Result<Vec<(PathBuf, File)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder_of(path))? {
-        let path = entry?.path();
+        let path = path.with_file_name(entry?.file_name());
         let is_part = path.extension() == Some(OsStr::new(PART))
             && goal_of(&path).extension() == Some(OsStr::new("mcap"));
         if !is_part {

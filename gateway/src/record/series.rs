@@ -81,6 +81,37 @@ impl Head {
     }
 }
 
+/// Something that people should know.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Said {
+    /// A file takes nothing more; the run goes on.
+    BrokeOff(String),
+    /// Anything else.
+    Else(String),
+}
+
+impl Said {
+    /// What happened, for the end of the run.
+    #[must_use]
+    pub fn what(&self) -> &str {
+        match self {
+            Self::BrokeOff(what) | Self::Else(what) => what,
+        }
+    }
+}
+
+impl core::fmt::Display for Said {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let more = match self {
+            Self::BrokeOff(_) => {
+                ": the run goes on without it; what was recorded so far stays readable, what comes now is counted"
+            }
+            Self::Else(_) => "",
+        };
+        write!(f, "{}{more}", self.what())
+    }
+}
+
 /// A file that is being written.
 struct Open<T> {
     writer: Writer,
@@ -147,7 +178,7 @@ pub struct Series<T> {
     written: Vec<Written>,
     lost: Count,
     /// What people should know.
-    said: Vec<String>,
+    said: Vec<Said>,
 }
 
 impl<T> core::fmt::Debug for Series<T> {
@@ -210,7 +241,7 @@ impl<T> Series<T> {
             let topics = topics(&mut writer)?;
             writer.flush()?;
             if gauge.is_full() {
-                return Err(io::ErrorKind::StorageFull.into());
+                return Err(rustix::io::Errno::NOSPC.into());
             }
             Ok((writer, topics, gauge))
         };
@@ -255,7 +286,7 @@ impl<T> Series<T> {
         open.gauge.reserve_for(open.writer.chunks());
         if open.gauge.is_full() {
             self.end();
-            self.fail(&io::ErrorKind::StorageFull.into());
+            self.fail(&rustix::io::Errno::NOSPC.into());
             return false;
         }
         let enough =
@@ -275,7 +306,8 @@ impl<T> Series<T> {
         match Part::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
             Ok(open) => {
                 if failed_before.is_some() {
-                    self.said.push(format!("recording goes on in {}", open.part.goal.display()));
+                    let goal = open.part.goal.display();
+                    self.said.push(Said::Else(format!("recording goes on in {goal}")));
                 }
                 (self.failed, self.open) = (None, Some(open));
                 true
@@ -307,7 +339,7 @@ impl<T> Series<T> {
     }
 
     /// What people should know since they were told last.
-    pub fn said(&mut self) -> std::vec::Drain<'_, String> {
+    pub fn said(&mut self) -> std::vec::Drain<'_, Said> {
         self.said.drain(..)
     }
 
@@ -323,11 +355,8 @@ impl<T> Series<T> {
         let path = match part.finish(self.force) {
             Ok(()) => part.goal,
             Err(error) => {
-                self.said.push(format!(
-                    "{}: {error}; the recording is {}",
-                    part.goal.display(),
-                    part.path.display()
-                ));
+                let (goal, there) = (part.goal.display(), part.path.display());
+                self.said.push(Said::Else(format!("{goal}: {error}; the recording is {there}")));
                 part.path
             }
         };
@@ -355,10 +384,7 @@ impl<T> Series<T> {
     fn fail(&mut self, error: &io::Error) {
         if self.failed.replace(Instant::now()).is_none() {
             let path = names::numbered(&self.path, self.number);
-            self.said.push(format!(
-                "{}: {error}: the run goes on without it; what was recorded so far stays readable, what comes now is counted",
-                path.display()
-            ));
+            self.said.push(Said::BrokeOff(format!("{}: {error}", path.display())));
         }
     }
 
@@ -378,7 +404,8 @@ impl<T> Series<T> {
                 }
                 Err(error) => {
                     let path = part.path.display().to_string();
-                    self.said.push(format!("{path}: {error}; mend it with `gateway recover {path}`"));
+                    self.said
+                        .push(Said::Else(format!("{path}: {error}; mend it with `gateway recover {path}`")));
                     let messages = kept.frames + kept.others;
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(Written { path, format: "mcap", frames: kept.frames, messages, bytes });

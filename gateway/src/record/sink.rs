@@ -46,7 +46,8 @@ impl Gauge {
     pub fn reserve_for(&self, chunks: u64) {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
-        let wanted = RESERVE + chunks * RESERVE_FOR_CHUNK;
+        // Half of it is for the chunk on the way.
+        let wanted = RESERVE / 2 + chunks * RESERVE_FOR_CHUNK;
         if wanted <= reserve.bytes {
             return;
         }

@@ -15,7 +15,7 @@ use super::facts::realtime_minus_monotonic;
 use super::feed::{Captured, FRAMES, Feed, Lane};
 use super::force::InForce;
 use super::layout::Layout;
-use super::series::{Head, Series, What};
+use super::series::{Head, Said, Series, What};
 use super::text::Text;
 use super::topics::Topics;
 use crate::capture::{Note, NoteKind};
@@ -55,7 +55,7 @@ pub(super) struct Work {
     feed: Feed,
     layout: Layout,
     tell: Sender<String>,
-    errors: Vec<String>,
+    errors: Vec<Said>,
     /// How many of them were told.
     told: usize,
     buses: Vec<Seen>,
@@ -298,7 +298,7 @@ impl Work {
         }
         for line in self.errors.get(self.told..).unwrap_or_default() {
             // Nobody listens any more when the run ends.
-            let _ = self.tell.send(line.clone());
+            let _ = self.tell.send(line.to_string());
         }
         self.told = self.errors.len();
     }
@@ -322,7 +322,7 @@ impl Work {
             lost = lost.max(unwritten);
             // What was said before is the reason.
             if let Err(error) = finished {
-                self.errors.push(format!("{path}: {error}"));
+                self.errors.push(Said::BrokeOff(format!("{path}: {error}")));
             }
         }
         self.say();
@@ -332,7 +332,7 @@ impl Work {
         recording.lost = lost;
         let spent = Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default();
         recording.processor_s = spent.as_secs_f64();
-        recording.errors = self.errors;
+        recording.errors = self.errors.iter().map(|said| said.what().to_owned()).collect();
         recording
     }
 }
@@ -350,7 +350,7 @@ struct Dropped<'a> {
 
 impl Dropped<'_> {
     /// Says it in every format.
-    fn write(&self, text: &mut Option<Text>, series: &mut Option<Series<Topics>>, errors: &mut Vec<String>) {
+    fn write(&self, text: &mut Option<Text>, series: &mut Option<Series<Topics>>, errors: &mut Vec<Said>) {
         let Self { at_nanos: nanos, interface, frames, place, total } = *self;
         let line = format!("DROPCOUNT: dropped {frames} {place} (total drops {total})");
         if let Some(text) = text
@@ -366,11 +366,8 @@ impl Dropped<'_> {
     }
 }
 
-fn failed(text: &Text, error: &std::io::Error) -> String {
-    format!(
-        "{}: {error}: the run goes on without it; what was recorded so far stays readable, what comes now is counted",
-        text.path().display()
-    )
+fn failed(text: &Text, error: &std::io::Error) -> Said {
+    Said::BrokeOff(format!("{}: {error}", text.path().display()))
 }
 
 /// How a bus is.

@@ -180,7 +180,7 @@ impl Place {
             "gateway",
             &format!(
                 "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
-                 --candump run.log --summary run.json {more}",
+                 --candump run.log --force --summary run.json {more}",
                 self.kind
             ),
         )
