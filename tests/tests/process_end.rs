@@ -86,7 +86,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
 fn a_signal_while_starting_is_a_run_that_failed_and_leaves_nothing() {
     let place = Place::new();
     place.pressed();
-    let bench = place.bench(60.0, "--quiet");
+    let bench = place.bench(60.0, "--quiet --record run.mcap");
     until("the first cells", || (!bench.cells().is_empty()).then_some(()));
     bench.signal(Signal::INT);
     assert_eq!(bench.end().refusal(1), "gateway: interrupted while starting");

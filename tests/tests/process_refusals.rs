@@ -192,8 +192,10 @@ fn a_run_that_fails_to_start_leaves_old_files_as_they_were() {
     place.write("run.log", "of yesterday\n");
     place.write("run.json", "{}\n");
     let run = "run skin.toml --bus-kind embedded --candump run.log --summary run.json --cell-node /bin/true \
-               --quiet";
+               --quiet --force --record run.mcap";
+    place.write("run.mcap", "of yesterday\n");
     refusal(&place, "gateway", run, 1);
+    assert_eq!(place.read("run.mcap"), "of yesterday\n");
     assert_eq!((place.read("run.log"), place.read("run.json")), ("of yesterday\n".into(), "{}\n".into()));
 }
 

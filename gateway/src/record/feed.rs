@@ -84,6 +84,12 @@ impl Outlet {
         }
     }
 
+    /// Frames that fit into the queue now.
+    #[must_use]
+    pub fn free(&self) -> usize {
+        self.frames.slots()
+    }
+
     /// Says that the bus dropped frames.
     pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
         // A full queue says so itself.

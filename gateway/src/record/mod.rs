@@ -125,7 +125,7 @@ impl Outputs {
     /// # Errors
     /// When there is no thread for it.
     pub fn start(self, feed: Feed, layout: Layout, head: Head) -> io::Result<Recorder> {
-        let stop = Arc::new(AtomicBool::new(false));
+        let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
         let work = thread::Work::new(self, feed, layout, tell);
         let (ended, name) = (Arc::clone(&stop), "recorder".to_owned());
@@ -134,11 +134,20 @@ impl Outputs {
     }
 }
 
+/// How a recording is ended.
+#[derive(Debug, Default)]
+struct Stop {
+    /// Now.
+    now: AtomicBool,
+    /// As if it had never been.
+    discard: AtomicBool,
+}
+
 /// The thread that records.
 #[derive(Debug)]
 pub struct Recorder {
     thread: std::thread::JoinHandle<Recording>,
-    stop: Arc<AtomicBool>,
+    stop: Arc<Stop>,
     said: mpsc::Receiver<String>,
 }
 
@@ -148,11 +157,19 @@ impl Recorder {
         self.said.try_iter()
     }
 
+    /// Ends a recording of a run that never began, and leaves nothing of it.
+    pub fn discard(self) {
+        self.stop.discard.store(true, Ordering::Relaxed);
+        self.stop.now.store(true, Ordering::Release);
+        // It can leave no more than a file that the next run takes away.
+        let _ = self.thread.join();
+    }
+
     /// Records what has been handed over, when nobody hands over more, and ends the files. `unrecorded` is what
     /// did not fit into receivers' queues, `ticks` what did not into the loop's.
     #[must_use]
     pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> Recording {
-        self.stop.store(true, Ordering::Relaxed);
+        self.stop.now.store(true, Ordering::Release);
         let mut recording = self.thread.join().unwrap_or_else(|_| {
             let errors =
                 vec!["the recorder panicked: what it had written is recovered by the next run".to_owned()];

@@ -388,6 +388,14 @@ impl<T> Series<T> {
         }
     }
 
+    /// Takes the file that is open away.
+    pub fn discard(&mut self) {
+        if let Some(open) = self.open.take() {
+            // What remains is an orphan, which the next run repairs.
+            let _ = std::fs::remove_file(&open.part.path);
+        }
+    }
+
     /// Ends the recording: its files, and what was lost.
     pub fn finish(&mut self) -> (Vec<Written>, Count) {
         self.end();

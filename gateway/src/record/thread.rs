@@ -1,7 +1,7 @@
 //! The recorder's thread: takes what has come, writes it, flushes, looks around.
 
 use std::mem;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -9,7 +9,6 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::parameters::MAX_JOINTS;
 use rustix::time::{ClockId, clock_gettime};
 
-use super::Outputs;
 use super::account::Recording;
 use super::facts::realtime_minus_monotonic;
 use super::feed::{Captured, FRAMES, Feed, Lane};
@@ -18,6 +17,7 @@ use super::layout::Layout;
 use super::series::{Head, Said, Series, What};
 use super::text::Text;
 use super::topics::Topics;
+use super::{Outputs, Stop};
 use crate::capture::{Note, NoteKind};
 use crate::ros2::skin::Felt;
 use crate::ros2::standard::{Diagnosis, Level, Point};
@@ -108,13 +108,19 @@ impl Work {
     }
 
     /// Records until someone says stop, and what has come until then.
-    pub(super) fn run(mut self, head: Head, stop: &AtomicBool) -> Recording {
+    pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
         if let Some(series) = &mut self.series {
             series.begin(head, |writer| Topics::new(writer, &self.layout));
         }
         let (mut flush, mut ask, mut diagnose) = (Every::new(FLUSH), Every::new(ASK), Every::new(DIAGNOSE));
         loop {
-            let ended = stop.load(Ordering::Acquire);
+            let ended = stop.now.load(Ordering::Acquire);
+            if ended && stop.discard.load(Ordering::Relaxed) {
+                if let Some(series) = &mut self.series {
+                    series.discard();
+                }
+                return Recording::default();
+            }
             let taken = self.take();
             if ask.is_due() || ended {
                 self.ask_kernel();

@@ -146,7 +146,10 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         served,
     };
     if let Err(error) = bench.begin() {
-        bench.stop_after_failure();
+        bench.stop_receivers();
+        if let Some(recorder) = bench.recorder.take() {
+            recorder.discard();
+        }
         return Err(error);
     }
     Ok(bench)

@@ -1,0 +1,186 @@
+//! How fast the recorder is, what a frame costs it, and how many bytes a frame takes.
+//!
+//! ```sh
+//! cargo run --release -p gateway --example recorder_speed -- [FOLDER] [LOG]
+//! ```
+//!
+//! Frames are those of 253 cells that are all pressed by an arm that moves, or those of a candump log. First they go
+//! through the recorder as fast as it takes them, for ten seconds, into a file in FOLDER (the present one unless it is
+//! told), which is removed again. Then they are written in their own time: handed on every 40 ms, as in a run, with
+//! nothing but frames in the file.
+#![allow(clippy::print_stdout, reason = "the figures are its output")]
+
+use std::error::Error;
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use gateway::central::Central;
+use gateway::record::feed::{self, Feed};
+use gateway::record::file::FileWriter;
+use gateway::record::force::Seen;
+use gateway::record::layout::Layout;
+use gateway::record::series::{Head, Split};
+use gateway::record::{Mcap, Options, Outputs};
+use gateway::ros2::messages::CanFrame;
+use protocol::can::Format;
+use protocol::candump::{self, Direction, Line, Record, Timestamp};
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::message::{Joints, Message};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+
+const SKIN: &str = include_str!("ur5-253.toml");
+/// How long frames are pushed.
+const PUSHED: Duration = Duration::from_secs(10);
+/// What a run hands on at once.
+const FLUSH_NANOS: u64 = 40_000_000;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut words = std::env::args_os().skip(1);
+    let folder = words.next().map_or_else(|| PathBuf::from("."), PathBuf::from);
+    let skin = Skin::parse("ur5-253.toml", SKIN)?;
+    let frames = match words.next() {
+        Some(log) => of_log(&std::fs::read_to_string(log)?)?,
+        None => of_run(&skin, 60),
+    };
+    println!("{} frames, {:.1} s of a bus", frames.len(), seconds(&frames));
+    speed(&skin, &folder, &frames)?;
+    size(&frames)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+fn seconds(frames: &[Seen]) -> f64 {
+    let ends = frames.first().zip(frames.last());
+    ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
+}
+
+/// What 253 cells say that are pressed by 1.5 N each, while each joint swings to and fro.
+fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
+    let central = Central::new(skin);
+    let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
+    let mut frames = Vec::new();
+    let mut say = |at_nanos, own, message: &Message| {
+        frames.extend(message.encode().frames(Format::Fd).map(|frame| Seen { at_nanos, own, frame }));
+    };
+    let mut number = 0_u32;
+    loop {
+        let time = f64::from(number) / hz;
+        if time >= f64::from(seconds) {
+            return frames;
+        }
+        let at = began + u64::from(number) * 16_000_000;
+        let epoch = Epoch(number.to_le_bytes()[0]);
+        let swings = [(0.3, 0.0), (-1.2, 0.4), (1.0, 0.9), (-1.4, 1.3), (-1.57, 2.0), (0.2, 2.7)];
+        let q: [f64; WORDS] = swings.map(|(middle, phase): (f64, f64)| middle + (time + phase).sin() * 0.4);
+        let positions = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
+        say(at, true, &Message::Joints { epoch, joints: Joints { positions, in_use: 6 } });
+        let links = central.frames(&positions);
+        for (place, cell) in skin.cells.iter().enumerate() {
+            let torque = central.torque(place, &links, 1.5).map(Q3_12::nearest);
+            // Cells wake one after the other, and never twice in the same order of ns.
+            let after = 150_000
+                + place as u64 * 22_000
+                + (u64::from(number) * 7_919 + place as u64 * 104_729) % 9_973;
+            say(at + after, false, &Message::Torque { from: cell.node, epoch, torque });
+        }
+        number += 1;
+    }
+}
+
+fn of_log(text: &str) -> Result<Vec<Seen>, Box<dyn Error>> {
+    let mut frames = Vec::new();
+    for line in text.lines() {
+        if let Line::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
+            frames.push(Seen { at_nanos: time.nanos, own: direction == Some(Direction::Sent), frame });
+        }
+    }
+    Ok(frames)
+}
+
+/// Pushes frames into the recorder as fast as it takes them.
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), Box<dyn Error>> {
+    let path = folder.join("recorder_speed.mcap");
+    let split = Split { bytes: u64::MAX / 2, age: Duration::MAX };
+    let mcap = Mcap { path: path.clone(), split, attachments: Vec::new(), command_line: Vec::new() };
+    let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
+    let outputs = Outputs::claim(&options, |line| println!("{line}"))?;
+    let (mut outlet, lane) = feed::lane(true, Arc::default(), Arc::default());
+    let feed = Feed { lanes: vec![lane], ticks: None };
+    let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;
+    let began = Instant::now();
+    let mut count = 0_u64;
+    'pushed: loop {
+        for chunk in frames.chunks(1_024) {
+            if began.elapsed() >= PUSHED {
+                break 'pushed;
+            }
+            // A bus never waits; this does, so that what is measured is what can be sustained.
+            while outlet.free() < chunk.len() {
+                std::thread::sleep(Duration::from_micros(200));
+            }
+            chunk.iter().for_each(|&seen| outlet.frame(seen));
+            count += chunk.len() as u64;
+        }
+    }
+    let unrecorded = outlet.unrecorded();
+    let recording = recorder.finish(unrecorded, 0);
+    let took = began.elapsed().as_secs_f64();
+    let bytes: u64 = recording.files.iter().map(|file| file.bytes).sum();
+    println!(
+        "recorder alone: {:.0} frames/s to disk, {} of {count} frames, {} lost, {:.2} us of processor a frame, {:.1} bytes a frame",
+        recording.frames as f64 / took,
+        recording.frames,
+        recording.lost,
+        recording.processor_s / recording.frames as f64 * 1e6,
+        bytes as f64 / recording.frames as f64,
+    );
+    std::fs::remove_file(path)?;
+    Ok(())
+}
+
+/// Counts bytes.
+#[derive(Default)]
+struct Counter(u64);
+
+impl Write for Counter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0 += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Writes frames and nothing else, handed on as in a run.
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
+    let mut writer = FileWriter::new(Counter::default())?;
+    let mut channel = writer.channel::<CanFrame<'_>>("/can/vcan0", &[("time_digits", "9")])?;
+    let (mut flushes, mut next) = (0_u64, 0);
+    let began = Instant::now();
+    for &Seen { at_nanos, own, frame } in frames {
+        if at_nanos >= next {
+            writer.flush()?;
+            next = at_nanos + FLUSH_NANOS;
+            flushes += 1;
+        }
+        let direction = Some(if own { Direction::Sent } else { Direction::Received });
+        let time = Timestamp { nanos: at_nanos, nine_digits: true };
+        let message = CanFrame(Record { time, interface: "vcan0", frame, direction });
+        writer.write(&mut channel, at_nanos, &message)?;
+    }
+    writer.finish()?;
+    let took = began.elapsed().as_secs_f64();
+    let (count, bytes) = (frames.len() as f64, writer.into_inner().0);
+    println!(
+        "frames alone, handed on {flushes} times: {:.1} bytes a frame, {:.2} us a frame",
+        bytes as f64 / count,
+        took / count * 1e6,
+    );
+    Ok(())
+}
