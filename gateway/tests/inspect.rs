@@ -1,4 +1,4 @@
-//! `gateway dbc` and the parts of `gateway dump` that are not lines, as processes.
+//! `gateway dbc`, `gateway explain`, and the parts of `gateway dump` that are not lines, as processes.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -146,6 +146,13 @@ fn contacts_alone_are_shown_and_json_is_one_object_a_line() {
 }
 
 #[test]
+fn brief_lines_have_the_time_since_the_first_frame_and_no_raw_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let shown = output(folder.path(), &format!("dump {} --brief --kind halt,sync", golden("document.log")));
+    assert_eq!(shown, "0.001000 vcan0 ok      halt\n0.002000 vcan0 ok      sync\n");
+}
+
+#[test]
 fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
@@ -157,4 +164,178 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     assert_eq!(std::str::from_utf8(&stdout).unwrap().lines().count(), 1);
     let Output { status, stdout, .. } = gateway(folder, "dump odd.log");
     assert_eq!((status.code(), std::str::from_utf8(&stdout).unwrap().lines().count()), (Some(0), 1));
+}
+
+/// The cell of the document's whole configuration, and another one that nobody touches.
+const SKIN: &str = r#"version = 1
+name = "document"
+
+[robot]
+name = "UR5"
+joints = [
+  { a = 0.0, alpha = 1.5707963267948966, d = 0.089159, theta_offset = 0.0 },
+  { a = -0.425, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
+  { a = -0.39225, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
+  { a = 0.0, alpha = 1.5707963267948966, d = 0.10915, theta_offset = 0.0 },
+  { a = 0.0, alpha = -1.5707963267948966, d = 0.09465, theta_offset = 0.0 },
+  { a = 0.0, alpha = 0.0, d = 0.0823, theta_offset = 0.0 },
+]
+
+[timing]
+control_hz = 500.0
+joint_broadcast_hz = 62.5
+
+[contact]
+alpha_c = 1.0
+alpha_p = 0.0
+contact_threshold_n = 0.1
+proximity_threshold = 0.05
+force_threshold_n = 0.1
+
+[[bus]]
+name = "vcan0"
+reply = "torque"
+format = "fd"
+
+[controller]
+kind = "kinesthetic"
+inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
+damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]
+max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
+
+[[cell]]
+bus = "vcan0"
+node = 12
+joint = 2
+position = [0.1, 0.05, 0.06]
+orientation = [-0.4472135955, 0.0, 0.0, 0.894427191]
+
+[[cell]]
+bus = "vcan0"
+node = 13
+joint = 3
+position = [0.1, 0.0, 0.06]
+orientation = [0.0, 0.0, 0.0, 1.0]
+"#;
+
+/// The document's cell is told to obey stimuli, pressed, asked, and answers.
+const PRESSED: &str = "(1.000000) vcan0 50C##10100000000000000000000000C853231
+(1.100000) vcan0 70C##1000400040004000000000000008047DA
+(1.200000) vcan0 001##500001CCFBE28F5C608C000000706BE4E
+(1.200500) vcan0 20C##5CDFB7B0C000000000000000007014157
+";
+
+/// A folder with `skin.toml` and `run.log`.
+fn pressed() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("skin.toml"), SKIN).unwrap();
+    std::fs::write(folder.path().join("run.log"), PRESSED).unwrap();
+    folder
+}
+
+#[test]
+fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
+    let folder = pressed();
+    let folder = folder.path();
+    let text = output(folder, "explain run.log --skin skin.toml --epoch 7 --cell 12");
+    for line in [
+        "run.log: joints of epoch 7 on vcan0, 0.200000 s after the first frame",
+        "  felt       1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
+        "  since      stimulus of 0.100000 s, from the next joints on",
+        "  F_c        3.0000 N, not below 0.1006 N: counts",
+        "  F_p        0.0000, below 0.0500: none",
+        "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
+        "  in words   196608 steps of 2^-16 N = 3.000000 N",
+        "  answered   0.500 ms after the joints",
+        "  vcan0 12: it said nothing of its configuration; taken to be the skin's, 266D",
+        "  vcan0: 1 cells said nothing, and what they felt is not in the capture; they are taken as not in contact",
+    ] {
+        assert!(text.lines().any(|there| there == line), "{line}\n{text}");
+    }
+    let words: Vec<_> = text.lines().filter(|line| line.contains("-1075") || line.contains("3195")).collect();
+    assert_eq!(words.len(), 2, "{text}");
+    let all = output(folder, "explain run.log --skin skin.toml --epoch 7");
+    assert!(all.contains("the whole skin: the words of the frames added up"), "{all}");
+    let joint = output(folder, "explain run.log --skin skin.toml --epoch 7 --joint 2");
+    assert!(joint.contains("3195") && !joint.contains("-1075"), "{joint}");
+}
+
+#[test]
+fn an_explanation_is_an_object_too() {
+    let folder = pressed();
+    let text = output(folder.path(), "explain run.log --skin skin.toml --epoch 7 --joint 2 --json");
+    let object: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let cell = &object["cells"][0];
+    assert_eq!((&object["epoch"], &cell["node"]), (&7.into(), &12.into()));
+    assert_eq!(
+        (&cell["force"]["force_steps"], &cell["force"]["origin"]["by"]),
+        (&196_608.into(), &"stimulus".into())
+    );
+    assert_eq!((&cell["rows"][0]["word"], cell["rows"].as_array().map(Vec::len)), (&3195.into(), Some(1)));
+    assert_eq!(object["total"][0]["word_steps"], 3195);
+}
+
+#[test]
+fn what_cannot_be_explained_is_one_line() {
+    let folder = pressed();
+    let folder = folder.path();
+    std::fs::write(folder.join("empty.log"), "# nothing\n").unwrap();
+    for (arguments, code, expected) in [
+        ("explain run.log --epoch 7", 2, "run.log has no skin in it: say which with --skin"),
+        (
+            "explain run.log --skin skin.toml --epoch 8",
+            1,
+            "run.log: there are no joints of epoch 8; there are those of epoch 7 at 0.200 s",
+        ),
+        (
+            "explain run.log --skin skin.toml --epoch 7 --at 0.3 --occurrence 2",
+            1,
+            "run.log: there are no joints of epoch 7 for the 2. time at 0.300 s or later; there are those of epoch 7 at \
+             0.200 s",
+        ),
+        (
+            "explain run.log --skin skin.toml --epoch 7 --cell 99",
+            2,
+            "--cell 99: the skin has no such cell on vcan0",
+        ),
+        (
+            "explain run.log --skin skin.toml --epoch 7 --cell can0:12",
+            2,
+            "--cell can0:12: the skin's buses are vcan0",
+        ),
+        (
+            "explain run.log --skin skin.toml --epoch 7 --cell 300",
+            2,
+            "invalid value '300' for '--cell <CELL>': \"300\" is no cell: a number, 1 to 254, is; try '--help'",
+        ),
+        (
+            "explain empty.log --skin skin.toml --epoch 7",
+            1,
+            "empty.log: none of its buses (none) is one of the skin's (vcan0)",
+        ),
+        (
+            "explain nosuch.log --skin skin.toml --epoch 7",
+            2,
+            "nosuch.log: No such file or directory (os error 2)",
+        ),
+        (
+            "explain run.log --skin skin.toml --epoch 256",
+            2,
+            "invalid value '256' for '--epoch <N>': 256 is not in 0..=255; try '--help'",
+        ),
+    ] {
+        assert_eq!(refusal(folder, arguments, code), format!("gateway: {expected}"), "{arguments}");
+    }
+}
+
+#[test]
+fn the_skin_is_the_one_in_the_recording() {
+    let folder = pressed();
+    let folder = folder.path();
+    assert_eq!(gateway(folder, "convert run.log run.mcap").status.code(), Some(0));
+    let said = refusal(folder, "explain run.mcap --epoch 7", 2);
+    assert_eq!(said, "gateway: run.mcap has no skin in it: say which with --skin");
+    let mcap = output(folder, "explain run.mcap --skin skin.toml --epoch 7 --json");
+    let log = output(folder, "explain run.log --skin skin.toml --epoch 7 --json");
+    assert_eq!(mcap.replace("run.mcap", "run.log"), log);
 }

@@ -65,6 +65,9 @@ pub(crate) struct Dump {
     /// End after N frames that are shown or counted
     #[arg(long, value_name = "N")]
     max: Option<u64>,
+    /// Without the raw frames: the time since the first frame, the bus, and what the frame says
+    #[arg(long, conflicts_with_all = ["json", "stats"])]
+    brief: bool,
     /// One JSON object a line; with --stats, one in all
     #[arg(long)]
     json: bool,
@@ -121,10 +124,11 @@ impl Dump {
         let out = io::stdout();
         let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         let colour = out.is_terminal() && !no_color;
-        let how = match (self.stats, self.json) {
-            (true, _) => How::Stats(Box::default()),
-            (false, true) => How::Json,
-            (false, false) => How::Lines { colour },
+        let how = match (self.stats, self.json, self.brief) {
+            (true, _, _) => How::Stats(Box::default()),
+            (false, true, _) => How::Json,
+            (false, false, true) => How::Brief { colour },
+            (false, false, false) => How::Lines { colour },
         };
         let format = match self.format {
             Format::Auto => None,

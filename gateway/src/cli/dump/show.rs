@@ -24,6 +24,8 @@ const PLAIN: &str = "\x1b[0m";
 pub(super) enum How {
     /// One line each, in colours or not.
     Lines { colour: bool },
+    /// The same without the raw frame: the time since the first one, the bus, and what it says.
+    Brief { colour: bool },
     /// One JSON object each.
     Json,
     /// Not each; all of them in numbers at the end.
@@ -71,6 +73,14 @@ impl<W: Write> Show<W> {
         match &mut self.how {
             How::Stats(stats) => stats.take(record, &decoded),
             How::Json => json::write(&mut self.out, record, &decoded)?,
+            How::Brief { colour } => {
+                // Where times run backwards a frame may be before the first one.
+                let (sign, since) = if nanos < first { ("-", first - nanos) } else { ("", nanos - first) };
+                let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
+                let (dim, of, plain) = if *colour { (DIM, of(&decoded), PLAIN) } else { ("", "", "") };
+                let bus = record.interface;
+                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {bus}{plain} {of}{decoded}{plain}")?;
+            }
             How::Lines { colour } => {
                 self.raw.clear();
                 let way = match record.direction {
@@ -108,7 +118,7 @@ impl<W: Write> Show<W> {
     pub(super) fn report(&self) -> Option<Report> {
         match &self.how {
             How::Stats(stats) => Some(stats.report()),
-            How::Lines { .. } | How::Json => None,
+            How::Lines { .. } | How::Brief { .. } | How::Json => None,
         }
     }
 }

@@ -71,54 +71,44 @@ fn beside(rows: &mut Rows, extras: &Extras) {
     }
 }
 
-/// One line a cell.
+/// What stands in a column: its head, and a cell's text there.
+type Column = (&'static str, fn(&CellReport) -> String);
+
+/// One line a cell. What no cell has (missed, lost, ...) has no column.
 fn cells(bus: &BusReport) -> Table {
+    // What is not there is no zero.
+    fn some(count: u64) -> String {
+        if count == 0 { String::new() } else { count.to_string() }
+    }
+    let columns: [Column; 11] = [
+        ("torques", |cell| cell.torques.to_string()),
+        ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default()),
+        ("epochs", |cell| match (cell.first_epoch, cell.last_epoch) {
+            (Some(first), Some(last)) => format!("{first}..{last}"),
+            (_, _) => String::new(),
+        }),
+        ("missed", |cell| some(cell.missed)),
+        ("twice", |cell| some(cell.repeated)),
+        ("satur.", |cell| some(cell.saturated)),
+        ("beats", |cell| cell.heartbeats.to_string()),
+        ("refused", |cell| cell.refused.map(|refused| some(refused.into())).unwrap_or_default()),
+        ("lost", |cell| some(cell.lost)),
+        ("starts", |cell| some(cell.restarts)),
+        ("last state", |cell| cell.state.join(" ")),
+    ];
+    let there = |(_, text): &Column| bus.cells.iter().any(|cell| !text(cell).is_empty());
+    let columns: Vec<_> = columns.into_iter().filter(there).collect();
     let mut table = Table::new();
     table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    let heads = [
-        bus.bus.as_str(),
-        "torques",
-        "per s",
-        "epochs",
-        "missed",
-        "twice",
-        "satur.",
-        "beats",
-        "refused",
-        "lost",
-        "starts",
-        "last state",
-    ];
-    table.set_header(heads);
+    table.set_header(std::iter::once(bus.bus.as_str()).chain(columns.iter().map(|(head, _)| *head)));
     for cell in &bus.cells {
-        table.add_row(line(cell));
+        table.add_row(
+            std::iter::once(cell.node.to_string()).chain(columns.iter().map(|(_, text)| text(cell))),
+        );
     }
-    for column in table.column_iter_mut().take(heads.len() - 1) {
+    let states = columns.last().is_some_and(|(head, _)| *head == "last state");
+    for column in table.column_iter_mut().take(columns.len() + usize::from(!states)) {
         column.set_cell_alignment(CellAlignment::Right);
-        column.set_padding((0, 1));
     }
     table
-}
-
-fn line(cell: &CellReport) -> [String; 12] {
-    // What is not there is no zero.
-    let some = |count: u64| if count == 0 { String::new() } else { count.to_string() };
-    let epochs = match (cell.first_epoch, cell.last_epoch) {
-        (Some(first), Some(last)) => format!("{first}..{last}"),
-        (_, _) => String::new(),
-    };
-    [
-        cell.node.to_string(),
-        cell.torques.to_string(),
-        cell.torques_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default(),
-        epochs,
-        some(cell.missed),
-        some(cell.repeated),
-        some(cell.saturated),
-        cell.heartbeats.to_string(),
-        cell.refused.map(|refused| refused.to_string()).unwrap_or_default(),
-        some(cell.lost),
-        some(cell.restarts),
-        cell.state.join(" "),
-    ]
 }

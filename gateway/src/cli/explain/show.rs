@@ -1,7 +1,7 @@
 //! An explanation as tables.
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
-use gateway::explain::{CellExplained, Explanation, Force, Origin, Row, Total, Verdict};
+use gateway::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
 
 /// Which part is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -32,7 +32,7 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
         table.add_row(
             std::iter::once("rad".to_owned()).chain(bus.position_rad.iter().map(|rad| format!("{rad:.4}"))),
         );
-        text += &right(table);
+        text += &right(table, false);
     }
     let cells = &explanation.cells;
     match (what, cells.as_slice()) {
@@ -63,10 +63,18 @@ fn table() -> Table {
     table
 }
 
-/// The table with all columns but the first to the right.
-fn right(mut table: Table) -> String {
-    for column in table.column_iter_mut().skip(1) {
-        column.set_cell_alignment(CellAlignment::Right);
+/// The table with its columns to the right, but the first and, where that is of words, the last; close together, so
+/// that it fits on 80 columns.
+fn right(mut table: Table, words_at_the_end: bool) -> String {
+    let count = table.column_count();
+    let last = count.saturating_sub(usize::from(words_at_the_end));
+    for (index, column) in table.column_iter_mut().enumerate() {
+        let numbers = index > 0 && index < last;
+        let at_the_end = index + 1 == count;
+        column.set_padding((1, u16::from(!numbers || at_the_end)));
+        if numbers {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
     }
     format!("{table}\n")
 }
@@ -83,22 +91,44 @@ fn millis(nanos: u64) -> String {
 
 fn one_line_each(cells: &[CellExplained]) -> String {
     let mut table = table();
-    let joints = cells.first().map_or(0, |cell| cell.rows.len());
-    let head = ["cell", "felt N", "F_z N"].map(str::to_owned).into_iter();
+    // Joints beyond those that move any of them have nothing but zeros, if all is well.
+    let odd = |row: &&Row| row.word.is_some_and(|word| word != 0);
+    let odd = cells.iter().flat_map(|cell| cell.rows.iter().filter(odd)).map(|row| row.joint);
+    let joints = cells.iter().map(|cell| cell.joint).chain(odd).max().map_or(0, usize::from);
+    let names = Names::of(cells);
+    let head = [names.head(), "F_z N".to_owned()].into_iter();
     let head = head.chain((1..=joints).map(|joint| format!("Nm {joint}")));
-    table.set_header(head.chain(["steps off".to_owned(), "which is".to_owned()]));
+    table.set_header(head.chain(["off".to_owned(), "which is".to_owned()]));
     for cell in cells {
-        let newtons = |of: fn(&Force) -> f64| {
-            cell.force.as_ref().map_or_else(|| "?".to_owned(), |it| format!("{:.3}", of(it)))
-        };
-        let head = [name(cell), newtons(|force| force.touch_n), newtons(|force| force.force_n)];
-        let words = cell
-            .rows
-            .iter()
-            .map(|row| row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.4}")));
+        let force =
+            cell.force.as_ref().map_or_else(|| "?".to_owned(), |force| format!("{:.3}", force.force_n));
+        let head = [names.of_cell(cell), force];
+        let words = cell.rows.iter().take(joints);
+        let words = words.map(|row| row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.4}")));
         table.add_row(head.into_iter().chain(words).chain([steps_off(&cell.rows), worst(&cell.rows)]));
     }
-    format!("\nthe words of cells in contact; --cell shows one in every step\n{}", right(table))
+    format!(
+        "\nwhat cells said in Nm, and by how many steps of 2^-12 at most; --cell shows how\n{}",
+        right(table, true)
+    )
+}
+
+/// How cells are called: by their numbers, and by their bus where there are several.
+struct Names(Option<String>);
+
+impl Names {
+    fn of(cells: &[CellExplained]) -> Self {
+        let bus = cells.first().map(|cell| &cell.bus);
+        Self(bus.filter(|bus| cells.iter().all(|cell| cell.bus == **bus)).cloned())
+    }
+
+    fn head(&self) -> String {
+        self.0.clone().unwrap_or_else(|| "cell".to_owned())
+    }
+
+    fn of_cell(&self, cell: &CellExplained) -> String {
+        if self.0.is_some() { cell.node.to_string() } else { name(cell) }
+    }
 }
 
 fn name(cell: &CellExplained) -> String {
@@ -133,7 +163,7 @@ fn worst(rows: &[Row]) -> String {
 
 const fn short(verdict: &Verdict) -> &'static str {
     match verdict {
-        Verdict::Nearest => "exact",
+        Verdict::Nearest => "nearest",
         Verdict::Rounded { .. } => "16 bits",
         Verdict::Saturated => "saturated",
         Verdict::Unexplained => "NOT EXPLAINED",
@@ -141,16 +171,32 @@ const fn short(verdict: &Verdict) -> &'static str {
     }
 }
 
+/// The same with the J that a word comes of.
 fn long(verdict: &Verdict) -> String {
     match verdict {
-        Verdict::Nearest => "the nearest step".to_owned(),
-        Verdict::Rounded { jacobian_m, jacobian_steps } => {
-            format!("16 bits: J = {jacobian_m:.5} m, {jacobian_steps:+.2} steps")
+        Verdict::Rounded { jacobian_steps, .. } => format!("16 bits: J {jacobian_steps:+.2}"),
+        Verdict::Nearest | Verdict::Saturated | Verdict::Unexplained | Verdict::Open => {
+            short(verdict).to_owned()
         }
-        Verdict::Saturated => "saturated: beyond 8 Nm".to_owned(),
-        Verdict::Unexplained => "NOT EXPLAINED by any J near".to_owned(),
-        Verdict::Open => "not known".to_owned(),
     }
+}
+
+/// What the words of the last column mean, those that stand there.
+fn legend(cells: &[CellExplained]) -> String {
+    let rows = || cells.iter().flat_map(|cell| &cell.rows);
+    let mut text = String::new();
+    if rows().any(|row| matches!(row.verdict, Verdict::Rounded { .. })) {
+        text += "  16 bits: a J so many steps of 2^-14 m from the exact one gives this very word\n";
+    }
+    if rows().any(|row| row.verdict == Verdict::Saturated) {
+        text += "  saturated: the product is beyond 8 Nm, and the word says so\n";
+    }
+    if rows().any(|row| row.verdict == Verdict::Unexplained) {
+        text += &format!(
+            "  NOT EXPLAINED: no J within {JACOBIAN_STEPS} steps of the exact one gives this word\n"
+        );
+    }
+    text
 }
 
 fn every_step(cell: &CellExplained, first: u64) -> String {
@@ -179,11 +225,12 @@ fn force_steps(force: &Force, first: u64) -> String {
     let [touch_counts, near_counts] =
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
-        "  felt       {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}: {origin}\n  \
+        "  felt       {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
+         since      {origin}\n  \
          F_c        {touch_n:.4} N, {touch} {contact_threshold_n:.4} N: {touch_counts}\n  \
          F_p        {proximity:.4}, {near} {proximity_threshold:.4}: {near_counts}\n  \
-         F_z        {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} {force_threshold_n:.4} N: \
-         {force_n:.6} N ({force_steps} steps of 2^-16)\n"
+         F_z        {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} {force_threshold_n:.4} N\n  \
+         in words   {force_steps} steps of 2^-16 N = {force_n:.6} N\n"
     )
 }
 
@@ -213,8 +260,9 @@ fn joint(cells: &[CellExplained]) -> String {
 /// Joints of cells, each in a line.
 fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     let mut table = table();
-    let first = if by_cell { "cell" } else { "joint" };
-    let head = [first, "J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"];
+    let names = Names::of(cells);
+    let first = if by_cell { names.head() } else { "joint".to_owned() };
+    let head = [first.as_str(), "J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"];
     let force = by_cell.then_some("F_z N");
     table.set_header(head.into_iter().take(1).chain(force).chain(head.into_iter().skip(1)));
     let number = |value: Option<f64>, decimals: usize| {
@@ -222,8 +270,8 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     };
     for cell in cells {
         for row in &cell.rows {
-            let first = if by_cell { name(cell) } else { row.joint.to_string() };
-            let force = by_cell.then(|| number(cell.force.as_ref().map(|force| force.force_n), 3));
+            let first = if by_cell { names.of_cell(cell) } else { row.joint.to_string() };
+            let force = by_cell.then(|| number(cell.force.as_ref().map(|force| force.force_n), 2));
             let word = |word: Option<i16>| word.map_or_else(|| "-".to_owned(), |word| word.to_string());
             let rest = [
                 number(row.jacobian_m, 6),
@@ -237,27 +285,12 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
             table.add_row(std::iter::once(first).chain(force).chain(rest));
         }
     }
-    if let Some(column) = table.column_iter_mut().last() {
-        column.set_cell_alignment(CellAlignment::Left);
-    }
-    let last = table.column_count().saturating_sub(1);
-    for column in table.column_iter_mut().take(last).skip(1) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
-    format!("{table}\n")
+    right(table, true) + &legend(cells)
 }
 
 fn totals(total: &[Total]) -> String {
     let mut table = table();
-    table.set_header([
-        "joint",
-        "words",
-        "words Nm",
-        "products Nm",
-        "central Nm",
-        "words - central",
-        "unrounded Nm",
-    ]);
+    table.set_header(["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"]);
     for Total {
         joint,
         word_steps,
@@ -285,5 +318,8 @@ fn totals(total: &[Total]) -> String {
             format!("{unrounded_nm:.6}"),
         ]);
     }
-    format!("\nthe whole skin: the frames' words added up, beside the central computation\n{}", right(table))
+    format!(
+        "\nthe whole skin: the words of the frames added up, beside the central computation\n{}",
+        right(table, false)
+    )
 }
