@@ -94,8 +94,8 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let page = SensorPage::Acceleration([Q3_12::from_bits(random.random()); 3]);
                 Message::Stimulus { to, from: From::Next, page }
             }
-            16 => Message::Halt,
-            17 => Message::Resume,
+            16 if random.random_ratio(1, 2) => Message::Halt,
+            16 | 17 => Message::Resume,
             18 => Message::Report,
             _ if tame => Message::Report,
             _ => configure(random, to),
@@ -173,5 +173,5 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
             all += 1;
         }
     }
-    assert!(torques > all / 10 && ends > 300, "{torques} torques, {ends} ends of contacts in {all} messages");
+    assert!(torques > all / 20 && ends > 300, "{torques} torques, {ends} ends of contacts in {all} messages");
 }
