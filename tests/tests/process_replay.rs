@@ -55,6 +55,26 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
 }
 
 #[test]
+fn a_recording_brings_its_own_skin() {
+    let place = Place::new();
+    place.skin(5);
+    place.scenario(process::PRESSED);
+    place.bench(2.0, "--record run.mcap").end().well();
+    fs::remove_file(place.path("skin.toml")).unwrap();
+    let mut counts = Vec::new();
+    for file in ["run.mcap", "run.log"] {
+        let skin = if file == "run.log" { " --skin again.toml" } else { "" };
+        place.skin(5);
+        fs::rename(place.path("skin.toml"), place.path("again.toml")).unwrap();
+        let (ended, replayed) = place.replayed(file, &format!("--expect --spawn --max{skin}"));
+        counts.push((replayed.all_came_back(&ended), replayed.number("/sent")));
+        place.is_left_clean();
+    }
+    // The log and the recording are of the same run.
+    assert!(counts[0].0 > 300 && counts[0] == counts[1], "{counts:?}");
+}
+
+#[test]
 fn two_buses_of_classic_frames_come_back_too() {
     let place = Place::new();
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));
