@@ -24,8 +24,10 @@ fn reader(bytes: &[u8]) -> Reader {
 
 fn converted(bytes: &[u8], format: Format) -> (Vec<u8>, Converted) {
     let mut out = Vec::new();
-    let mut to = Output::new(&mut out, format, Style::default()).unwrap();
-    let done = convert(&mut reader(bytes), &mut to, |_, _| Ok(())).unwrap();
+    let mut from = reader(bytes);
+    let style = Style { directions: from.is_of_a_log(), ..Style::default() };
+    let mut to = Output::new(&mut out, format, style).unwrap();
+    let done = convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
     drop(to);
     (out, done)
@@ -300,7 +302,7 @@ fn what_else_a_recording_has_is_named_and_counted() {
     assert_eq!(extras.attachments, [("skin.toml".to_owned(), b"version = 1".to_vec())]);
     assert_eq!(extras.metadata[0], ("run".to_owned(), vec![("git".to_owned(), "abc".to_owned())]));
     let (log, _) = converted(&bytes, Format::Candump);
-    let expected = "(1700000000.000000000) can0 123#01 R\n\
+    let expected = "(1700000000.000000000) can0 123#01\n\
                     DROPCOUNT: dropped 2 CAN frames on 'can0' socket (total drops 2)\n";
     assert_eq!(String::from_utf8(log).unwrap(), expected);
 }

@@ -316,10 +316,10 @@ fn we_read_recordings_that_other_libraries_write() {
     assert_eq!(expected.lines().count(), RICH.lines().count());
     for packing in ["none", "lz4", "zstd"] {
         place.python(&format!("mcap-copy ours.mcap {packing}.mcap {packing}"));
-        place.gateway(&format!("convert {packing}.mcap {packing}.log"));
+        place.gateway(&format!("convert {packing}.mcap {packing}.log --direction"));
         assert_eq!(fs::read_to_string(place.path(&format!("{packing}.log"))).unwrap(), expected, "{packing}");
     }
     place.python("mcap-loose ours.mcap loose.mcap");
-    place.gateway("convert loose.mcap loose.log");
+    place.gateway("convert loose.mcap loose.log --direction");
     assert_eq!(fs::read_to_string(place.path("loose.log")).unwrap(), RICH);
 }

@@ -15,6 +15,7 @@ mod magic;
 mod mcap;
 mod reader;
 
+pub use mcap::ORIGIN;
 pub use reader::{CaptureError, Extras, Format, InForce, Reader, Topic};
 
 use protocol::candump::Record;

@@ -11,7 +11,7 @@ use thiserror::Error;
 use super::Entry;
 use super::log::LogReader;
 use super::magic::{self, Kind};
-use super::mcap::{Fault, McapReader};
+use super::mcap::{Fault, McapReader, ORIGIN, SOURCE};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -193,6 +193,17 @@ impl Reader {
         Ok(next)
     }
 
+    /// Whether its entries are lines of a log, now or before it was converted. Else what was left to whoever
+    /// took the capture is in it too, as each frame's direction.
+    #[must_use]
+    pub fn is_of_a_log(&self) -> bool {
+        let origin = |facts: &[(String, String)]| {
+            facts.iter().any(|(key, value)| (key.as_str(), value.as_str()) == SOURCE)
+        };
+        self.format() == Format::Candump
+            || self.extras().metadata.iter().any(|(name, facts)| name == ORIGIN && origin(facts))
+    }
+
     /// Lines of a log so far: the number of the last entry's; 0 in an MCAP recording.
     #[must_use]
     pub const fn lines(&self) -> u64 {
@@ -212,7 +223,8 @@ impl Reader {
         }
     }
 
-    /// What it has beside frames and notes, as far as it has been read. A log has nothing.
+    /// What it has beside frames and notes, as far as it has been read; what stands before the first of them, from
+    /// the beginning. A log has nothing.
     #[must_use]
     pub fn extras(&self) -> &Extras {
         static NONE: Extras = Extras {

@@ -11,7 +11,7 @@ use std::sync::atomic::Ordering;
 use clap::{Args, ValueEnum};
 use gateway::capture::convert::{ConvertError, Converted, Output, convert};
 use gateway::capture::log::{self, Style};
-use gateway::capture::{Format, Reader};
+use gateway::capture::{Format, ORIGIN, Reader};
 use gateway::run::file::WholeFile;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::Failure;
@@ -51,7 +51,10 @@ pub(crate) struct Convert {
     /// Digits of a second in a log: 6 or 9; else as many as IN has
     #[arg(long, value_enum, value_name = "N")]
     digits: Option<Digits>,
-    /// Write only what every tool reads: frames, without direction and raw DLC, no comments
+    /// Write T or R behind frames in a log, which a log that had them has anyway; Wireshark does not read that
+    #[arg(long, conflicts_with = "plain")]
+    direction: bool,
+    /// Write only what every tool reads: frames, without direction and raw DLC, 6 digits, no comments
     #[arg(long)]
     plain: bool,
 }
@@ -68,8 +71,9 @@ impl Convert {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let format = self.format()?;
         let text = format == Format::Candump;
-        if !text && (self.digits.is_some() || self.plain) {
-            let option = if self.plain { "--plain" } else { "--digits" };
+        let options =
+            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
+        if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
             return Err(Failure::usage(format!(
                 "{option} is for a candump log: a recording keeps everything"
             )));
@@ -95,11 +99,13 @@ impl Convert {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
         let digits = match self.digits {
+            None if self.plain => log::Digits::Six,
             None => log::Digits::Own,
             Some(Digits::Six) => log::Digits::Six,
             Some(Digits::Nine) => log::Digits::Nine,
         };
-        let style = Style { digits, plain: self.plain };
+        let directions = !self.plain && (self.direction || reader.is_of_a_log());
+        let style = Style { digits, plain: self.plain, directions };
         let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
         let (whole, out) = create(&self.to).map_err(failed)?;
         let mut output = Output::new(out, format, style).map_err(failed)?;
@@ -144,7 +150,7 @@ impl Convert {
         if let Some(whole) = whole {
             whole.finish().map_err(failed)?;
         }
-        for line in remarks(&reader, &done) {
+        for line in remarks(&reader, &done, &style) {
             note(format_args!("{name}: {line}"));
         }
         note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
@@ -231,21 +237,27 @@ fn others(reader: &Reader) -> String {
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
     let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
     let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
-    let facts = extras.metadata.iter().map(|(name, _)| format!("metadata {name}"));
+    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
+    let facts = facts.map(|(name, _)| format!("metadata {name}"));
     topics.chain(attached).chain(facts).collect::<Vec<_>>().join(", ")
 }
 
 /// What somebody may want to know of a conversion, a line each.
-fn remarks(reader: &Reader, done: &Converted) -> Vec<String> {
+fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
     let mut lines = Vec::new();
     if let Some((times, first)) = done.backwards {
         lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
     }
+    let shortened = if style.plain || style.digits != log::Digits::Own || style.directions {
+        "frames are written without something that a log cannot have or was not to have"
+    } else {
+        "frames are written without their direction, which not every tool reads; --direction writes it"
+    };
     for (count, what) in [
         (done.unreadable, "begin like a frame and are none: not read"),
         (done.can_xl, "are CAN XL frames: not read"),
         (done.dropped, "frames are missing: whoever took the capture lost them"),
-        (done.shortened, "frames are written without something that a log cannot have or was not to have"),
+        (done.shortened, shortened),
         (done.left_out, "notes are left out"),
     ] {
         if count > 0 {

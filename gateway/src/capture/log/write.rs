@@ -27,8 +27,10 @@ pub enum Digits {
 pub struct Style {
     /// Digits of a second.
     pub digits: Digits,
-    /// Only what every tool reads: frames, without direction and raw DLC.
+    /// Only what every tool reads: frames, without raw DLC.
     pub plain: bool,
+    /// `T` or `R` behind frames whose direction is known, as `candump -x` does. Wireshark does not read that.
+    pub directions: bool,
 }
 
 /// What became of an entry.
@@ -85,9 +87,12 @@ impl<W: Write> LogWriter<W> {
             Some(Direction::Sent) => " T",
             Some(Direction::Received) => " R",
         };
-        if self.style.plain {
-            less |= !way.is_empty() || frame.raw_dlc() != 0;
+        if !self.style.directions {
+            less |= !way.is_empty();
             way = "";
+        }
+        if self.style.plain {
+            less |= frame.raw_dlc() != 0;
             written.frame = frame.with_raw_dlc(0);
         }
         let name;
@@ -180,9 +185,11 @@ mod tests {
     #[test]
     fn a_frame_is_written_as_it_was_or_as_was_asked_for() {
         let line = "(1.000000007) can0 123#1122334455667788_A T";
-        let style = |digits, plain| Style { digits, plain };
+        let style = |digits, plain| Style { digits, plain, directions: !plain };
         let as_is = |line: &str| (format!("{line}\n"), vec![Wrote::All]);
-        assert_eq!(written(Style::default(), &[frame(line)]), as_is(line));
+        assert_eq!(written(style(Digits::Own, false), &[frame(line)]), as_is(line));
+        let bare = (line.replace(" T", "\n"), vec![Wrote::Less]);
+        assert_eq!(written(Style::default(), &[frame(line)]), bare);
         let six = ("(1.000000) can0 123#1122334455667788_A T\n".to_owned(), vec![Wrote::Less]);
         assert_eq!(written(style(Digits::Six, false), &[frame(line)]), six);
         let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![Wrote::Less]);

@@ -5,4 +5,5 @@ mod read;
 mod write;
 
 pub(super) use read::{Fault, McapReader};
-pub(super) use write::McapWriter;
+pub use write::ORIGIN;
+pub(super) use write::{McapWriter, SOURCE};

@@ -45,6 +45,8 @@ pub(crate) struct McapReader {
     /// Bytes that came in.
     bytes: u64,
     any_frame: bool,
+    /// What was read when it was opened: the channel and time of the first message, or why there is none.
+    first: Option<Result<(u16, u64), Fault>>,
     over: bool,
 }
 
@@ -80,7 +82,7 @@ impl McapReader {
             *to = *from;
         }
         linear.notify_read(head.len());
-        Self {
+        let mut reader = Self {
             input,
             linear,
             schemas: HashMap::new(),
@@ -90,8 +92,12 @@ impl McapReader {
             message: Vec::new(),
             bytes: u64::try_from(head.len()).unwrap_or(0),
             any_frame: false,
+            first: None,
             over: false,
-        }
+        };
+        // What stands before the first message is known from the beginning.
+        reader.first = reader.advance().transpose();
+        reader
     }
 
     pub(crate) const fn extras(&self) -> &Extras {
@@ -100,10 +106,19 @@ impl McapReader {
 
     /// The next entry. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Entry<'_>>, Fault> {
+        let message = match self.first.take() {
+            Some(first) => Some(first?),
+            None => self.advance()?,
+        };
+        Ok(message.map(|(channel, log_time)| self.entry(channel, log_time)))
+    }
+
+    /// Reads up to the next entry's message; its channel and its time.
+    fn advance(&mut self) -> Result<Option<(u16, u64)>, Fault> {
         while !self.over {
             match self.step() {
                 Ok(None) => {}
-                Ok(Some((channel, log_time))) => return Ok(Some(self.entry(channel, log_time))),
+                Ok(message) => return Ok(message),
                 Err(fault) => {
                     self.over = true;
                     return Err(fault);

@@ -14,6 +14,10 @@ use crate::ros2::messages::{CanFrame, CaptureNote};
 const LANES: usize = 64;
 /// Where the frames of further buses stand; each bears its bus' name.
 const FURTHER: &str = "/further";
+/// The metadata that says what a recording was made from, when that was a capture.
+pub const ORIGIN: &str = "capture";
+/// What it says.
+pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
 /// Bytes of notes that wait for the first frame.
 const WAITING: usize = 1 << 20;
 
@@ -51,7 +55,9 @@ struct Waiting {
 impl<W: Write> McapWriter<W> {
     /// Begins a recording.
     pub(crate) fn new(out: W) -> io::Result<Self> {
-        let file = FileWriter::new(out)?;
+        let mut file = FileWriter::new(out)?;
+        let (key, value) = SOURCE;
+        file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
         Ok(Self { file, lanes: Vec::new(), last: 0, notes: None, waiting: Some(Vec::new()), bytes: 0 })
     }
 
