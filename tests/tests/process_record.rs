@@ -279,7 +279,7 @@ fn a_limit_on_the_size_of_files_ends_the_recording_and_not_the_run() {
     place.pressed();
     // In blocks of 512 bytes; a pipe has no size.
     let run = format!("{RUN} --record run.mcap --candump /dev/stderr");
-    let ended = in_shell(&place, "ulimit -f 900", &run, "true");
+    let ended = in_shell(&place, "ulimit -f 700", &run, "true");
     let is_frame = |line: &&str| line.starts_with('(');
     let log: String = ended.stderr.lines().filter(is_frame).flat_map(|line| [line, "\n"]).collect();
     place.write("run.log", &log);

@@ -281,9 +281,11 @@ impl Work {
             return;
         }
         // So that this file can be understood without the one before.
+        let now = wall();
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.in_force.frames() {
-                series.put(What::Others(1), |writer, topics| topics.in_force(writer, bus, name, &frame));
+                series
+                    .put(What::Others(1), |writer, topics| topics.in_force(writer, now, (bus, name), &frame));
             }
         }
         for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {

@@ -79,13 +79,20 @@ impl Topics {
         writer.write(channel, seen.at_nanos, &message(name, seen))
     }
 
-    /// A frame that is in force when the file begins.
+    /// A frame that is in force when the file begins, at `nanos`: its own time may be long before, and would be
+    /// the beginning of what viewers show.
     ///
     /// # Errors
     /// See above.
-    pub fn in_force(&mut self, writer: &mut Writer, bus: usize, name: &str, seen: &Seen) -> io::Result<()> {
+    pub fn in_force(
+        &mut self,
+        writer: &mut Writer,
+        nanos: u64,
+        (bus, name): (usize, &str),
+        seen: &Seen,
+    ) -> io::Result<()> {
         let Some(channel) = self.state.get_mut(bus) else { return Ok(()) };
-        writer.write(channel, seen.at_nanos, &message(name, seen))
+        writer.write(channel, nanos, &message(name, seen))
     }
 
     /// Something between frames.
