@@ -1,0 +1,164 @@
+"""A DBC as cantools reads it, against frames whose meaning another program wrote beside them.
+
+    dbc.py DBC GOLDEN        decodes each frame of the log, compares it with the comment above it, encodes it again
+
+Prints how many frames of each kind were compared. The DBC is of a bus with all 254 cells.
+"""
+
+import math
+import sys
+
+import cantools
+
+AXES = ("x", "y", "z")
+HEARD = {"joints_late": "joints_skipped"}
+PARAMETERS = {
+    "joint": "mount_joint",
+    "joints": "mount_joints",
+    "alpha_c": "alpha_c",
+    "alpha_p": "alpha_p",
+    "contact_threshold": "contact_threshold",
+    "proximity_threshold": "proximity_threshold",
+    "force_threshold": "force_threshold",
+    "period_us": "period",
+    "on": "mode",
+}
+
+
+def numbers(text):
+    return [float(number) for number in text.split(",")]
+
+
+def numbered(name, text):
+    return {f"{name}_{index}": value for index, value in enumerate(numbers(text), 1)}
+
+
+def on_axes(name, text):
+    return {f"{name}_{axis}": value for axis, value in zip(AXES, numbers(text))}
+
+
+def felt(fields):
+    if "acceleration" in fields:
+        return {"page": 1} | on_axes("acceleration", fields["acceleration"])
+    return (
+        {"page": 0, "proximity": float(fields["proximity"])}
+        | numbered("contact", fields["contact"])
+        | numbered("temperature", fields["temperature"])
+    )
+
+
+def state(fields):
+    names = "configured active halted flash-damaged duplicate test-mode saturated claiming".split()
+    there = fields["state"].split("+")
+    bits = {f"state_{name.replace('-', '_')}": int(name in there) for name in names}
+    return bits | {"state_joint": int(fields["joint"]), "state_version": int(fields["version"])}
+
+
+def parameter(fields):
+    number = int(fields["parameter"])
+    said = {"parameter": number, "tag": int(fields["tag"])}
+    for key, text in fields.items():
+        if key == "position":
+            said |= on_axes("pose", text)
+        elif key == "normal":
+            said |= on_axes("normal", text)
+        elif key == "hash":
+            said["commit_hash"] = int(text, 16)
+        elif key in ("a", "d"):
+            said[f"row{number - 15}_{key}"] = float(text)
+        elif key in ("alpha", "theta_offset"):
+            said[f"row{number - 15}_{key}"] = float(text) * math.pi / 2
+        elif key in PARAMETERS:
+            said[PARAMETERS[key]] = float(text)
+    return said
+
+
+def meaning(kind, fields):
+    """The message's name and what its signals should say."""
+    who = fields.get("from", fields.get("to"))
+    epoch = {"epoch": int(fields["epoch"])} if "epoch" in fields else {}
+    match kind:
+        case "halt" | "sync" | "resume" | "report":
+            return kind, {}
+        case "joints":
+            angles = numbered("position", fields["positions"])
+            angles = {name: value * math.pi / 2 for name, value in angles.items()}
+            return kind, epoch | angles | {"count": int(fields["in_use"])}
+        case "sum":
+            return f"sum_{who}", epoch | numbered("sum", fields["torque"]) | {"count": int(fields["count"])}
+        case "torque":
+            return f"torque_{who}", epoch | numbered("torque", fields["torque"]) | {"count": 1}
+        case "sensors":
+            return f"sensors_{who}", epoch | felt(fields)
+        case "heartbeat":
+            said = {"page": 0, "serial": int(fields["serial"]), "configuration": int(fields["configuration"], 16)}
+            said |= {"sent": int(fields["sent"]), "rejected": int(fields["rejected"])}
+            return f"network_{who}", epoch | said | state(fields)
+        case "heard" | "refused":
+            counters = {key: int(text) for key, text in fields.items() if key not in ("from", "epoch")}
+            counters = {f"{kind}_{HEARD.get(key, key)}": count for key, count in counters.items()}
+            return f"network_{who}", epoch | counters | {"page": 1 if kind == "heard" else 2}
+        case "read" | "write":
+            return f"configure_{who}", parameter(fields) | {"write": int(kind == "write")}
+        case "value" if "words" in fields:
+            # Identity: two words of serial number, version, hash, state.
+            words = [int(word) & 0xFFFF for word in fields["words"].split(",")]
+            said = {"serial": words[0] | words[1] << 16, "version": words[2], "configuration": words[3]}
+            said |= {"state_joint": words[4] >> 8 & 15, "state_version": words[4] >> 12}
+            return f"configured_{who}", parameter(fields) | said | {"written": 0}
+        case "value" | "written":
+            return f"configured_{who}", parameter(fields) | {"written": int(kind == "written")}
+        case "refusal":
+            said = {"tag": int(fields["tag"]), "parameter": 126, "written": 0}
+            said |= {"refused_parameter": int(fields["parameter"]), "refused_reason": int(fields["reason"])}
+            return f"configured_{who}", said
+        case "stimulus":
+            when = {"from_next": 1} if fields["from"] == "next" else {"from_next": 0, "epoch": int(fields["from"])}
+            return f"stimulus_{fields['to']}", when | felt(fields)
+    raise SystemExit(f"what is {kind}?")
+
+
+def frames(path):
+    comment = ""
+    for line in open(path, encoding="utf-8"):
+        if line.startswith("# "):
+            comment = line[2:].strip()
+        elif line.startswith("("):
+            identifier, _, data = line.split()[2].partition("##")
+            yield comment, int(identifier, 16), bytes.fromhex(data[1:])
+
+
+def main(dbc, golden):
+    database = cantools.database.load_file(dbc, strict=True)
+    assert {message.length for message in database.messages} == {16}
+    assert all(message.is_fd and not message.is_extended_frame for message in database.messages)
+    compared = {}
+    for comment, identifier, data in frames(golden):
+        kind, *words = comment.split()
+        fields = dict(word.split("=", 1) for word in words)
+        message = database.get_message_by_frame_id(identifier)
+        if fields.get("parameter") == "99":
+            # No such parameter: the DBC has no words for it.
+            try:
+                message.decode(data)
+            except cantools.database.errors.DecodeError:
+                compared["unknown"] = compared.get("unknown", 0) + 1
+                continue
+            raise SystemExit(f"{comment}: decoded")
+        said = message.decode(data, decode_choices=False)
+        name, wanted = meaning(kind, fields)
+        assert message.name == name, f"{comment}: {message.name}"
+        wanted["crc"] = int.from_bytes(data[14:], "little")
+        for signal, value in wanted.items():
+            assert abs(said[signal] - value) < 1e-9, f"{comment}: {signal} is {said[signal]}, not {value}"
+        assert message.encode(said, strict=False) == data, f"{comment}: encoded otherwise"
+        compared[kind] = compared.get(kind, 0) + 1
+    saturated = database.get_message_by_name("torque_254").get_signal_by_name("torque_1").choices
+    assert {int(value): str(text) for value, text in saturated.items()} == {32767: "saturated", -32768: "saturated"}
+    joints = database.get_message_by_name("joints")
+    assert (joints.cycle_time, joints.senders, len(joints.receivers)) == (16, ["gateway"], 254)
+    print(" ".join(f"{kind}={count}" for kind, count in sorted(compared.items())))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
