@@ -359,6 +359,24 @@ fn a_signal_ends_a_dump_cleanly() {
 }
 
 #[test]
+fn a_live_bus_is_counted_until_the_end_that_was_asked_for_or_a_signal() {
+    let bench = Bench::new();
+    let counted = |child: Child| {
+        let Output { status, stdout, stderr } = child.wait_with_output().unwrap();
+        assert_eq!((status.code(), text(&stderr)), (Some(0), ""));
+        let report: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
+        (report["format"].clone(), report["frames"].clone())
+    };
+    let child = bench.dump("--stats --json --max 2");
+    (0..2).for_each(|_| bench.send("frame sync --bus vcan0"));
+    assert_eq!(counted(child), ("live".into(), 2.into()));
+
+    let child = bench.dump("--stats --json");
+    kill_process(Pid::from_child(&child), Signal::INT).unwrap();
+    assert_eq!(counted(child), ("live".into(), 0.into()));
+}
+
+#[test]
 fn a_bus_that_ends_ends_its_dump_with_an_error() {
     let bench = Bench::new();
     let dump = bench.dump("");

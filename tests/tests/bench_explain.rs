@@ -143,7 +143,7 @@ fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
     let cell = explanation.cells.iter().find(|cell| cell.node == one).unwrap();
     assert!(cell.force.is_some() && cell.answered_after_ns.is_none());
     let said = explanation.missing.join("\n");
-    assert!(said.contains(&format!("vcan0 {one}: no torque of this epoch came: lost, late, or")), "{said}");
+    assert!(said.contains(&format!("vcan0 {one}: no torque of this epoch in time: lost, or")), "{said}");
     assert_eq!(explanation.total[0].open, 1);
 }
 
@@ -164,7 +164,7 @@ fn a_cell_that_has_just_started_says_nothing_and_one_that_lets_go_says_zeros() {
     // It was told again what it feels, and answers nothing while it claims its number.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch came: it had just started and claimed its number; the words are without it",
+        "vcan0 {}: no torque of this epoch in time: it had just started and claimed its number; the words are without it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

@@ -215,10 +215,13 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                 continue;
             }
             if active && said.answer.is_none() {
-                let why = silence(moment.halted, said.state);
+                let why = match said.too_late {
+                    Some(at) => too_late(at.saturating_sub(moment.at_ns)),
+                    None => silence(moment.halted, said.state).to_owned(),
+                };
                 let node = cell.node;
                 explanation.missing.push(format!(
-                    "{name} {node}: no torque of this epoch came: {why}; the words are without it"
+                    "{name} {node}: no torque of this epoch in time: {why}; the words are without it"
                 ));
             }
             let [[exact, unit], [unrounded, _]] =
@@ -290,6 +293,12 @@ impl Sum {
     }
 }
 
+#[expect(clippy::cast_precision_loss, reason = "to be read")]
+fn too_late(nanos: u64) -> String {
+    let ms = nanos as f64 / 1e6;
+    format!("it came {ms:.3} ms after the joints, when four more had come, and is not used")
+}
+
 /// Why a cell in contact says nothing, as far as is known.
 fn silence(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
@@ -300,7 +309,7 @@ fn silence(halted: bool, state: Option<State>) -> &'static str {
     } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
         "it had no configuration"
     } else {
-        "lost, late, or the cell was not there"
+        "lost, or the cell was not there"
     }
 }
 

@@ -213,3 +213,20 @@ fn joints_that_a_cell_drops_are_none() {
     let explanation = explained(&skin, &again, Asked { occurrence: 2, ..first(7) }).unwrap();
     assert_eq!(explanation.buses[0].at_ns, 4_000_000, "the second of them was repeated");
 }
+
+#[test]
+fn a_torque_after_four_more_joints_is_named_and_not_used() {
+    let skin = skin();
+    let said = |more: u8| {
+        let mut said = vec![heartbeat(0x266D), press(From::Next, 1.0), joints(7)];
+        said.extend((8..8 + more).map(joints));
+        said.push(torque(7, [-1075, 3195]));
+        said
+    };
+    let in_time = explained(&skin, &said(3), first(7)).unwrap();
+    assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
+    let late = explained(&skin, &said(4), first(7)).unwrap();
+    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, when four more had \
+                    come, and is not used; the words are without it";
+    assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
+}

@@ -12,7 +12,7 @@ use super::felt::{Felt, Origin};
 
 /// Joints after the ones that are asked about, within which a torque may come.
 const LATE: u32 = 4;
-/// Joints after them, within which the configurations of cells that have not said theirs are waited for.
+/// Joints after them, within which late torques and the configurations of cells are waited for.
 const PATIENCE: u32 = 32;
 /// Runs of epochs that an error names.
 const RUNS: usize = 8;
@@ -82,6 +82,8 @@ pub struct CellMoment {
     pub hash: Option<u16>,
     /// The torque that it answered, and when.
     pub answer: Option<(u64, [Q3_12; WORDS])>,
+    /// When its torque came, if that was too late to be used.
+    pub too_late: Option<u64>,
     /// Further torques of this epoch, which nobody uses.
     pub repeated: u32,
 }
@@ -223,10 +225,14 @@ impl Run {
 
 impl Lane {
     fn is_complete(&self) -> bool {
-        let known = |moment: &Moment| {
-            let answered = |cell: &&CellMoment| cell.answer.is_some();
-            moment.cells.iter().filter(answered).all(|cell| cell.hash.is_some())
+        // Whoever answered has said its configuration, and whoever was touched has answered.
+        let settled = |cell: &CellMoment| match cell.answer {
+            Some(_) => cell.hash.is_some(),
+            None => {
+                cell.too_late.is_some() || cell.felt.is_none_or(|(skin, _)| skin == SkinSensors::default())
+            }
         };
+        let known = |moment: &Moment| moment.cells.iter().all(settled);
         self.moment
             .as_ref()
             .is_some_and(|moment| self.since >= PATIENCE || self.since >= LATE && known(moment))
@@ -290,14 +296,19 @@ impl Lane {
                     });
                 }
                 // A cell that measures has read its sensors at these very joints.
-                if let Some(cell) = self.answering(from, epoch, asked) {
+                if let Some((cell, _)) = self.answering(from, epoch, asked) {
                     cell.felt.get_or_insert((skin, Origin::Said { at_ns: nanos }));
                 }
             }
             Message::Torque { from, epoch, torque } => {
-                if let Some(cell) = self.answering(from, epoch, asked) {
-                    cell.repeated += u32::from(cell.answer.is_some());
-                    cell.answer.get_or_insert((nanos, torque));
+                if let Some((cell, in_time)) = self.answering(from, epoch, asked) {
+                    if cell.answer.is_some() {
+                        cell.repeated += 1;
+                    } else if in_time {
+                        cell.answer = Some((nanos, torque));
+                    } else {
+                        cell.too_late.get_or_insert(nanos);
+                    }
                 }
             }
             Message::Sync
@@ -347,10 +358,11 @@ impl Lane {
         }
     }
 
-    /// The cell at the moment, when it speaks of it and in time.
-    fn answering(&mut self, from: CellId, epoch: Epoch, asked: Asked) -> Option<&mut CellMoment> {
-        let in_time = epoch == asked.epoch && self.since < LATE;
-        self.moment.as_mut().filter(|_| in_time)?.cells.get_mut(from.index())
+    /// The cell at the moment, when it speaks of it; and whether that is in time.
+    fn answering(&mut self, from: CellId, epoch: Epoch, asked: Asked) -> Option<(&mut CellMoment, bool)> {
+        let in_time = self.since < LATE;
+        let moment = self.moment.as_mut().filter(|_| epoch == asked.epoch)?;
+        Some((moment.cells.get_mut(from.index())?, in_time))
     }
 
     /// What a cell computes with became known only after the moment; it was the same then.
