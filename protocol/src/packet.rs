@@ -194,8 +194,8 @@ pub enum Paired {
     Waiting,
     /// Both halves were there and the CRC is right.
     Whole(Packet),
-    /// Two halves that do not belong together, or a first half that waited too long: the older half
-    /// is dropped, and the newer one is now the first.
+    /// A packet is lost: two halves that do not belong together, or that came too far apart. The older half is
+    /// dropped, and the newer one is now the first. Said once for a packet both of whose halves came.
     Incomplete,
 }
 
@@ -205,7 +205,15 @@ pub enum Paired {
 /// the older half is dropped, so that a lost frame costs one packet and not every later one.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Half {
-    waiting: Option<([u8; 8], Micros)>,
+    waiting: Option<Waiting>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Waiting {
+    data: [u8; 8],
+    since: Micros,
+    /// It may be the second half of a packet that has been counted as incomplete: it is not counted again.
+    counted: bool,
 }
 
 impl Half {
@@ -222,21 +230,23 @@ impl Half {
     pub fn push(&mut self, at: Micros, id: Id, data: &[u8]) -> Result<Paired, PacketError> {
         let length = PacketError::Length { expected: HALF_BYTES, got: data.len() };
         let data: [u8; 8] = data.try_into().map_err(|_| length)?;
-        let Some((older, since)) = self.waiting.replace((data, at)) else {
+        let Some(older) = self.waiting.replace(Waiting { data, since: at, counted: false }) else {
             return Ok(Paired::Waiting);
         };
-        if at.since(since) > Self::WITHIN {
-            return Ok(Paired::Incomplete);
-        }
         let mut bytes = [0; BYTES];
-        let (head, tail) = bytes.split_at_mut(older.len());
-        head.copy_from_slice(&older);
+        let (head, tail) = bytes.split_at_mut(older.data.len());
+        head.copy_from_slice(&older.data);
         tail.copy_from_slice(&data);
-        let Ok(packet) = Packet::decode(id, &bytes) else {
-            return Ok(Paired::Incomplete);
+        let (packet, in_time) = (Packet::decode(id, &bytes), at.since(older.since) <= Self::WITHIN);
+        let Some(packet) = packet.as_ref().ok().filter(|_| in_time) else {
+            let of_one_packet = in_time || packet.is_ok();
+            if let Some(newer) = &mut self.waiting {
+                newer.counted = of_one_packet && !older.counted;
+            }
+            return Ok(if older.counted { Paired::Waiting } else { Paired::Incomplete });
         };
         self.waiting = None;
-        Ok(Paired::Whole(packet))
+        Ok(Paired::Whole(*packet))
     }
 }
 
@@ -277,6 +287,26 @@ mod tests {
         assert_eq!(push(1_100, &halves(2)[1]), Paired::Whole(make(2)));
         assert_eq!(push(9_000, &halves(3)[0]), Paired::Waiting);
         assert_eq!(push(13_001, &halves(3)[1]), Paired::Incomplete, "more than 4 ms apart");
+    }
+
+    #[test]
+    fn a_packet_both_of_whose_halves_came_is_counted_once() {
+        let id = Id::command(Command::Joints);
+        let make = |epoch| Packet { id, words: [7; WORDS], epoch: Epoch(epoch), count: 6 };
+        let halves = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
+        let damaged = Frame::classic(halves(2)[0].raw_id(), &[9; 8]).unwrap();
+        for (first, apart) in [(halves(2)[0], 4_001), (damaged, 100)] {
+            let mut half = Half::NONE;
+            let mut push = |at, frame: &Frame| half.push(Micros(at), id, frame.data()).unwrap();
+            assert_eq!(push(0, &first), Paired::Waiting);
+            assert_eq!(push(apart, &halves(2)[1]), Paired::Incomplete);
+            assert_eq!(push(50_000, &halves(3)[0]), Paired::Waiting, "that packet is counted");
+            assert_eq!(push(50_100, &halves(3)[1]), Paired::Whole(make(3)));
+            // Halves of two packets, each of which lost its other one, are counted each.
+            assert_eq!(push(90_000, &halves(4)[0]), Paired::Waiting);
+            assert_eq!(push(100_000, &halves(5)[0]), Paired::Incomplete);
+            assert_eq!(push(110_000, &halves(6)[0]), Paired::Incomplete);
+        }
     }
 
     #[test]

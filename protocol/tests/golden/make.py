@@ -620,12 +620,12 @@ def classic():
     half(a[1], 1, second, 120)
     half(b[1], 1, second, 120)
 
-    log.title("exactly 4 ms apart is a pair; 1 us more is not, and the newer half is then a first one")
+    log.title("exactly 4 ms apart is a pair; 1 us more is not: the packet is counted, once")
     half(a[2], 0, first, 1000)
     half(a[2], 1, second, 4000)
     half(a[3], 0, first, 1000)
     half(a[3], 1, "incomplete", 4001)
-    half(a[4], 0, "incomplete", 4001)
+    half(a[4], 0, first, 4001)
     half(a[4], 1, second, 150)
 
     log.title("a lost second half costs its own packet only")
@@ -653,11 +653,11 @@ def classic():
     for frame in ("20C#R8", "20C#R", "20000004#0001000000000000", f"0000020C#{'00' * 8}"):
         log.add("bad foreign", frame)
 
-    log.title("a wrong CRC drops the older half; the newer one waits and falls to the next first half")
+    log.title("a wrong CRC drops the older half; the newer one waits, falls to the next first half and is not counted")
     half(a[11], 0, first, 1000)
     spoilt = a[11].halves()[1]
     log.add("incomplete", spoilt[:-1] + ("0" if spoilt[-1] != "0" else "1"), 150)
-    half(a[12], 0, "incomplete", 1000)
+    half(a[12], 0, first, 1000)
     half(a[12], 1, second, 150)
 
     log.title("a whole pair without a meaning")
