@@ -225,10 +225,11 @@ impl Cell {
         self.said.counters = true;
     }
 
-    /// Counters that the cell reports; the first ones since a start are what later ones are compared to.
-    pub(super) fn report(&mut self, heard: Heard) {
+    /// Counters that the cell reports; the first ones since a start are what later ones are compared to. So many
+    /// joints passed the page on its way.
+    pub(super) fn report(&mut self, heard: Heard, passed: u64) {
         let (first, _) = *self.heard.get_or_insert_with(|| {
-            self.told = 0;
+            self.told = passed;
             (heard, heard)
         });
         self.heard = Some((first, heard));

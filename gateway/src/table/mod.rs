@@ -114,6 +114,17 @@ struct Broadcast {
     error: [f64; WORDS],
 }
 
+impl Broadcast {
+    /// Broadcasts after those of which a cell had heard when it wrote a page; more than a few are not looked for.
+    fn since(&self, heard: Epoch) -> u64 {
+        let recent = || self.recent.iter().flatten();
+        let of_which_it_heard = recent().position(|epoch| *epoch == heard);
+        // It has heard of none, where none but these has been.
+        let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent().count());
+        of_which_it_heard.or_else(all).map_or(0, |passed| passed as u64)
+    }
+}
+
 /// All that is known of one bus.
 #[derive(Debug)]
 pub struct Table {
@@ -338,7 +349,10 @@ impl Table {
                 cell.last_joints = epoch;
                 self.take_heartbeat(place, &heartbeat)
             }
-            Message::Network { page: NetworkPage::Heard(heard), .. } => cell.report(heard),
+            Message::Network { epoch, page: NetworkPage::Heard(heard), .. } => {
+                let passed = self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch));
+                cell.report(heard, passed);
+            }
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refuses(refused),
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
@@ -535,4 +549,52 @@ impl Table {
 /// A word as a whole number of steps.
 fn i32_of<const F: u32>(word: Q<F>) -> i32 {
     i32::from(word.to_bits())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::id::CellId;
+    use protocol::message::Heard;
+    use protocol::packet::Packet;
+
+    /// A table that heard these, in the frames of the bus, the gateway's own or a cell's.
+    fn table(heard: &[(bool, Message)]) -> Table {
+        let mut table = Table::new(&crate::testing::skin(), 0);
+        for (own, message) in heard {
+            let packet: Packet = message.encode();
+            for frame in packet.frames(Format::Fd) {
+                table.handle_frame(Micros(0), *own, &frame, &mut |_| None);
+            }
+        }
+        table
+    }
+
+    #[test]
+    fn joints_that_passed_a_report_on_its_way_count_as_not_heard_when_they_were_not() {
+        let joints = |epoch| {
+            (
+                true,
+                Message::Joints {
+                    epoch: Epoch(epoch),
+                    joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
+                },
+            )
+        };
+        let report = |epoch, joints| {
+            let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
+            (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
+        };
+        let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
+        // It has not heard the first; nor, when it began, one that came before its report.
+        assert_eq!(unanswered(&[report(0, 0), joints(1), joints(2), report(2, 1)]), Some((0, 1)));
+        assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 1)]), Some((0, 1)));
+        assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 2)]), Some((0, 0)));
+        assert_eq!(unanswered(&[joints(1), report(1, 1), joints(2), report(2, 2)]), Some((0, 0)));
+        // Who was long there, and before this gateway, has counted on.
+        assert_eq!(
+            unanswered(&[joints(8), joints(9), report(8, 70), joints(10), report(10, 72)]),
+            Some((0, 0))
+        );
+    }
 }
