@@ -13,8 +13,8 @@ use crate::capture::{CaptureError, Entry, Reader};
 
 /// Steps that are read ahead: some tenths of a second of a full bus.
 pub(super) const AHEAD: usize = 16_384;
-/// How long it is waited for room, or for steps.
-const PAUSE: Duration = Duration::from_micros(200);
+/// How long it is waited for room: what is read ahead lasts longer by far.
+const PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture so many times (without end when there is no number), and hands on what is to be done.
 #[derive(Debug)]

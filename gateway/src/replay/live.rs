@@ -21,10 +21,13 @@ const LOOK_NS: u64 = 100_000_000;
 /// How long it is waited for the next step, or an interface that is down.
 const PAUSE: Duration = Duration::from_micros(100);
 const DOWN: Duration = Duration::from_millis(50);
-/// Cells of which none has answered for so long are given up.
+/// Cells of which none has answered for so long are asked again, for a frame may have been lost; and given up.
+const REMIND: Duration = Duration::from_millis(500);
 const PATIENCE: Duration = Duration::from_secs(3);
 /// Joints are asked again so often when cells were too late for them.
-const ASK_AGAIN: u32 = 4;
+const ASK_AGAIN: u32 = 8;
+/// The answers to that are waited for, so long the first time, before cells have a heartbeat to say as well.
+const ANSWERS: Duration = Duration::from_millis(100);
 
 /// One bus.
 #[derive(Debug)]
@@ -128,7 +131,8 @@ impl Stage for Live {
         self.wait_until_done(lane);
         let Some(round) = open.round.filter(|_| self.expects) else { return };
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
-        // is slower than that. They are asked again under the epoch before, and then under their own.
+        // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
+        // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
         for again in 0..ASK_AGAIN {
             if self.hall.is_over() || self.hall.judge().unanswered(lane, round) == 0 {
                 return;
@@ -137,7 +141,16 @@ impl Stage for Live {
             self.asked_again += 1;
             self.hall.judge().announce(lane, Some(round), epoch);
             let joints = Message::Joints { epoch, joints: open.joints };
-            if self.tell(lane, &[joints, Message::Sync]).is_err() {
+            if self.tell(lane, &[joints]).is_err() {
+                return;
+            }
+            let give_up = Instant::now() + ANSWERS * (again + 1);
+            let mut judge = self.hall.judge();
+            while judge.unanswered(lane, round) > 0 && Instant::now() < give_up && !self.hall.is_over() {
+                judge = self.hall.wait(judge, Duration::from_millis(5));
+            }
+            drop(judge);
+            if self.tell(lane, &[Message::Sync]).is_err() {
                 return;
             }
             self.wait_until_done(lane);
@@ -206,12 +219,17 @@ impl Live {
     }
 
     fn wait_until_done(&mut self, lane: usize) {
-        let (mut done, mut progress) = (0, Instant::now());
+        let (mut done, mut progress, mut reminded) = (0, Instant::now(), Instant::now());
         let mut judge = self.hall.judge();
         while !judge.is_done(lane) && !self.hall.is_over() {
             let now = judge.done(lane);
             if now != done {
-                (done, progress) = (now, Instant::now());
+                (done, progress, reminded) = (now, Instant::now(), Instant::now());
+            }
+            if reminded.elapsed() > REMIND {
+                reminded = Instant::now();
+                // A bus that takes nothing says so at the next frame.
+                let _ = self.tell(lane, &[Message::Sync]);
             }
             if progress.elapsed() > PATIENCE {
                 let late = judge.give_up(lane);
