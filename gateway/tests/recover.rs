@@ -1,0 +1,189 @@
+//! Recordings that break off, or are damaged, are made whole: what is whole and right is kept, and the rest is said.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use gateway::record::file::FileWriter;
+use gateway::record::recover::{RecoverError, Recovered, recover};
+use gateway::ros2::messages::CanFrame;
+use gateway::ros2::standard::JointState;
+use mcap::MessageStream;
+use mcap::read::{Summary, attachment, metadata};
+use protocol::can::Frame;
+use protocol::candump::{Record, Timestamp};
+
+/// Messages of two topics in five chunks, a file and facts.
+fn recording() -> Vec<u8> {
+    let mut writer = FileWriter::new(Vec::new()).unwrap();
+    writer.metadata("program", &BTreeMap::from([("a".to_owned(), "b".to_owned())])).unwrap();
+    writer.attach("skin.toml", "application/toml", 7, b"version = 1\n").unwrap();
+    let mut can = writer.channel::<CanFrame<'_>>("/can/vcan0", &[("time_digits", "9")]).unwrap();
+    let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
+    writer.flush().unwrap();
+    for number in 0..50_u8 {
+        let nanos = u64::from(number) * 1_000;
+        let frame = Frame::classic(0x123, &[number; 8]).unwrap();
+        let time = Timestamp { nanos, nine_digits: true };
+        let record = Record { time, interface: "vcan0", frame, direction: None };
+        writer.write(&mut can, nanos, &CanFrame(record)).unwrap();
+        let q = [f64::from(number)];
+        let state = JointState { nanos, names: &[], position: &q, velocity: &[], effort: &[] };
+        writer.write(&mut joints, nanos, &state).unwrap();
+        if number % 10 == 9 {
+            writer.flush().unwrap();
+        }
+    }
+    writer.finish().unwrap();
+    writer.into_inner()
+}
+
+/// Topic, time, sequence and bytes of each message of a file that has its end.
+fn messages(bytes: &[u8]) -> Vec<(String, u64, u32, Vec<u8>)> {
+    let summary = Summary::read(bytes).unwrap().expect("it has its end");
+    let messages = MessageStream::new(bytes).unwrap().map(|message| {
+        let message = message.unwrap();
+        assert!(message.channel.schema.is_some());
+        (message.channel.topic.clone(), message.log_time, message.sequence, message.data.into_owned())
+    });
+    let messages: Vec<_> = messages.collect();
+    assert_eq!(summary.stats.unwrap().message_count, messages.len() as u64);
+    messages
+}
+
+fn recovered(bytes: &[u8]) -> Result<(Recovered, Vec<u8>), RecoverError> {
+    let mut out = Vec::new();
+    recover(bytes, &mut out).map(|recovered| (recovered, out))
+}
+
+#[test]
+fn a_whole_file_comes_back_with_everything_in_it() {
+    let bytes = recording();
+    let (said, copy) = recovered(&bytes).unwrap();
+    assert!(said.is_sound(), "{said:?}");
+    assert_eq!((said.messages, said.frames, said.last_nanos), (100, 50, 49_000));
+    assert_eq!(messages(&copy), messages(&bytes));
+    let summary = Summary::read(&copy).unwrap().unwrap();
+    let attached = attachment(&copy, &summary.attachment_indexes[0]).unwrap();
+    assert_eq!((attached.name.as_str(), &attached.data[..]), ("skin.toml", &b"version = 1\n"[..]));
+    assert_eq!(metadata(&copy, &summary.metadata_indexes[0]).unwrap().metadata["a"], "b");
+    let channel = summary.channels.values().find(|channel| channel.topic == "/can/vcan0").unwrap();
+    assert_eq!(channel.metadata["time_digits"], "9");
+}
+
+#[test]
+fn a_file_that_breaks_off_anywhere_keeps_what_was_handed_on() {
+    let bytes = recording();
+    let all = messages(&bytes);
+    let mut most = 0;
+    for end in 0..bytes.len() {
+        match recovered(&bytes[..end]) {
+            Ok((said, copy)) => {
+                let kept = messages(&copy);
+                assert!(
+                    all.starts_with(&kept) && kept.len().is_multiple_of(20),
+                    "{end}: whole chunks, in order"
+                );
+                assert!(kept.len() >= most, "{end}: more bytes, fewer messages");
+                assert!(!said.is_sound() && said.damaged == (0, 0) && said.homeless == 0, "{end}: {said:?}");
+                most = kept.len();
+                // What was made whole is whole.
+                let (again, _) = recovered(&copy).unwrap();
+                assert!(again.is_sound() && again.messages == kept.len() as u64, "{end}: {again:?}");
+            }
+            Err(RecoverError::Empty(_)) => assert!(most == 0 && end < 64, "{end}"),
+            Err(other) => panic!("{end}: {other}"),
+        }
+    }
+    assert_eq!(most, 100);
+}
+
+#[test]
+fn a_damaged_chunk_is_left_out_and_said_and_the_others_are_kept() {
+    let bytes = recording();
+    let all = messages(&bytes);
+    let chunks = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    // The first one has the channels: without them nothing else has a topic.
+    for (number, chunk) in chunks.iter().enumerate().skip(1) {
+        let mut bytes = bytes.clone();
+        let middle =
+            usize::try_from(chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size / 2)
+                .unwrap();
+        bytes[middle] ^= 0x10;
+        let (said, copy) = recovered(&bytes).unwrap();
+        assert_eq!((said.damaged.0, said.messages, said.whole), (1, 80, true), "{said:?}");
+        let lost = (number - 1) * 20;
+        assert_eq!(messages(&copy), [&all[..lost], &all[lost + 20..]].concat());
+        assert!(said.to_string().contains("1 damaged chunks of "), "{said}");
+    }
+    let mut bytes = bytes;
+    bytes[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
+    let (said, _) = recovered(&bytes).unwrap();
+    assert_eq!((said.messages, said.homeless), (0, 100), "{said:?}");
+}
+
+#[test]
+fn what_is_no_recording_is_named() {
+    let says = |bytes: &[u8]| recovered(bytes).unwrap_err().to_string();
+    assert_eq!(
+        says(b"PK\x03\x04 and so on"),
+        "it is no MCAP file: it begins with 50 4b 03 04 20 61 6e 64, an MCAP file with 89 4d 43 41 50"
+    );
+    assert_eq!(says(b""), "it ends within its first 0 bytes: there is nothing in it");
+}
+
+fn gateway(folder: &Path, words: &str) -> Output {
+    let program = env!("CARGO_BIN_EXE_gateway");
+    Command::new(program).args(words.split(' ')).current_dir(folder).output().unwrap()
+}
+
+#[test]
+fn the_command_says_what_it_did_and_overwrites_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let bytes = recording();
+    // In the middle of the third chunk with messages.
+    let third = Summary::read(&bytes).unwrap().unwrap().chunk_indexes[3].chunk_start_offset;
+    fs::write(path("run.mcap.part"), &bytes[..usize::try_from(third).unwrap() + 50]).unwrap();
+    fs::write(path("whole.mcap"), &bytes).unwrap();
+    fs::write(path("there.mcap"), "somebody's").unwrap();
+    fs::write(path("a.zip"), "PK\x03\x04").unwrap();
+    let says = |words: &str, code: i32| {
+        let Output { status, stdout, stderr } = gateway(folder.path(), words);
+        let text = String::from_utf8([stdout, stderr].concat()).unwrap();
+        assert_eq!((status.code(), text.lines().count()), (Some(code), 1), "{words}: {text}");
+        text.trim_end().to_owned()
+    };
+    let said = says("recover run.mcap.part", 0);
+    assert!(
+        said.starts_with("run-recovered.mcap, ")
+            && said.contains("; 50 bytes of an unfinished chunk are lost"),
+        "{said}"
+    );
+    assert_eq!(messages(&fs::read(path("run-recovered.mcap")).unwrap()).len(), 40);
+    assert!(path("run.mcap.part").exists(), "it stays");
+    assert!(says("recover run.mcap.part", 0).starts_with("run-recovered-1.mcap, "));
+    assert_eq!(
+        says("recover whole.mcap", 0),
+        "whole.mcap is whole, there is nothing to recover: 100 messages"
+    );
+    assert!(!path("whole-recovered.mcap").exists());
+    let exists = "gateway: -o there.mcap: there.mcap exists: name another file, or overwrite it with --force";
+    assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
+    assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
+    says("recover run.mcap.part -o there.mcap --force", 0);
+    assert_eq!(messages(&fs::read(path("there.mcap")).unwrap()).len(), 40);
+    let itself = "gateway: -o whole.mcap is the recording itself: name another file";
+    assert_eq!(says("recover whole.mcap -o whole.mcap --force", 2), itself);
+    assert!(
+        says("recover a.zip", 1)
+            .starts_with("gateway: a.zip: it is no MCAP file: it begins with 50 4b 03 04")
+    );
+    assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));
+    let held = fs::File::open(path("run.mcap.part")).unwrap();
+    rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).unwrap();
+    let recorded = "gateway: run.mcap.part is being recorded: wait for the run's end";
+    assert_eq!(says("recover run.mcap.part", 2), recorded);
+}
