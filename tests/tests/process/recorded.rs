@@ -17,7 +17,10 @@ use serde_json::{Map, Value, json};
 /// One message.
 pub(crate) struct Message {
     pub(crate) topic: String,
+    /// By its header.
     pub(crate) nanos: u64,
+    /// By the file.
+    pub(crate) log_nanos: u64,
     pub(crate) value: Value,
 }
 
@@ -56,7 +59,7 @@ impl Recorded {
                 if of_the_past { stamp < message.log_time } else { stamp == message.log_time },
                 "{topic}"
             );
-            Message { topic, nanos: stamp, value }
+            Message { topic, nanos: stamp, log_nanos: message.log_time, value }
         });
         let messages: Vec<_> = messages.collect();
         let counted: u64 = summary.stats.as_ref().unwrap().message_count;
