@@ -31,8 +31,8 @@ def leaves(value):
     else:
         known = dataclasses.is_dataclass(value)
         names = [field.name for field in dataclasses.fields(value)] if known else type(value).__slots__
-        # rosbags writes the type's name into a field of its own.
-        for name in sorted(name for name in names if not name.startswith("_")):
+        # rosbags has the type's name and its constants as fields, too.
+        for name in sorted(name for name in names if name.islower() and not name.startswith("_")):
             yield from leaves(getattr(value, name))
 
 
