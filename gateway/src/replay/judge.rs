@@ -8,7 +8,7 @@
 //! ```
 //!
 //! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus each
-//! for itself. Rounds of joints are judged when [`WINDOW`] more have been sent, or at the end.
+//! for itself. Rounds of joints are judged when 100 more have been sent, or at the end.
 
 use std::collections::{BTreeMap, VecDeque};
 
