@@ -493,6 +493,16 @@ mod tests {
         let expected =
             json!({ "from_next": true, "page": "acceleration", "acceleration_g": [0.0, 0.0, -8.0] });
         assert_eq!(from_next, expected);
+        let sum = values("sum from=1 epoch=0 count=1 torque=1,-1,0.00390625");
+        assert_eq!(sum, json!({ "torque_nm": [1.0, -1.0, 0.00390625, -0.00390625, 0.0, 0.5], "cells": 1 }));
+        let joints = values("joints epoch=1 in_use=1 positions=0.5,0,0,0,0,0");
+        assert_eq!(joints, json!({ "position_rad": [core::f64::consts::FRAC_PI_4] }));
+        let heard = values("heard from=12 epoch=7 joints=1000 joints_late=2");
+        let expected = json!({
+            "page": "heard", "joints": 1000, "joints_skipped": 2, "joints_repeated": 3, "stimuli": 40,
+            "stimuli_late": 5, "torques": 600,
+        });
+        assert_eq!(heard, expected);
         let refusal = values("refusal from=12 tag=200 parameter=1 reason=3");
         let because = "joint k is not 1 to the robot's joints";
         assert_eq!(refusal, json!({ "parameter": "mount", "refusal": 3, "because": because }));
