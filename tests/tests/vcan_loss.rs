@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
+#[path = "process/recorded.rs"]
+mod recorded;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -13,6 +15,8 @@ use process::vcan::{Candump, backlog_drops, frames_of, needs, small_skin, tool};
 use process::{PATIENCE, PRESSED, Place, is_stopped, until};
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{EXTENDED, Frame};
+use protocol::candump::{Line, parse};
+use recorded::Recorded;
 use rustix::process::Signal;
 
 /// About 16 frames, of which the kernel makes 32 and more.
@@ -182,7 +186,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let backlog = backlog_drops();
-    let bench = place.running_bench(4.0, &format!("--receive-buffer {SMALL}"));
+    let bench = place.running_bench(4.0, &format!("--record run.mcap --receive-buffer {SMALL}"));
     place.guest().waits_for_epoch(10);
     bench.signal(Signal::STOP);
     until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
@@ -190,7 +194,11 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
     bench.signal(Signal::CONT);
     let ended = bench.end().well();
-    let (ours, mut theirs) = (frames_of(&place.path("run.log")), candump.frames());
+    // The log says itself what is missing in it.
+    let log = place.read("run.log");
+    let (missing, lines): (Vec<_>, Vec<_>) = log.lines().partition(|line| line.starts_with("DROPCOUNT: "));
+    place.write("frames.log", &(lines.join("\n") + "\n"));
+    let (ours, mut theirs) = (frames_of(&place.path("frames.log")), candump.frames());
     // What cells said when the gateway listened no more is nobody's loss.
     let last = ours.last().unwrap();
     theirs.truncate(1 + theirs.iter().rposition(|frame| frame == last).unwrap());
@@ -200,6 +208,18 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     assert_eq!(summary.of_bus("/receive_buffer"), 2 * SMALL as u64);
     let dropped = summary.of_bus("/dropped_by_bus");
     assert_eq!((theirs.len() - ours.len()) as u64, dropped, "{}", ended.stderr);
+    let said = |line: &str| match parse(line) {
+        Ok(Line::Dropped { frames }) => frames,
+        other => panic!("{line}: {other:?}"),
+    };
+    assert_eq!(missing.iter().map(|line| said(line)).sum::<u64>(), dropped, "{missing:?}");
+    assert!(missing.iter().all(|line| line.contains("on 'vcan0' socket")), "{missing:?}");
+    // And so does the recording, word for word.
+    let recorded = Recorded::read(&place.path("run.mcap"));
+    let notes: Vec<_> = recorded.on("/can/notes").map(|note| &note.value).collect();
+    assert_eq!(notes.iter().map(|note| note["text"].as_str().unwrap()).collect::<Vec<_>>(), missing);
+    assert_eq!(notes.iter().map(|note| note["frames"].as_u64().unwrap()).sum::<u64>(), dropped);
+    assert_eq!(recorded.lines("/can/vcan0"), lines);
     let (ours, theirs) = (counts(&ours), counts(&theirs));
     assert!(ours.iter().all(|(id, count)| theirs[id] >= *count), "{ours:?} {theirs:?}");
     let foreign = FOREIGN as usize - ours[&(0x0123_4567 | EXTENDED)];
