@@ -11,6 +11,7 @@
 //! dots between bytes, a raw DLC (`_9` to `_F`). Lines that do not begin with a parenthesis are other
 //! text, as can-utils has it; CAN XL frames (5 digits, `###`) are named but not read.
 
+mod portable;
 mod read;
 mod write;
 
@@ -93,6 +94,11 @@ pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
 /// When it begins with a parenthesis and is no frame.
 #[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
+    portable::record(line).map_or_else(|| parse_widely(line), |record| Ok(Line::Frame(record)))
+}
+
+/// Reads all that can be read.
+fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
     let text = trim_end(line);
     if !text.starts_with(b"(") {
         return Ok(other(text));

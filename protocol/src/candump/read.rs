@@ -19,7 +19,8 @@ const NONE: u8 = 0xFF;
 
 /// The value of a digit; [`NONE`] and more when it is none.
 #[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
-const fn value(digit: u8) -> u8 {
+#[inline]
+pub(super) const fn value(digit: u8) -> u8 {
     NIBBLES[digit as usize]
 }
 
@@ -28,7 +29,8 @@ fn nibble(digit: u8) -> Option<u8> {
 }
 
 /// Four bytes of eight digits; `None` when one is none.
-fn four_bytes(digits: &[u8; 8]) -> Option<[u8; 4]> {
+#[inline]
+pub(super) fn four_bytes(digits: &[u8; 8]) -> Option<[u8; 4]> {
     let &[a, b, c, d, e, f, g, h] = digits;
     let (a, b, c, d) = (value(a), value(b), value(c), value(d));
     let (e, f, g, h) = (value(e), value(f), value(g), value(h));
@@ -37,7 +39,8 @@ fn four_bytes(digits: &[u8; 8]) -> Option<[u8; 4]> {
 }
 
 /// The number at the beginning of eight bytes, and of how many digits it is.
-fn eight_digits(text: [u8; 8]) -> (u64, usize) {
+#[inline]
+pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     const ZEROS: u64 = 0x3030_3030_3030_3030;
     let text = u64::from_le_bytes(text);
     let digits = text ^ ZEROS;

@@ -47,26 +47,34 @@ impl LogReader {
     }
 
     /// The next entry: one for each line. Never panics.
+    #[inline]
     pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
         self.lines += 1;
         let text = self.buffer.get(line).unwrap_or_default();
-        let kind = match read(text, long) {
-            Ok(Line::Frame(record)) => {
-                self.nanos = record.time.nanos;
-                return Ok(Some(Entry::Frame(record)));
-            }
-            Ok(Line::Other) => NoteKind::Text,
-            Ok(Line::Dropped { frames }) => NoteKind::Dropped(frames),
-            Ok(Line::CanXl) => NoteKind::CanXl,
-            Err(why) => NoteKind::Unreadable(why),
-        };
-        let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted(text) } else { "" };
-        Ok(Some(Entry::Note(Note { kind, nanos: self.nanos, interface, line: self.lines, text })))
+        if !long && let Ok(Line::Frame(record)) = candump::parse_bytes(text) {
+            self.nanos = record.time.nanos;
+            return Ok(Some(Entry::Frame(record)));
+        }
+        Ok(Some(Entry::Note(note(text, long, self.nanos, self.lines))))
     }
 
     /// Where the next line stands in the buffer, without its end, and whether it was longer than is read.
+    #[inline]
     fn next_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
+        let Range { start, end } = self.rest;
+        let fresh = self.buffer.get(start..end).unwrap_or_default();
+        match memchr::memchr(b'\n', fresh) {
+            Some(at) if at < LONGEST => {
+                self.rest.start = start + at + 1;
+                Ok(Some((start..self.before_return(start..start + at), false)))
+            }
+            _ => self.line_beyond(),
+        }
+    }
+
+    /// The same for a line that is not whole in the buffer, or too long.
+    fn line_beyond(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let mut seen = 0;
         loop {
             let Range { start, end } = self.rest;
@@ -142,12 +150,19 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
     }
 }
 
-/// What a line is. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
-fn read(text: &[u8], long: bool) -> Result<Line<'_>, String> {
-    if long {
-        return Err(format!("a line of more than {LONGEST} bytes, whose rest is left out"));
-    }
-    candump::parse_bytes(text).map_err(|error| error.to_string())
+/// A line that is no frame. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
+#[cold]
+fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
+    let why = format!("a line of more than {LONGEST} bytes, whose rest is left out");
+    let kind = match candump::parse_bytes(text) {
+        _ if long => NoteKind::Unreadable(why),
+        Ok(Line::Frame(_) | Line::Other) => NoteKind::Text,
+        Ok(Line::Dropped { frames }) => NoteKind::Dropped(frames),
+        Ok(Line::CanXl) => NoteKind::CanXl,
+        Err(error) => NoteKind::Unreadable(error.to_string()),
+    };
+    let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted(text) } else { "" };
+    Note { kind, nanos, interface, line, text }
 }
 
 /// The bus that candump's word about lost frames is about: `... frames on 'vcan0' socket ...`.

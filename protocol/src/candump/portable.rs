@@ -1,0 +1,140 @@
+//! The short way through a line that is written as nearly all of them are: the subset that every tool reads.
+//!
+//! It knows nothing that the long way does not know, and leaves to it whatever is not exactly like this:
+//!
+//! ```text
+//!   (1700000000.123456) vcan0 22C##5AABBCC
+//!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
+//! ```
+
+use super::read::{eight_digits, four_bytes, value};
+use super::{Record, Timestamp};
+use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
+
+/// Bytes of a time of ten and six digits, with what stands around it.
+const TIME: usize = 20;
+
+/// Reads a line without its end; `None` when it is to be read the long way.
+#[inline]
+pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
+    let (time, rest) = line.split_first_chunk::<TIME>()?;
+    let nanos = nanos(time)?;
+    let space = rest.iter().position(|&byte| byte == b' ')?;
+    let (name, frame) = rest.split_at_checked(space)?;
+    let interface = core::str::from_utf8(name).ok().filter(|name| !name.is_empty())?;
+    let frame = match frame {
+        [_, a, b, c, b'#', rest @ ..] => {
+            let [a, b, c] = [value(*a), value(*b), value(*c)];
+            let id = u32::from(a) << 8 | u32::from(b) << 4 | u32::from(c);
+            // Of a digit that is none more than three digits would be left.
+            if a | b | c > 0xF || id > STANDARD_MASK {
+                return None;
+            }
+            data(id, rest)?
+        }
+        [_, a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
+            let id = u32::from_be_bytes(four_bytes(&[*a, *b, *c, *d, *e, *f, *g, *h])?);
+            if id > EXTENDED_MASK {
+                return None;
+            }
+            data(id | EXTENDED, rest)?
+        }
+        _ => return None,
+    };
+    let time = Timestamp { nanos, nine_digits: false };
+    Some(Record { time, interface, frame, direction: None })
+}
+
+fn nanos(time: &[u8; TIME]) -> Option<u64> {
+    let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', rest @ ..] = time else { return None };
+    let (high, eight) = eight_digits([a, b, c, d, e, f, g, h]);
+    let (i, j) = (i.wrapping_sub(b'0'), j.wrapping_sub(b'0'));
+    let (micros, six) = eight_digits(rest);
+    if eight != 8 || i > 9 || j > 9 || six != 6 || !rest.ends_with(b") ") {
+        return None;
+    }
+    let seconds = high * 100 + u64::from(i) * 10 + u64::from(j);
+    Some(seconds * 1_000_000_000 + micros * 1_000)
+}
+
+/// A frame's data from behind its first `#` to the end of the line.
+#[inline]
+fn data(id: u32, text: &[u8]) -> Option<Frame> {
+    let (format, flags, digits) = match text {
+        [b'#', flags, digits @ ..] => (Format::Fd, value(*flags), digits),
+        digits => (Format::Classic, 0, digits),
+    };
+    let len = digits.len() / 2;
+    if flags > 0xF || digits.len() % 2 != 0 || len > 64 {
+        return None;
+    }
+    let mut data = [0; 64];
+    let (fours, rest) = digits.as_chunks();
+    // Not a zip, which is slower here.
+    let mut places = data.as_chunks_mut().0.iter_mut();
+    for four in fours {
+        *places.next()? = four_bytes(four)?;
+    }
+    if let [_, _, ..] = rest {
+        let mut last = *b"00000000";
+        last.get_mut(..rest.len())?.copy_from_slice(rest);
+        *places.next()? = four_bytes(&last)?;
+    }
+    Frame::filled(id, format, flags, data, len).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Line, parse_widely};
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn what_is_nearly_always_written_goes_the_short_way() {
+        for line in [
+            "(1700000000.123456) vcan0 123#",
+            "(1700000000.123456) vcan0 7FF#1122334455667788",
+            "(0000000000.000000) c 1FFFFFFF#01",
+            "(1700000000.123456) vcan0 22C##5AABBCC",
+            "(1700000000.123456) vcan0 1F334455##F",
+        ] {
+            let record = record(line.as_bytes()).expect(line);
+            assert_eq!(parse_widely(line.as_bytes()), Ok(Line::Frame(record)), "{line}");
+        }
+    }
+
+    #[test]
+    fn every_change_of_one_byte_is_read_as_the_long_way_reads_it() {
+        let full = format!("(1700000000.123456) vcan0 22C##5{}", "A5".repeat(64));
+        for line in
+            ["(1700000000.123456) vcan0 123#1122334455", "(1700000000.123456) can0 1F334455#01", &full]
+        {
+            for at in 0..line.len() {
+                for byte in 0..=u8::MAX {
+                    let mut line = line.as_bytes().to_vec();
+                    line[at] = byte;
+                    agrees(&line);
+                }
+            }
+            for end in 0..line.len() {
+                agrees(&line.as_bytes()[..end]);
+            }
+            agrees(format!("{line}00").as_bytes());
+        }
+    }
+
+    fn agrees(line: &[u8]) {
+        if let Some(record) = record(line) {
+            assert_eq!(parse_widely(line), Ok(Line::Frame(record)), "{:?}", String::from_utf8_lossy(line));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_it_reads_the_long_way_reads_too(
+            line in "\\([0-9]{10}\\.[0-9]{6}\\) [a-z ]{0,5}[0-9]? ([0-9A-Fa-f]{3}|[0-9A-F]{8})##?[0-9A-Fa-f]{0,20}[ TR_.]{0,2}"
+        ) {
+            agrees(line.as_bytes());
+        }
+    }
+}
