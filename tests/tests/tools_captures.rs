@@ -235,6 +235,59 @@ fn cantools_decodes_our_log_by_our_dbc() {
     assert!(unknown.is_empty(), "{unknown:?}");
 }
 
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn what_each_tool_reads_beyond_that_is_as_docs_captures_says() {
+    let place = Place::new();
+    let script = format!("{}/tools/captures.py can-read odd.log", env!("CARGO_MANIFEST_DIR"));
+    let tools = [
+        (PathBuf::from("log2asc"), "-I odd.log vcan0".to_owned(), [" Rx ", " Tx "], "0.000003"),
+        (of_python("python"), script, ["1700000000000001 ", "1700000000000004 "], "1700000000000004"),
+        (
+            PathBuf::from("tshark"),
+            "-r odd.log -T fields -e frame.time_epoch".to_owned(),
+            ["1700000000.", "-"],
+            ".000004",
+        ),
+    ];
+    // Two frames of the portable subset's first line, and one thing more; whether each tool reads both at their times.
+    let odd = [
+        (
+            "directions",
+            "(1700000000.000001) vcan0 123#11 R\n(1700000000.000004) vcan0 123#11 T\n",
+            [true, true, false],
+        ),
+        (
+            "notes",
+            "(1700000000.000001) vcan0 123#11\n# a\n(1700000000.000004) vcan0 123#11\n",
+            [true, false, false],
+        ),
+        (
+            "nine digits",
+            "(1700000000.000001000) vcan0 123#11\n(1700000000.000004000) vcan0 123#11\n",
+            [false, true, false],
+        ),
+        (
+            "odd lengths",
+            "(1700000000.000001) vcan0 123##411\n(1700000000.000004) vcan0 123##40102030405060708090A0B\n",
+            [true, true, false],
+        ),
+    ];
+    for (what, log, expected) in odd {
+        fs::write(place.path("odd.log"), log).unwrap();
+        for ((tool, arguments, marks, last), expected) in tools.iter().zip(expected) {
+            let mut command = Command::new(tool);
+            command.args(arguments.split(' ')).current_dir(place.0.path());
+            let output = command.output().unwrap_or_else(|error| panic!("{}: {error}", tool.display()));
+            let text = String::from_utf8_lossy(&output.stdout);
+            let frames: Vec<_> =
+                text.lines().filter(|line| marks.iter().any(|mark| line.contains(mark))).collect();
+            let both = output.status.success() && frames.len() == 2 && frames[1].contains(last);
+            assert_eq!(both, expected, "{}, {what}: {text}", tool.display());
+        }
+    }
+}
+
 /// Everything in a recording as the script prints it, with the digits its channels say.
 fn of_ros(path: &Path) -> Vec<String> {
     let stamp = |nanos: u64| format!("{nanos} {}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000);
