@@ -34,7 +34,7 @@ fn write_line(log: &mut String, line: u64) {
     let micros = 1_700_000_000_000_000 + line * 63;
     let (sec, micro, id) = (micros / 1_000_000, micros % 1_000_000, 0x200 + line % 253);
     let word = line.wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    if line % 2 == 0 {
+    if line.is_multiple_of(2) {
         writeln!(log, "({sec}.{micro:06}) vcan0 {id:03X}#{word:016X}").unwrap();
     } else {
         let other = word ^ line;
