@@ -109,6 +109,7 @@ impl Frame {
     }
 
     /// The same with the data in its place already; what is behind `len` has to be 0.
+    #[inline]
     pub(crate) fn filled(
         id: u32,
         format: Format,

@@ -33,7 +33,7 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
             data(id, rest)?
         }
         [_, a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
-            let id = u32::from_be_bytes(four_bytes(&[*a, *b, *c, *d, *e, *f, *g, *h])?);
+            let id = u32::from_be_bytes(four_bytes([*a, *b, *c, *d, *e, *f, *g, *h])?);
             if id > EXTENDED_MASK {
                 return None;
             }
@@ -46,11 +46,13 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
 }
 
 fn nanos(time: &[u8; TIME]) -> Option<u64> {
-    let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', rest @ ..] = time else { return None };
+    let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', k, l, m, n, o, p, q @ b')', r @ b' '] = time else {
+        return None;
+    };
     let (high, eight) = eight_digits([a, b, c, d, e, f, g, h]);
     let (i, j) = (i.wrapping_sub(b'0'), j.wrapping_sub(b'0'));
-    let (micros, six) = eight_digits(rest);
-    if eight != 8 || i > 9 || j > 9 || six != 6 || !rest.ends_with(b") ") {
+    let (micros, six) = eight_digits([k, l, m, n, o, p, q, r]);
+    if eight != 8 || i > 9 || j > 9 || six != 6 {
         return None;
     }
     let seconds = high * 100 + u64::from(i) * 10 + u64::from(j);
@@ -73,12 +75,12 @@ fn data(id: u32, text: &[u8]) -> Option<Frame> {
     // Not a zip, which is slower here.
     let mut places = data.as_chunks_mut().0.iter_mut();
     for four in fours {
-        *places.next()? = four_bytes(four)?;
+        *places.next()? = four_bytes(*four)?;
     }
     if let [_, _, ..] = rest {
         let mut last = *b"00000000";
         last.get_mut(..rest.len())?.copy_from_slice(rest);
-        *places.next()? = four_bytes(&last)?;
+        *places.next()? = four_bytes(last)?;
     }
     Frame::filled(id, format, flags, data, len).ok()
 }

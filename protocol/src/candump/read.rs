@@ -28,14 +28,29 @@ fn nibble(digit: u8) -> Option<u8> {
     Some(value(digit)).filter(|&value| value < 16)
 }
 
-/// Four bytes of eight digits; `None` when one is none.
+/// Four bytes of eight hexadecimal digits; `None` when one is none.
 #[inline]
-pub(super) fn four_bytes(digits: &[u8; 8]) -> Option<[u8; 4]> {
-    let &[a, b, c, d, e, f, g, h] = digits;
-    let (a, b, c, d) = (value(a), value(b), value(c), value(d));
-    let (e, f, g, h) = (value(e), value(f), value(g), value(h));
-    let any = a | b | c | d | e | f | g | h;
-    if any > 15 { None } else { Some([a << 4 | b, c << 4 | d, e << 4 | f, g << 4 | h]) }
+pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
+    /// The same byte eight times.
+    const fn all(byte: u8) -> u64 {
+        u64::from_le_bytes([byte; 8])
+    }
+    let text = u64::from_le_bytes(digits);
+    let letters = text & all(0x40);
+    // '1' is 31, 'A' is 41 and 'a' is 61: a letter's value is 9 more than its lower half.
+    let values = (text & all(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
+    // The upper half of a digit is 3, of a letter 4, or 6, which is made 4.
+    let halves = (text & all(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(all(0x30));
+    // A value has 4 bits, and is 10 or more when it is a letter's.
+    let tens = (values.wrapping_add(all(6)) ^ (letters >> 2)) & all(0x10);
+    if halves | values & all(0xF0) | tens != 0 {
+        return None;
+    }
+    // Neighbours are put together: into a byte, into two, into four.
+    let bytes = (values << 4 | values >> 8) & 0x00FF_00FF_00FF_00FF;
+    let twos = (bytes | bytes >> 8) & 0x0000_FFFF_0000_FFFF;
+    let [a, b, c, d, ..] = (twos | twos >> 16).to_le_bytes();
+    Some([a, b, c, d])
 }
 
 /// The number at the beginning of eight bytes, and of how many digits it is.
@@ -197,7 +212,9 @@ impl<'a> Cursor<'a> {
         let mut len = 0;
         // Bytes without dots between them, as they nearly always are; four at once, then one by one.
         let rest = self.rest();
-        while let Some(four) = rest.get(2 * len..).and_then(<[u8]>::first_chunk).and_then(four_bytes) {
+        while let Some(four) =
+            rest.get(2 * len..).and_then(<[u8]>::first_chunk).and_then(|&digits| four_bytes(digits))
+        {
             let Some(place) = data.get_mut(len..).and_then(<[u8]>::first_chunk_mut) else { break };
             *place = four;
             len += 4;
@@ -259,6 +276,19 @@ mod tests {
     }
 
     #[test]
+    fn one_wrong_byte_among_eight_hexadecimal_digits_is_found() {
+        for at in 0..8 {
+            for byte in 0..=u8::MAX {
+                let mut text = *b"9aF05BeD";
+                text[at] = byte;
+                let value = str::from_utf8(&text).ok().filter(|_| byte.is_ascii_hexdigit());
+                let value = value.map(|text| u32::from_str_radix(text, 16).unwrap().to_be_bytes());
+                assert_eq!(four_bytes(text), value, "{text:?}");
+            }
+        }
+    }
+
+    #[test]
     fn a_number_ends_before_the_first_byte_that_is_no_digit() {
         for at in 0..8 {
             for byte in 0..=u8::MAX {
@@ -272,6 +302,18 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn eight_digits_are_four_bytes(value: u32, upper: bool) {
+            let text = if upper { format!("{value:08X}") } else { format!("{value:08x}") };
+            prop_assert_eq!(four_bytes(*text.as_bytes().first_chunk().unwrap()), Some(value.to_be_bytes()));
+        }
+
+        #[test]
+        fn eight_bytes_are_digits_or_none(text: [u8; 8]) {
+            let digits = text.iter().all(u8::is_ascii_hexdigit);
+            prop_assert_eq!(four_bytes(text).is_some(), digits);
+        }
+
         #[test]
         fn any_bytes_are_the_number_they_begin_with(text: [u8; 8], digits in 0..=8_usize) {
             let mut text = text;
