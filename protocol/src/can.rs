@@ -45,7 +45,9 @@ pub enum Format {
 }
 
 /// A CAN frame: data, remote or error; classic or FD.
+// In this order and at multiples of 8, or else copies of it wait for the bytes that have just been written.
 #[derive(Clone, Copy, Eq, Hash, PartialEq)]
+#[repr(C, align(8))]
 pub struct Frame {
     id: u32,
     format: Format,
@@ -109,7 +111,7 @@ impl Frame {
     }
 
     /// The same with the data in its place already; what is behind `len` has to be 0.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn filled(
         id: u32,
         format: Format,

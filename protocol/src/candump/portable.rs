@@ -15,7 +15,7 @@ use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 const TIME: usize = 20;
 
 /// Reads a line without its end; `None` when it is to be read the long way.
-#[inline]
+#[inline(always)]
 pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
     let (time, rest) = line.split_first_chunk::<TIME>()?;
     let nanos = nanos(time)?;
@@ -45,6 +45,7 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
     Some(Record { time, interface, frame, direction: None })
 }
 
+#[inline(always)]
 fn nanos(time: &[u8; TIME]) -> Option<u64> {
     let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', k, l, m, n, o, p, q @ b')', r @ b' '] = time else {
         return None;
@@ -60,7 +61,7 @@ fn nanos(time: &[u8; TIME]) -> Option<u64> {
 }
 
 /// A frame's data from behind its first `#` to the end of the line.
-#[inline]
+#[inline(always)]
 fn data(id: u32, text: &[u8]) -> Option<Frame> {
     let (format, flags, digits) = match text {
         [b'#', flags, digits @ ..] => (Format::Fd, value(*flags), digits),
