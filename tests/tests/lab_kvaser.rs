@@ -397,9 +397,9 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
         tool(&format!("ip link set {name} down"));
         if name == "can0" {
             bench.hears("can0 is down: bring it up with `ip link set can0 up`");
-        } else {
-            std::thread::sleep(Duration::from_millis(200));
         }
+        // For some broadcasts.
+        std::thread::sleep(Duration::from_millis(200));
         tool(&format!("ip link set {name} up"));
     }
     torques_come("can0");
