@@ -301,13 +301,19 @@ fn lines_of_a_live_capture_are_handed_on_as_they_come() {
         .spawn()
         .unwrap();
     let mut input = child.stdin.take().unwrap();
-    let mut output = std::io::BufReader::new(child.stdout.take().unwrap());
+    let output = std::io::BufReader::new(child.stdout.take().unwrap());
+    let (send, lines) = std::sync::mpsc::channel();
+    let reading = std::thread::spawn(move || {
+        for line in std::io::BufRead::lines(output) {
+            send.send(line.unwrap()).unwrap();
+        }
+    });
     for line in LOG.lines() {
         writeln!(input, "{line}").unwrap();
-        let mut back = String::new();
-        std::io::BufRead::read_line(&mut output, &mut back).unwrap();
-        assert_eq!(back.trim_end(), line);
+        let back = lines.recv_timeout(Duration::from_secs(60));
+        assert_eq!(back.as_deref(), Ok(line), "while the input goes on");
     }
     drop(input);
     assert_eq!(child.wait().unwrap().code(), Some(0));
+    reading.join().unwrap();
 }
