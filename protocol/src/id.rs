@@ -162,6 +162,15 @@ impl Kind {
         }
     }
 
+    /// Whether cells send it; the others the gateway's side sends.
+    #[must_use]
+    pub const fn is_from_cells(self) -> bool {
+        match self {
+            Self::Sum | Self::Torque | Self::Sensors | Self::Network | Self::Configured => true,
+            Self::Command | Self::Configure | Self::Stimulus => false,
+        }
+    }
+
     const fn from_bits(bits: u16) -> Self {
         match bits & 7 {
             0 => Self::Command,
@@ -255,6 +264,24 @@ impl Id {
     pub const fn from_bits(bits: u16) -> Self {
         let [node, _] = bits.to_le_bytes();
         Self { kind: Kind::from_bits(bits >> 8), node }
+    }
+
+    /// The cell that sends frames of this identifier; `None` when the gateway's side does.
+    #[must_use]
+    pub const fn sender(self) -> Option<CellId> {
+        match Node::from_byte(self.node) {
+            Node::Cell(cell) if self.kind.is_from_cells() => Some(cell),
+            Node::Cell(_) | Node::Gateway | Node::Everyone => None,
+        }
+    }
+
+    /// The name of what it bears: a command's own, else the kind's.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match (self.kind, Command::from_byte(self.node)) {
+            (Kind::Command, Some(command)) => command.name(),
+            (kind, _) => kind.name(),
+        }
     }
 }
 

@@ -412,9 +412,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     // What bears a cell's name and is not its own is in its account.
     let of_cells = |frame: &&Frame| {
         data_id(frame).is_ok_and(|Id { kind, node }| {
-            let from_cells =
-                matches!(kind, Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured);
-            from_cells && (1..=CELLS).contains(&node) && reason(frame).is_some()
+            kind.is_from_cells() && (1..=CELLS).contains(&node) && reason(frame).is_some()
         })
     };
     let forged = frames.iter().filter(of_cells).count() as u64;

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use protocol::can::Format;
 use protocol::candump::{Direction, Record};
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
-use protocol::id::{Command, Id, Kind};
+use protocol::id::{Id, Kind};
 use protocol::message::{
     Answer, From, Heard, Heartbeat, Message, NetworkPage, Refused, Request, SensorPage, State,
 };
@@ -263,8 +263,7 @@ fn word(word: u16) -> String {
 impl Line<'_> {
     /// Who speaks, and of what.
     fn about(&mut self, id: Id) {
-        let command = Command::from_byte(id.node).filter(|_| id.kind == Kind::Command);
-        self.kind = Some(command.map_or_else(|| id.kind.name(), Command::name));
+        self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
     }
 

@@ -9,7 +9,7 @@
 
 use protocol::candump::Record;
 use protocol::fixed::Q;
-use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::id::CellId;
 use protocol::message::{Heartbeat, Message, NetworkPage, State};
 use protocol::packet::{Epoch, PacketError};
 use serde::Serialize;
@@ -349,33 +349,16 @@ impl Lane {
     }
 
     fn message(&mut self, nanos: u64, message: &Message) {
-        let Id { kind, node } = message.encode().id;
-        let name = match Command::from_byte(node) {
-            Some(command) if kind == Kind::Command => command.name(),
-            Some(_) | None => kind.name(),
-        };
-        if let Some(count) = NAMES.iter().position(|it| *it == name).and_then(|at| self.kinds.get_mut(at)) {
+        let id = message.encode().id;
+        if let Some(count) =
+            NAMES.iter().position(|it| *it == id.name()).and_then(|at| self.kinds.get_mut(at))
+        {
             count.take(nanos);
         }
         if let Message::Joints { epoch, .. } = message {
             self.take_joints(*epoch);
         }
-        let from = match message {
-            Message::Sum { from, .. }
-            | Message::Torque { from, .. }
-            | Message::Sensors { from, .. }
-            | Message::Configured { from, .. }
-            | Message::Network { from: Node::Cell(from), .. } => *from,
-            Message::Network { from: Node::Gateway | Node::Everyone, .. }
-            | Message::Halt
-            | Message::Joints { .. }
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Configure { .. }
-            | Message::Stimulus { .. } => return,
-        };
-        if let Some(cell) = self.cells.get_mut(from.index()) {
+        if let Some(cell) = id.sender().and_then(|from| self.cells.get_mut(from.index())) {
             cell.get_or_insert_default().take(nanos, message, self.joints);
         }
     }
@@ -513,6 +496,7 @@ mod tests {
     use protocol::can::{Format, Frame};
     use protocol::candump::Timestamp;
     use protocol::fixed::Q3_12;
+    use protocol::id::Node;
     use protocol::message;
     use protocol::time::Micros;
 

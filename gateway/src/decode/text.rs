@@ -36,10 +36,13 @@ struct Subject(Id);
 impl Display for Subject {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Id { kind, node } = self.0;
-        match Command::from_byte(node) {
-            Some(command) if kind == Kind::Command => f.write_str(command.name()),
-            _ if kind == Kind::Command => write!(f, "{} {node}", kind.name()),
-            _ => write!(f, "{} {}", kind.name(), Node::from_byte(node)),
+        f.write_str(self.0.name())?;
+        if kind != Kind::Command {
+            write!(f, " {}", Node::from_byte(node))
+        } else if Command::from_byte(node).is_none() {
+            write!(f, " {node}")
+        } else {
+            Ok(())
         }
     }
 }

@@ -9,13 +9,14 @@ use std::collections::BTreeMap;
 
 use protocol::can::Frame;
 use protocol::candump::Record;
+use protocol::id::Id;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, data_id};
 use protocol::time::Micros;
 
 use super::judge::Judge;
 use super::order::{Order, Ordered};
-use super::survey::{Survey, is_input, is_joints, sender};
+use super::survey::{Survey, is_input, is_joints};
 use crate::decode::pick::Pick;
 use crate::decode::{Decoded, Decoder};
 
@@ -259,7 +260,7 @@ impl<'a> Reel<'a> {
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),
             Only::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
-            Only::Replies if id.and_then(sender).is_none() => Some(reason::NO_REPLY),
+            Only::Replies if id.and_then(Id::sender).is_none() => Some(reason::NO_REPLY),
             Only::All | Only::Inputs | Only::Replies => None,
         }
     }

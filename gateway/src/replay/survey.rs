@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use protocol::can::Format;
 use protocol::candump::Record;
-use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::id::{CellId, Command, Id, Node};
 use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
 use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
@@ -122,7 +122,7 @@ impl Survey {
         bus.frames += 1;
         bus.has_fd |= record.frame.format() == Format::Fd;
         if let Ok(id) = data_id(&record.frame)
-            && let Some(cell) = sender(id)
+            && let Some(cell) = id.sender()
         {
             bus.heard(cell, nanos);
         }
@@ -174,15 +174,6 @@ impl Survey {
             self.buses.len() - 1
         });
         self.buses.get_mut(at).expect("found, or just made")
-    }
-}
-
-/// The cell that an identifier names as the sender.
-pub(super) fn sender(id: Id) -> Option<CellId> {
-    let Node::Cell(cell) = Node::from_byte(id.node) else { return None };
-    match id.kind {
-        Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => Some(cell),
-        Kind::Command | Kind::Configure | Kind::Stimulus => None,
     }
 }
 
@@ -252,7 +243,7 @@ impl Bus {
             | Message::Stimulus { .. } => {}
         }
         // After a heartbeat has been read: what it says was sent is what was sent before it.
-        if let Some(cell) = sender(message.encode().id).and_then(|cell| self.cells.get_mut(&cell)) {
+        if let Some(cell) = message.encode().id.sender().and_then(|cell| self.cells.get_mut(&cell)) {
             cell.count();
         }
     }
@@ -346,10 +337,7 @@ impl Cell {
 /// Whether a frame is of the gateway's side: a command, configuration, a stimulus.
 #[must_use]
 pub const fn is_input(id: Id) -> bool {
-    match id.kind {
-        Kind::Command | Kind::Configure | Kind::Stimulus => true,
-        Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => false,
-    }
+    !id.kind.is_from_cells()
 }
 
 /// Whether a frame is of a broadcast of joints, or of half of one.

@@ -20,7 +20,7 @@ use std::collections::VecDeque;
 use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q1_14};
-use protocol::id::{CellId, Id, Kind, Node};
+use protocol::id::{CellId, Id, Node};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
 use protocol::skin::{Safety, Skin};
@@ -274,13 +274,7 @@ impl Table {
 
     /// The cell that frames of this identifier come from.
     fn sender(&mut self, id: Id) -> Option<&mut Cell> {
-        match (id.kind, Node::from_byte(id.node)) {
-            (
-                Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured,
-                Node::Cell(cell),
-            ) => self.cell_mut(cell),
-            _ => None,
-        }
+        self.cell_mut(id.sender()?)
     }
 
     fn cell_mut(&mut self, cell: CellId) -> Option<&mut Cell> {

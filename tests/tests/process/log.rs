@@ -78,11 +78,7 @@ impl Log {
     pub(crate) fn heartbeats_count_what_came(&self) {
         let mut sent = BTreeMap::<u8, u16>::new();
         for (message, packet) in &self.messages {
-            let from_cell = matches!(
-                packet.id.kind,
-                Kind::Torque | Kind::Sum | Kind::Sensors | Kind::Network | Kind::Configured
-            );
-            if !from_cell {
+            if !packet.id.kind.is_from_cells() {
                 continue;
             }
             let sent = sent.entry(packet.id.node).or_default();
