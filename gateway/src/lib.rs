@@ -15,6 +15,7 @@ pub mod robot;
 pub mod ros2;
 pub mod run;
 pub mod scenario;
+mod stimuli;
 pub mod summary;
 pub mod table;
 #[cfg(test)]

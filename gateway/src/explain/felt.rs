@@ -1,13 +1,10 @@
 //! What one cell felt at each joints, by the protocol's rules, and how that is known.
 
-use std::collections::VecDeque;
-
 use protocol::message::{From, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use serde::Serialize;
 
-/// Stimuli that a cell lets wait.
-const PENDING: usize = 8;
+use crate::stimuli::{Waiting, is_late};
 
 /// How it is known what a cell felt.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -42,7 +39,7 @@ pub enum Origin {
 /// One cell's sensors in test mode.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Felt {
-    waiting: VecDeque<(From, SensorPage, Origin)>,
+    waiting: Waiting<(SensorPage, Origin)>,
     now: Option<(SkinSensors, Origin)>,
 }
 
@@ -54,25 +51,16 @@ impl Felt {
 
     /// A stimulus was sent; `last` is the epoch of the last joints.
     pub(super) fn push(&mut self, at_ns: u64, from: From, page: SensorPage, last: Option<Epoch>) {
-        if self.waiting.len() == PENDING {
-            return;
-        }
-        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
         let from_epoch = if let From::Epoch(epoch) = from { Some(epoch.0) } else { None };
-        let origin = Origin::Stimulus { at_ns, from_epoch, late };
-        self.waiting.push_back((if late { From::Next } else { from }, page, origin));
+        let origin = Origin::Stimulus { at_ns, from_epoch, late: is_late(from, last) };
+        self.waiting.push(from, (page, origin), last);
     }
 
     /// Joints were taken.
     pub(super) fn latch(&mut self, epoch: Epoch) {
-        for _ in 0..self.waiting.len() {
-            let Some((from, page, origin)) = self.waiting.pop_front() else { break };
-            match (from, page) {
-                (From::Epoch(first), _) if epoch.since(first) < 0 => {
-                    self.waiting.push_back((from, page, origin))
-                }
-                (From::Epoch(_) | From::Next, SensorPage::Skin(skin)) => self.now = Some((skin, origin)),
-                (From::Epoch(_) | From::Next, SensorPage::Acceleration(_)) => {}
+        for (page, origin) in self.waiting.latch(epoch) {
+            if let SensorPage::Skin(skin) = page {
+                self.now = Some((skin, origin));
             }
         }
     }
@@ -97,6 +85,7 @@ impl Felt {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stimuli::PENDING;
     use protocol::fixed::{Q3_12, Q5_10};
 
     fn press(newtons: f64) -> SensorPage {

@@ -10,8 +10,10 @@ use protocol::id::Kind;
 use protocol::packet::{self, BYTES, Half, Paired};
 use protocol::time::Micros;
 
+use crate::stimuli::PENDING;
+
 /// As many stimuli as a cell lets wait, and the one that it feels.
-const STIMULI: usize = 9;
+const STIMULI: usize = PENDING + 1;
 
 /// A frame that somebody saw.
 #[derive(Clone, Copy, Debug, PartialEq)]

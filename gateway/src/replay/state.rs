@@ -10,8 +10,6 @@
 //! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
 //! were said.
 
-use std::collections::VecDeque;
-
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
@@ -20,8 +18,8 @@ use protocol::message::{
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 
-/// Stimuli that a cell lets wait.
-const PENDING: usize = 8;
+use crate::stimuli::Waiting;
+
 /// Messages since the last joints that are kept as they were said.
 const SINCE: usize = 16_384;
 
@@ -31,28 +29,22 @@ struct Feeling {
     /// In force, once something has been said of it.
     skin: Option<SkinSensors>,
     acceleration: Option<[Q3_12; 3]>,
-    pending: VecDeque<(From, SensorPage)>,
+    pending: Waiting<SensorPage>,
     /// It was told to measure: then it refuses stimuli.
     measures: bool,
 }
 
 impl Feeling {
     fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
-        if self.measures || self.pending.len() == PENDING {
-            return;
+        if !self.measures {
+            self.pending.push(from, page, last);
         }
-        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
-        self.pending.push_back((if late { From::Next } else { from }, page));
     }
 
     fn latch(&mut self, epoch: Epoch) {
-        for _ in 0..self.pending.len() {
-            let Some((from, page)) = self.pending.pop_front() else { break };
-            match from {
-                From::Epoch(first) if epoch.since(first) < 0 => self.pending.push_back((from, page)),
-                From::Epoch(_) | From::Next => self.feel(page),
-            }
-        }
+        let mut pending = std::mem::take(&mut self.pending);
+        pending.latch(epoch).for_each(|page| self.feel(page));
+        self.pending = pending;
     }
 
     const fn feel(&mut self, page: SensorPage) {

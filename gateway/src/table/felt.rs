@@ -1,29 +1,21 @@
-//! What a cell feels, as far as the bus tells: the gateway's own view of the rule by which cells latch
-//! stimuli. It is written apart from the cells' code, so that each is a witness of the other.
-
-use std::collections::VecDeque;
+//! What a cell feels, as far as the bus tells.
 
 use protocol::message::{From, SkinSensors};
 use protocol::packet::Epoch;
 
-/// As many stimuli as a cell lets wait.
-const PENDING: usize = 8;
+use crate::stimuli::Waiting;
 
 /// What one cell feels.
 #[derive(Debug, Default)]
 pub(super) struct Felt {
-    waiting: VecDeque<(From, SkinSensors)>,
+    waiting: Waiting<SkinSensors>,
     now: Option<SkinSensors>,
 }
 
 impl Felt {
     /// A stimulus was sent; `last` is the epoch of the last joints.
     pub(super) fn push(&mut self, from: From, skin: SkinSensors, last: Option<Epoch>) {
-        if self.waiting.len() == PENDING {
-            return;
-        }
-        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
-        self.waiting.push_back((if late { From::Next } else { from }, skin));
+        self.waiting.push(from, skin, last);
     }
 
     /// The cell said what it feels. That is news only while nobody knows: its word may be older than the
@@ -45,15 +37,7 @@ impl Felt {
 
     /// What the cell feels from the joints of this epoch on; `None` while nobody knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
-        let due = |from: &From| match from {
-            From::Next => true,
-            From::Epoch(first) => epoch.since(*first) >= 0,
-        };
-        let newest = self.waiting.iter().rev().find(|(from, _)| due(from));
-        if let Some((_, skin)) = newest {
-            self.now = Some(*skin);
-            self.waiting.retain(|(from, _)| !due(from));
-        }
+        self.now = self.waiting.latch(epoch).last().or(self.now);
         self.now
     }
 }
