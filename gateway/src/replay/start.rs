@@ -25,12 +25,8 @@ use super::survey::{Known, Survey};
 use super::{Options, Spawn};
 use crate::capture::Extras;
 use crate::run::RunError;
-use crate::run::launch::{Plan, Processes, ServedBus, program};
+use crate::run::launch::{LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
 
-/// Two gateways on one bus notice each other in this time.
-const LISTEN: Duration = Duration::from_millis(500);
-/// Cells that were started and make no progress for so long are given up.
-const STARTING: Duration = Duration::from_secs(15);
 /// Cells that were there before say something within this time, by heartbeats alone.
 const SHOWING: Duration = Duration::from_secs(1);
 /// How often it is looked.
@@ -178,16 +174,12 @@ pub(super) fn open(
             send_patience: options.patience,
             ..BusOptions::default()
         };
-        let before = served.len();
-        let bus = match Bus::open(name, options.kind, &wanted) {
-            Err(BusError::NotServed { .. }) if wearing.is_some() => {
-                let program = program("vcan-setup", options.vcan_setup.as_deref())?;
-                served.push(ServedBus::start(&program, name)?);
-                Bus::open(name, options.kind, &wanted)?
-            }
-            opened => opened?,
+        let (bus, of_ours) = match wearing {
+            Some(_) => open_or_serve(name, options.kind, &wanted, options.vcan_setup.as_deref())?,
+            None => (Bus::open(name, options.kind, &wanted)?, None),
         };
-        own.push(served.len() > before);
+        own.push(of_ours.is_some());
+        served.extend(of_ours);
         lanes.push(Lane { bus: Arc::new(bus), format: format.unwrap_or(Format::Fd) });
     }
     Ok(Buses { lanes: Arc::new(lanes), own, processes: Processes::default(), _served: served })

@@ -9,13 +9,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::bus::Choice;
+use protocol::bus::{Bus, BusError, Choice, Options};
 use protocol::skin::Skin;
 use rustix::process::{Pid, Signal, kill_process};
 use thiserror::Error;
 
+use super::RunError;
 use crate::scenario::ProcessAction;
 
+/// Two gateways on one bus notice each other in this time.
+pub const LISTEN: Duration = Duration::from_millis(500);
+/// Cells that were started and make no progress for so long are given up.
+pub const STARTING: Duration = Duration::from_secs(15);
 /// How long processes may take to end when asked to.
 const PATIENCE: Duration = Duration::from_secs(2);
 
@@ -99,6 +104,25 @@ impl ServedBus {
     #[must_use]
     pub fn pid(&self) -> u32 {
         self.child.id()
+    }
+}
+
+/// Opens a bus; an embedded one that nobody serves is served, by `vcan_setup` if that is named.
+///
+/// # Errors
+/// When it does not open, or is not served.
+pub fn open_or_serve(
+    name: &str,
+    kind: Choice,
+    wanted: &Options,
+    vcan_setup: Option<&Path>,
+) -> Result<(Bus, Option<ServedBus>), RunError> {
+    match Bus::open(name, kind, wanted) {
+        Err(BusError::NotServed { .. }) => {
+            let served = ServedBus::start(&program("vcan-setup", vcan_setup)?, name)?;
+            Ok((Bus::open(name, kind, wanted)?, Some(served)))
+        }
+        opened => Ok((opened?, None)),
     }
 }
 

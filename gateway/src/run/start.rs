@@ -15,7 +15,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
-use super::launch::{Ended, Plan, Processes, ServedBus, program};
+use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
 use super::progress::say;
 use super::receiver::{CellView, Left, News, Receiver, View};
 use super::turn::{Line, Shared, Timed};
@@ -38,10 +38,6 @@ const SEND_PATIENCE: Duration = Duration::from_millis(10);
 const GATHER: Duration = Duration::from_millis(10);
 /// Said when a receive buffer is smaller than it should be.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
-/// Two gateways on one bus notice each other in this time.
-const LISTEN: Duration = Duration::from_millis(500);
-/// Cells that make no progress for so long are given up.
-const STARTING: Duration = Duration::from_secs(15);
 /// Cells that were there before are given so long to show up.
 const SHOWING: Duration = Duration::from_secs(2);
 /// Wake-ups of the idle machine that are measured, at the loop's period.
@@ -213,14 +209,9 @@ fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bu
         send_patience: SEND_PATIENCE,
         ..BusOptions::default()
     };
-    match Bus::open(name, options.kind, &wanted) {
-        Err(BusError::NotServed { .. }) => {
-            let program = program("vcan-setup", options.vcan_setup.as_deref())?;
-            served.push(ServedBus::start(&program, name)?);
-            Ok(Bus::open(name, options.kind, &wanted)?)
-        }
-        opened => Ok(opened?),
-    }
+    let (bus, own) = open_or_serve(name, options.kind, &wanted, options.vcan_setup.as_deref())?;
+    served.extend(own);
+    Ok(bus)
 }
 
 /// Starts the thread that records, if anything is to be recorded; where the loop's records go to it.
