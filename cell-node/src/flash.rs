@@ -1,12 +1,13 @@
-//! What a cell keeps when the power is off: its parameters, as bytes with a version and a CRC.
+//! What a cell keeps when the power is off: its number and its parameters, as bytes with a version and a CRC.
 //!
 //! ```text
-//!   byte 0..3  "SKIN"      4  version, 1      5  the cell's number
-//!        6..9  serial number, little endian
-//!       10..   the parameters' image (see `protocol::parameters`)
+//!   byte 0..3  "SKIN"      4  version, 2      5  the cell's number, 0 for none
+//!        6..9  serial number, little endian  10  1 when parameters follow, 0 when zeros do
+//!       11..   the parameters' image (see `protocol::parameters`)
 //!     last 2   CRC-16 over all bytes before it, little endian
 //! ```
 
+use protocol::id::CellId;
 use protocol::packet::crc16;
 use protocol::parameters::{IMAGE_BYTES, Parameters};
 use thiserror::Error;
@@ -14,11 +15,20 @@ use thiserror::Error;
 use crate::node::Identity;
 
 const MAGIC: &[u8; 4] = b"SKIN";
-const VERSION: u8 = 1;
-const HEAD_BYTES: usize = 10;
+const VERSION: u8 = 2;
+const HEAD_BYTES: usize = 11;
 
 /// Bytes of a flash image.
 pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
+
+/// What flash holds.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Kept {
+    /// The cell's number, if it has one.
+    pub number: Option<CellId>,
+    /// What it computes with, if it has been told.
+    pub parameters: Option<Parameters>,
+}
 
 /// Why an image is not used.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
@@ -42,7 +52,7 @@ pub enum FlashError {
     /// Another cell's.
     #[error("it belongs to cell {cell} with serial number {serial}")]
     OtherCell {
-        /// Its number.
+        /// Its number, 0 for none.
         cell: u8,
         /// Its serial number.
         serial: u32,
@@ -54,10 +64,12 @@ pub enum FlashError {
 
 /// The bytes to keep.
 #[must_use]
-pub fn encode(identity: Identity, parameters: &Parameters) -> [u8; BYTES] {
+pub fn encode(serial: u32, kept: &Kept) -> [u8; BYTES] {
     let mut bytes = [0; BYTES];
-    let serial = identity.serial.to_le_bytes();
-    let parts: [&[u8]; 4] = [MAGIC, &[VERSION, identity.cell.get()], &serial, &parameters.image()];
+    let number = kept.number.map_or(0, CellId::get);
+    let image = kept.parameters.map_or([0; IMAGE_BYTES], |parameters| parameters.image());
+    let serial = serial.to_le_bytes();
+    let parts: [&[u8]; 5] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()], &image];
     for (byte, &part) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
         *byte = part;
     }
@@ -70,8 +82,9 @@ pub fn encode(identity: Identity, parameters: &Parameters) -> [u8; BYTES] {
 /// What was kept. Never panics.
 ///
 /// # Errors
-/// When the bytes are not whole, sound, of this version, of this cell, or no parameters.
-pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Parameters, FlashError> {
+/// When the bytes are not whole, sound, of this version, of this cell (by its serial number, and by its number
+/// if it is given one), or no parameters.
+pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
     let size = FlashError::Size { got: bytes.len() };
     let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| size)?;
     let (body, crc) = bytes.split_last_chunk::<2>().ok_or(size)?;
@@ -79,15 +92,19 @@ pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Parameters, FlashError
         return Err(FlashError::Damaged);
     }
     let (head, image) = body.split_first_chunk::<HEAD_BYTES>().ok_or(size)?;
-    let &[_, _, _, _, version, cell, s0, s1, s2, s3] = head;
+    let &[_, _, _, _, version, cell, s0, s1, s2, s3, configured] = head;
     if version != VERSION {
         return Err(FlashError::Version { got: version });
     }
     let serial = u32::from_le_bytes([s0, s1, s2, s3]);
-    if (cell, serial) != (identity.cell.get(), identity.serial) {
+    let number = CellId::new(cell.into()).ok();
+    let is_another = identity.cell.is_some() && number.is_some() && number != identity.cell;
+    if is_another || serial != identity.serial {
         return Err(FlashError::OtherCell { cell, serial });
     }
-    Ok(Parameters::from_image(image.try_into().map_err(|_| size)?)?)
+    let image = image.try_into().map_err(|_| size)?;
+    let parameters = (configured == 1).then(|| Parameters::from_image(image)).transpose()?;
+    Ok(Kept { number, parameters })
 }
 
 #[cfg(test)]
@@ -95,11 +112,14 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
     use protocol::fixed::Q1_14;
-    use protocol::id::CellId;
     use protocol::parameters::Pose;
 
     fn identity() -> Identity {
-        Identity { cell: CellId::new(12).unwrap(), serial: 100_012 }
+        Identity { cell: CellId::new(12).ok(), serial: 100_012 }
+    }
+
+    fn kept() -> Kept {
+        Kept { number: CellId::new(12).ok(), parameters: Some(parameters()) }
     }
 
     fn parameters() -> Parameters {
@@ -109,9 +129,16 @@ mod tests {
 
     #[test]
     fn what_was_kept_comes_back_to_the_same_cell_only() {
-        let bytes = encode(identity(), &parameters());
-        assert_eq!(&bytes[..10], b"SKIN\x01\x0c\xac\x86\x01\x00");
-        assert_eq!(decode(identity(), &bytes), Ok(parameters()));
+        let bytes = encode(100_012, &kept());
+        assert_eq!(&bytes[..11], b"SKIN\x02\x0c\xac\x86\x01\x00\x01");
+        assert_eq!(decode(identity(), &bytes), Ok(kept()));
+        assert_eq!(decode(Identity { cell: None, ..identity() }, &bytes), Ok(kept()));
+        let bare = Kept { parameters: None, ..kept() };
+        assert_eq!(decode(identity(), &encode(100_012, &bare)), Ok(bare));
+        let nameless = Kept { number: None, ..kept() };
+        assert_eq!(decode(identity(), &encode(100_012, &nameless)), Ok(nameless));
+        let elsewhere = Identity { cell: CellId::new(13).ok(), ..identity() };
+        assert_eq!(decode(elsewhere, &bytes), Err(FlashError::OtherCell { cell: 12, serial: 100_012 }));
         let other = Identity { serial: 7, ..identity() };
         assert_eq!(decode(other, &bytes), Err(FlashError::OtherCell { cell: 12, serial: 100_012 }));
         assert_eq!(decode(identity(), &bytes[1..]), Err(FlashError::Size { got: BYTES - 1 }));
@@ -120,7 +147,7 @@ mod tests {
     proptest! {
         #[test]
         fn one_wrong_bit_is_noticed(bit in 0..BYTES * 8) {
-            let mut bytes = encode(identity(), &parameters());
+            let mut bytes = encode(100_012, &kept());
             bytes[bit / 8] ^= 1 << (bit % 8);
             prop_assert_eq!(decode(identity(), &bytes), Err(FlashError::Damaged));
         }

@@ -7,12 +7,11 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::bus::{Bus, BusError, Inbox};
 use protocol::can::{Format, Frame};
-use protocol::id::Kind;
+use protocol::id::{CellId, Kind};
 use protocol::packet;
-use protocol::parameters::Parameters;
 use protocol::time::{Micros, Span};
 
-use crate::flash::{self, FlashError};
+use crate::flash::{self, FlashError, Kept};
 use crate::node::{Flash, Identity, Node};
 
 /// Waits while an interface is down before it is tried again.
@@ -29,50 +28,52 @@ pub struct FlashFile {
 }
 
 impl FlashFile {
-    /// The file `BUS-NODE.flash` in a directory.
+    /// The file `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` of a cell that came without a number.
     #[must_use]
     pub fn new(directory: Option<&std::path::Path>, bus: &str, identity: Identity) -> Self {
-        let path = directory.map(|directory| directory.join(format!("{bus}-{}.flash", identity.cell)));
+        let name = identity.cell.map_or_else(|| format!("s{}", identity.serial), |cell| cell.to_string());
+        let path = directory.map(|directory| directory.join(format!("{bus}-{name}.flash")));
         Self { identity, path }
     }
 
     /// What people call it: `flash of cell 12 (DIR/vcan0-12.flash)`.
     #[must_use]
     pub fn name(&self) -> String {
-        let cell = self.identity.cell;
+        let Identity { cell, serial } = self.identity;
+        let cell = cell.map_or_else(|| format!("with serial number {serial}"), |cell| cell.to_string());
         self.path.as_ref().map_or_else(
             || format!("flash of cell {cell}"),
             |path| format!("flash of cell {cell} ({})", path.display()),
         )
     }
 
-    /// What it holds. What is there but not sound is damaged; why is the second value.
+    /// What it holds: a number, and parameters. What is there but not sound is damaged; why is the last value.
     ///
     /// # Errors
     /// When the file is there and cannot be read.
-    pub fn load(&self) -> io::Result<(Flash, Option<FlashError>)> {
-        let Some(path) = &self.path else { return Ok((Flash::Empty, None)) };
+    pub fn load(&self) -> io::Result<(Option<CellId>, Flash, Option<FlashError>)> {
+        let Some(path) = &self.path else { return Ok((None, Flash::Empty, None)) };
         let bytes = match fs::read(path) {
             Ok(bytes) => bytes,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Flash::Empty, None)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((None, Flash::Empty, None)),
             Err(error) => return Err(error),
         };
         Ok(match flash::decode(self.identity, &bytes) {
-            Ok(parameters) => (Flash::Sound(parameters), None),
-            Err(error) => (Flash::Damaged, Some(error)),
+            Ok(kept) => (kept.number, kept.parameters.map_or(Flash::Empty, Flash::Sound), None),
+            Err(error) => (None, Flash::Damaged, Some(error)),
         })
     }
 
-    /// Keeps parameters: a whole new file takes the old one's place, or nothing changes.
+    /// Keeps a number and parameters: a whole new file takes the old one's place, or nothing changes.
     ///
     /// # Errors
     /// When the disk will not have it.
-    pub fn store(&self, parameters: &Parameters) -> io::Result<()> {
+    pub fn store(&self, kept: &Kept) -> io::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
         let part = path.with_extension("flash.part");
         let store = || {
             let mut file = File::create(&part)?;
-            file.write_all(&flash::encode(self.identity, parameters))?;
+            file.write_all(&flash::encode(self.identity.serial, kept))?;
             file.sync_all()?;
             fs::rename(&part, path)
         };
@@ -140,7 +141,7 @@ impl Cells {
 
     /// Starts a cell with what flash holds; a simulated cell has no sensors, so it obeys stimuli.
     pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile) {
-        if let Some(place) = self.places.get_mut(usize::from(identity.cell.get())) {
+        if let Some(place) = identity.cell.and_then(|cell| self.places.get_mut(usize::from(cell.get()))) {
             *place = u8::try_from(self.cells.len()).ok();
         }
         let node = Node::new(identity, self.format, flash, true, self.clock.now());
@@ -207,7 +208,7 @@ impl Cells {
             for (node, file) in hearers.unwrap_or_default() {
                 node.handle_frame(now, age, &received.frame);
                 if let Some(serial) = node.taken() {
-                    let (bus, cell) = (bus.name().to_owned(), node.identity().cell.get());
+                    let (bus, cell) = (bus.name().to_owned(), node.identity().cell.map_or(0, CellId::get));
                     return Err(Stopped::Taken { bus, cell, serial });
                 }
                 collect(node, file, self.format, &mut self.outbox);
@@ -228,8 +229,8 @@ impl Cells {
 
 /// Writes what a cell has for flash, and takes what it has to send.
 fn collect(node: &mut Node, file: &FlashFile, format: Format, outbox: &mut Vec<Frame>) {
-    if let Some(parameters) = node.poll_store() {
-        node.handle_stored(file.store(&parameters).is_ok());
+    if let Some(kept) = node.poll_store() {
+        node.handle_stored(file.store(&kept).is_ok());
     }
     while let Some(packet) = node.poll_transmit() {
         outbox.extend(packet.frames(format));

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
+use cell_node::flash::Kept;
 use cell_node::io::{Cells, FlashFile, Stopped};
 use cell_node::node::{Flash, Identity};
 use clap::Parser;
@@ -118,17 +119,18 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
         let described = skin.cells_of(bus_index).find(|described| described.node == cell);
         let described =
             described.with_context(|| format!("cell {cell} is not on {} in {file}", arguments.bus))?;
-        let identity = Identity { cell, serial: described.serial };
-        heard.extend(identity.hears());
+        let identity = Identity { cell: Some(cell), serial: described.serial };
+        heard.extend(identity.hears().into_iter().flatten());
         let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
-        let (mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
+        let (_, mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
         if let Some(damage) = damage {
             let name = flash_file.name();
             say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
         }
         if flash == Flash::Empty {
             let parameters = skin.parameters(described);
-            flash_file.store(&parameters).with_context(|| flash_file.name())?;
+            let kept = Kept { number: Some(cell), parameters: Some(parameters) };
+            flash_file.store(&kept).with_context(|| flash_file.name())?;
             flash = Flash::Sound(parameters);
         }
         cells.start(identity, &flash, flash_file);

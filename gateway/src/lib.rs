@@ -9,6 +9,7 @@ pub mod decode;
 pub mod explain;
 pub mod external;
 pub mod generate;
+pub mod network;
 pub mod record;
 pub mod replay;
 pub mod robot;

@@ -17,3 +17,4 @@ pub mod skin;
 pub mod time;
 #[cfg(feature = "host")]
 pub mod usage;
+pub mod wire;

@@ -26,6 +26,8 @@ pub const VERSION: u8 = 1;
 const FROM_THE_NEXT: u8 = 0x80;
 /// Set in the count of `configure` and `configured`: the parameter is written.
 const WRITE: u8 = 0x80;
+/// In a tree page: no parent.
+const NOBODY: u8 = 255;
 /// The parameter number that stands for a refusal.
 const REFUSED: u8 = 126;
 
@@ -76,6 +78,10 @@ pub enum NetworkPage {
     Heard(Heard),
     /// Page 2: what it refused, by reason.
     Refused(Refused),
+    /// Page 3: its place in the tree, and what became of sums.
+    Tree(Tree),
+    /// Page 4: what its ports lead to.
+    Ports(Ports),
 }
 
 /// Page 0: sign of life, four times a second and after each sync. The epoch byte is that of the last
@@ -193,6 +199,78 @@ pub struct Refused {
     pub stimuli: u16,
 }
 
+/// Page 3: a cell's place in the tree. The epoch byte is that of the last joints taken.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Tree {
+    /// Where its sums go: the number of a cell, 0 for the gateway's side; `None` without a way up.
+    pub parent: Option<u8>,
+    /// The port that leads there, 0 to 4; not looked at without a parent.
+    pub up: u8,
+    /// Wires to the root of its tree: 0 is a root; not looked at without a parent.
+    pub depth: u8,
+    /// The exploration from which the depth is.
+    pub round: u8,
+    /// Bit p: the cell at port p is its child.
+    pub children: u8,
+    /// Bit p: port p works in both directions.
+    pub works: u8,
+    /// Sums sent, resends among them, modulo 2^16.
+    pub sent: u16,
+    /// Sums taken from children, modulo 2^16.
+    pub taken: u16,
+    /// Sums of children that were not taken: too late, or not said to be for this cell; modulo 2^16.
+    pub dropped: u16,
+}
+
+/// Page 4: what a cell's ports lead to.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Ports {
+    /// Each port.
+    pub ports: [PortState; 4],
+    /// How often its parent changed, modulo 2^16.
+    pub changes: u16,
+}
+
+/// What one port leads to.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct PortState {
+    /// The number of the cell at the other end; 0 when nothing is heard from there, or it has no number.
+    pub number: u8,
+    /// The other end's port.
+    pub port: u8,
+    /// Something is heard from there.
+    pub hears: bool,
+    /// It hears this cell too.
+    pub works: bool,
+    /// It speaks another version of the protocol.
+    pub other_version: bool,
+}
+
+impl PortState {
+    const HEARS: u16 = 1 << 12;
+    const WORKS: u16 = 1 << 13;
+    const OTHER_VERSION: u16 = 1 << 14;
+
+    const fn decode(word: u16) -> Self {
+        let [number, high] = word.to_le_bytes();
+        Self {
+            number,
+            port: high & 7,
+            hears: word & Self::HEARS != 0,
+            works: word & Self::WORKS != 0,
+            other_version: word & Self::OTHER_VERSION != 0,
+        }
+    }
+
+    fn encode(self) -> u16 {
+        let flag = |set: bool, flag| if set { flag } else { 0 };
+        u16::from_le_bytes([self.number, self.port & 7])
+            | flag(self.hears, Self::HEARS)
+            | flag(self.works, Self::WORKS)
+            | flag(self.other_version, Self::OTHER_VERSION)
+    }
+}
+
 /// What a `configure` packet asks for.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Request {
@@ -238,6 +316,8 @@ impl Answer {
     pub const FLASH_FAILED: i16 = 17;
     /// No such parameter.
     pub const UNKNOWN: i16 = 18;
+    /// Words that this parameter cannot have, or a cut outside test mode.
+    pub const CANNOT_BE: i16 = 19;
 }
 
 /// A packet's meaning.
@@ -558,6 +638,23 @@ impl NetworkPage {
                 incomplete: e,
                 stimuli: f,
             })),
+            3 => {
+                let ([parent, up], [depth, round]) = (a.to_le_bytes(), b.to_le_bytes());
+                let [children, works] = c.to_le_bytes();
+                let parent = (parent != NOBODY).then_some(parent);
+                Ok(Self::Tree(Tree {
+                    parent,
+                    up,
+                    depth,
+                    round,
+                    children,
+                    works,
+                    sent: d,
+                    taken: e,
+                    dropped: f,
+                }))
+            }
+            4 => Ok(Self::Ports(Ports { ports: [a, b, c, d].map(PortState::decode), changes: e })),
             _ => Err(MessageError::Page { kind: Kind::Network, page }),
         }
     }
@@ -574,6 +671,19 @@ impl NetworkPage {
             }
             Self::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
                 (2, [length, crc, foreign, meaning, incomplete, stimuli])
+            }
+            Self::Tree(tree) => {
+                let pair = |low, high| u16::from_le_bytes([low, high]);
+                let place = [
+                    pair(tree.parent.unwrap_or(NOBODY), tree.up),
+                    pair(tree.depth, tree.round),
+                    pair(tree.children, tree.works),
+                ];
+                (3, [place[0], place[1], place[2], tree.sent, tree.taken, tree.dropped])
+            }
+            Self::Ports(Ports { ports: [a, b, c, d], changes }) => {
+                let [a, b, c, d] = [a, b, c, d].map(PortState::encode);
+                (4, [a, b, c, d, changes, 0])
             }
         };
         (page, words.map(u16::cast_signed))

@@ -175,6 +175,9 @@ impl<'a> Meaning<'a> {
                 };
             }
             Parameter::Mode => return [self.number("on"), 0, 0, 0, 0, 0],
+            Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => {
+                panic!("{}: given in words", self.text)
+            }
             Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
             Parameter::Identity => panic!("{}: identity is given in words", self.text),
         }

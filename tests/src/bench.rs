@@ -165,7 +165,7 @@ impl Bench {
             ticking: false,
         };
         for (place, cell) in skin.cells.iter().enumerate() {
-            let identity = Identity { cell: cell.node, serial: cell.serial };
+            let identity = Identity { cell: Some(cell.node), serial: cell.serial };
             let seat = bench.add(identity, Flash::Sound(skin.parameters(cell)));
             bench.at(start(place), Act::Start(seat));
         }
@@ -176,7 +176,7 @@ impl Bench {
     /// One more cell, switched off; returns its seat.
     pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
         let seat = self.seats.len();
-        for id in identity.hears() {
+        for id in identity.hears().into_iter().flatten() {
             self.hearers.entry(u32::from(id.to_bits())).or_default().push(seat);
         }
         self.seats.push(Seat::new(identity, flash, self.format));

@@ -141,8 +141,8 @@ impl Seat {
 
     fn sends(&mut self) -> Vec<Packet> {
         let Life::Runs(node) = &mut self.life else { return Vec::new() };
-        if let Some(parameters) = node.poll_store() {
-            self.flash = Flash::Sound(parameters);
+        if let Some(kept) = node.poll_store() {
+            self.flash = kept.parameters.map_or(Flash::Empty, Flash::Sound);
             node.handle_stored(true);
         }
         core::iter::from_fn(|| node.poll_transmit()).collect()

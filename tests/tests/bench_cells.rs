@@ -105,7 +105,7 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         bench.act(Act::Kill(CELL));
         let killed = bench.now();
         bench.run(Span(DEAD_AFTER.0 + HEARTBEAT.0));
-        let node = bench.seats[CELL].identity.cell;
+        let node = bench.seats[CELL].identity.cell.unwrap();
         let [(dead, Notice::Dead(who))] = bench.gateway.notices[..] else {
             panic!("{:?}", bench.gateway.notices)
         };
@@ -175,7 +175,7 @@ fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
         let claim = bench.now()..bench.now() + CLAIM;
         bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::Seat(CELL)).during(claim));
         bench.run(START);
-        let node = bench.seats[CELL].identity.cell;
+        let node = bench.seats[CELL].identity.cell.unwrap();
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, [Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
@@ -323,7 +323,7 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         let claim = bench.wire.iter().find(|it| it.from == Party::Seat(newcomer)).map(|it| it.at);
         let claimed = claim.is_some();
         claims[usize::from(claimed)] += 1;
-        let node = bench.seats[0].identity.cell;
+        let node = bench.seats[0].identity.cell.unwrap();
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
         if let (Some(claim), Some((told, _))) = (claim, bench.gateway.notices.first()) {

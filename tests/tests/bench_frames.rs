@@ -104,7 +104,7 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         let before = bench.gateway.table.cells()[0].replies;
         bench.run_epochs(late);
         let torque = [protocol::fixed::Q3_12::from_bits(5); 6];
-        let from = bench.seats[0].identity.cell;
+        let from = bench.seats[0].identity.cell.unwrap();
         bench.witness.compares = false;
         bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque }));
         bench.run(Span(epoch.0 / 4));

@@ -32,7 +32,7 @@ fn parameters() -> Parameters {
 
 /// A cell that has claimed its number.
 fn started() -> Node {
-    let identity = Identity { cell: CellId::new(CELL).unwrap(), serial: 1 };
+    let identity = Identity { cell: CellId::new(CELL).ok(), serial: 1 };
     let mut node = Node::new(identity, Format::Fd, &Flash::Sound(parameters()), true, Micros(0));
     for _ in 0..2 {
         node.handle_timeout(node.poll_timeout());

@@ -12,6 +12,7 @@
 
 mod configuration;
 mod stimuli;
+mod switches;
 
 use heapless::Deque;
 use protocol::can::{Format, Frame};
@@ -24,11 +25,14 @@ use protocol::message::{
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
+use protocol::wire::{PORTS, PortMessage};
 
 use crate::contact::Torque;
+use crate::flash::Kept;
 use crate::kernel::Kernel;
 use configuration::{Configuration, Written};
 use stimuli::{Arrival, Stimuli};
+use switches::Switches;
 
 pub use configuration::Flash;
 pub use stimuli::PENDING;
@@ -43,39 +47,45 @@ const FIRST_WORD: Span = Span::from_millis(64);
 /// The shortest time between two answers to another cell under our number.
 const DEFEND: Span = Span::from_millis(10);
 
-/// Identifiers that a cell hears.
-pub const HEARD: usize = 10;
+/// Identifiers that every cell with a number hears.
+pub const OWN: usize = 10;
+/// Identifiers that a cell can hear: these, and the sums of the cells at its ports.
+pub const HEARD: usize = OWN + PORTS;
 /// Packets that wait to be sent; a shell takes them after every call.
 const OUTBOX: usize = 16;
 
 /// Who a cell is, from the factory on.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Identity {
-    /// Its number on the bus.
-    pub cell: CellId,
+    /// Its number on the bus; none until the network gives it one.
+    pub cell: Option<CellId>,
     /// Its serial number.
     pub serial: u32,
 }
 
 impl Identity {
-    /// The identifiers that this cell hears, and no others: halt, joints, sync, resume, report; its own
-    /// heartbeats' (to notice another cell under its number); what configures and presses it, alone or
-    /// with everyone.
+    /// The identifiers that this cell hears whatever the network is like: halt, joints, sync, resume, report;
+    /// its own heartbeats' (to notice another cell under its number); what configures and presses it, alone
+    /// or with everyone. A cell without a number hears nothing but its ports.
     #[must_use]
-    pub const fn hears(&self) -> [Id; HEARD] {
-        let cell = Address::Cell(self.cell);
-        [
-            Id::command(Command::Halt),
-            Id::command(Command::Joints),
-            Id::command(Command::Sync),
-            Id::command(Command::Resume),
-            Id::command(Command::Report),
-            Id::new(Kind::Network, cell),
-            Id::new(Kind::Configure, cell),
-            Id::new(Kind::Configure, Address::Everyone),
-            Id::new(Kind::Stimulus, cell),
-            Id::new(Kind::Stimulus, Address::Everyone),
-        ]
+    pub fn hears(&self) -> [Option<Id>; OWN] {
+        let all = |cell| {
+            let cell = Address::Cell(cell);
+            [
+                Id::command(Command::Halt),
+                Id::command(Command::Joints),
+                Id::command(Command::Sync),
+                Id::command(Command::Resume),
+                Id::command(Command::Report),
+                Id::new(Kind::Network, cell),
+                Id::new(Kind::Configure, cell),
+                Id::new(Kind::Configure, Address::Everyone),
+                Id::new(Kind::Stimulus, cell),
+                Id::new(Kind::Stimulus, Address::Everyone),
+            ]
+            .map(Some)
+        };
+        self.cell.map_or([None; OWN], all)
     }
 }
 
@@ -108,6 +118,9 @@ pub struct Node {
     halves: [Half; HEARD],
     outbox: Deque<Message, OUTBOX>,
     storing: Option<(Parameters, u8)>,
+    switches: Switches,
+    wired: u8,
+    hears_changed: bool,
     claim: Claim,
     next_heartbeat: Micros,
     defended: Option<Micros>,
@@ -135,11 +148,35 @@ impl Node {
             halves: [Half::NONE; HEARD],
             outbox: Deque::new(),
             storing: None,
+            switches: Switches::default(),
+            wired: 0,
+            hears_changed: false,
             claim: Claim::Unsaid,
             next_heartbeat: now + Span(u64::from(identity.serial) * 1_000 % FIRST_WORD.0),
             defended: None,
             taken: None,
         }
+    }
+
+    /// The same cell in a network: bit p says that port p leads somewhere, bit 4 that it is wired to the
+    /// gateway's side.
+    #[must_use]
+    pub const fn with_ports(mut self, wired: u8) -> Self {
+        self.wired = wired;
+        self
+    }
+
+    /// Takes what came in through a port.
+    pub const fn handle_port(&mut self, _now: Micros, _port: usize, _message: PortMessage) {}
+
+    /// The next message for a port.
+    pub const fn poll_port_transmit(&mut self) -> Option<(usize, PortMessage)> {
+        None
+    }
+
+    /// Whether the identifiers that it hears have changed since the last call.
+    pub const fn poll_hears(&mut self) -> bool {
+        core::mem::replace(&mut self.hears_changed, false)
     }
 
     /// Who it is.
@@ -171,10 +208,10 @@ impl Node {
         self.next_heartbeat
     }
 
-    /// Parameters that have to go into flash; then comes [`Node::handle_stored`].
+    /// What has to go into flash; then comes [`Node::handle_stored`].
     #[must_use]
-    pub fn poll_store(&self) -> Option<Parameters> {
-        self.storing.map(|(parameters, _)| parameters)
+    pub fn poll_store(&self) -> Option<Kept> {
+        self.storing.map(|(parameters, _)| Kept { number: self.identity.cell, parameters: Some(parameters) })
     }
 
     /// Flash was written, or could not be.
@@ -183,8 +220,24 @@ impl Node {
             let answer = self.configuration.stored(parameters, written);
             self.flags =
                 self.flags.with(State::FLASH_DAMAGED, self.flags.has(State::FLASH_DAMAGED) && !written);
-            self.push(Message::Configured { from: self.identity.cell, tag, answer });
+            if let Some(from) = self.identity.cell {
+                self.push(Message::Configured { from, tag, answer });
+            }
         }
+    }
+
+    /// The identifiers that this cell hears now; a shell asks again after [`Node::poll_hears`].
+    pub fn hears(&self) -> impl Iterator<Item = Id> + use<'_> {
+        self.slots().into_iter().flatten()
+    }
+
+    /// By slot of a pair's waiting half.
+    fn slots(&self) -> [Option<Id>; HEARD] {
+        let mut slots = [None; HEARD];
+        for (slot, id) in slots.iter_mut().zip(self.identity.hears()) {
+            *slot = id;
+        }
+        slots
     }
 
     /// Takes in that time has passed. Harmless when called early.
@@ -194,7 +247,7 @@ impl Node {
         }
         if self.claim == Claim::Unsaid {
             self.claim = Claim::Said;
-            self.next_heartbeat = now + CLAIM + phase(self.identity.cell);
+            self.next_heartbeat = now + CLAIM + self.identity.cell.map_or(Span(0), phase);
             return self.push_heartbeat();
         }
         self.claim = Claim::Settled;
@@ -214,7 +267,7 @@ impl Node {
             count(&mut self.refused.foreign);
             return;
         };
-        let Some(slot) = self.identity.hears().iter().position(|&heard| heard == id) else { return };
+        let Some(slot) = self.slots().iter().position(|&heard| heard == Some(id)) else { return };
         let packet = match self.format {
             Format::Fd => Packet::from_fd(frame),
             Format::Classic => match self.pair(now, id, slot, frame) {
@@ -342,13 +395,14 @@ impl Node {
     }
 
     fn push_torque(&mut self, epoch: Epoch, torque: [Q3_12; WORDS]) {
+        let Some(from) = self.identity.cell else { return };
         count(&mut self.heard.torques);
-        self.push(Message::Torque { from: self.identity.cell, epoch, torque });
+        self.push(Message::Torque { from, epoch, torque });
     }
 
     fn push_sensors(&mut self, page: SensorPage) {
-        let (from, epoch) = (self.identity.cell, self.epoch.unwrap_or_default());
-        self.push(Message::Sensors { from, epoch, page });
+        let Some(from) = self.identity.cell else { return };
+        self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
     fn take_stimulus(&mut self, from: From, page: SensorPage) {
@@ -367,7 +421,7 @@ impl Node {
     }
 
     fn configure(&mut self, tag: u8, request: Request) {
-        let from = self.identity.cell;
+        let Some(from) = self.identity.cell else { return };
         let number = match request {
             Request::Read { number } | Request::Write { number, .. } => number,
         };
@@ -384,8 +438,15 @@ impl Node {
                 self.stimuli.clear();
                 value(true, words)
             }
-            (Some(parameter), Request::Read { .. }) => value(false, self.configuration.read(parameter)),
+            (Some(parameter), Request::Read { .. }) => {
+                let switched = self.switches.read(parameter);
+                value(false, switched.unwrap_or_else(|| self.configuration.read(parameter)))
+            }
             (Some(parameter), Request::Write { words, .. }) => {
+                let test_mode = self.flags.has(State::TEST_MODE);
+                if let Some(answer) = self.switches.write(parameter, words, test_mode) {
+                    return self.push(Message::Configured { from, tag, answer });
+                }
                 match self.configuration.write(parameter, words) {
                     Written::Answer(answer) => answer,
                     Written::Store(parameters) => {
@@ -417,7 +478,10 @@ impl Node {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = match page {
             NetworkPage::Heartbeat(other) => Some(other),
-            NetworkPage::Heard(_) | NetworkPage::Refused(_) => None,
+            NetworkPage::Heard(_)
+            | NetworkPage::Refused(_)
+            | NetworkPage::Tree(_)
+            | NetworkPage::Ports(_) => None,
         };
         let claims = other.is_some_and(|other| other.state.has(State::CLAIMING));
         let stays = claims && other.is_some_and(|other| other.serial > self.identity.serial);
@@ -454,7 +518,8 @@ impl Node {
     }
 
     fn push_network(&mut self, page: NetworkPage) {
-        let from = Address::Cell(self.identity.cell);
+        let Some(cell) = self.identity.cell else { return };
+        let from = Address::Cell(cell);
         self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 

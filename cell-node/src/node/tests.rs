@@ -22,8 +22,12 @@ fn wheel() -> Parameters {
     parameters
 }
 
+fn cell() -> CellId {
+    CellId::new(12).unwrap()
+}
+
 fn identity() -> Identity {
-    Identity { cell: CellId::new(12).unwrap(), serial: 100_012 }
+    Identity { cell: Some(cell()), serial: 100_012 }
 }
 
 /// A cell that has claimed its number and said so.
@@ -67,13 +71,13 @@ fn joints(epoch: u8) -> Message {
 fn press(newtons: f64, from: From) -> Message {
     let contact = [Q5_10::nearest(newtons), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    Message::Stimulus { to: Address::Cell(identity().cell), from, page }
+    Message::Stimulus { to: Address::Cell(cell()), from, page }
 }
 
 fn torque(epoch: u8, nm: f64) -> Message {
     let mut torque = [Q3_12::ZERO; WORDS];
     torque[0] = Q3_12::nearest(nm);
-    Message::Torque { from: identity().cell, epoch: Epoch(epoch), torque }
+    Message::Torque { from: cell(), epoch: Epoch(epoch), torque }
 }
 
 fn heartbeat(messages: &[Message]) -> Heartbeat {
@@ -254,7 +258,7 @@ fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
 #[test]
 fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     let mut node = settled(Flash::Damaged);
-    let to = Address::Cell(identity().cell);
+    let to = Address::Cell(cell());
     let ask = |node: &mut Node, request| {
         let answer = tell(node, &Message::Configure { to, tag: 77, request });
         match answer.as_slice() {
@@ -278,13 +282,10 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");
 
     assert_eq!(ask(&mut node, commit(wheel().hash())), None, "flash first");
-    assert_eq!(node.poll_store(), Some(wheel()));
+    assert_eq!(node.poll_store(), Some(Kept { number: Some(cell()), parameters: Some(wheel()) }));
     node.handle_stored(false);
-    let failed = Message::Configured {
-        from: identity().cell,
-        tag: 77,
-        answer: refused(Answer::FLASH_FAILED).unwrap(),
-    };
+    let failed =
+        Message::Configured { from: cell(), tag: 77, answer: refused(Answer::FLASH_FAILED).unwrap() };
     assert_eq!(drain(&mut node), [failed]);
 
     ask(&mut node, commit(wheel().hash()));

@@ -157,6 +157,7 @@ fn words(parameter: Parameter) -> Vec<Signal> {
         Parameter::Mode => {
             vec![Signal::fixed::<0>("mode", 0, "").naming([(0, "measure"), (1, "obey stimuli")])]
         }
+        Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => vec![],
         Parameter::Row(row) => {
             let name = |field: &str| format!("row{}_{field}", row + 1);
             vec![

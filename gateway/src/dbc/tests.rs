@@ -124,6 +124,7 @@ impl Said {
             }
             Some(Parameter::Timing) => self.put("period", unsigned[0]),
             Some(Parameter::Mode) => self.put("mode", words[0]),
+            Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {}
             Some(Parameter::Row(row)) => {
                 let row = row + 1;
                 self.put(format!("row{row}_a"), q14(0).to_f64());
@@ -203,6 +204,7 @@ fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, 
                     said.put("refused_incomplete", refused.incomplete);
                     said.put("refused_stimuli", refused.stimuli);
                 }
+                NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
             }
             format!("network_{from}")
         }

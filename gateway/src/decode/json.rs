@@ -7,7 +7,7 @@ use protocol::candump::{Direction, Record};
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
 use protocol::id::{Id, Kind};
 use protocol::message::{
-    Answer, From, Heard, Heartbeat, Message, NetworkPage, Refused, Request, SensorPage, State,
+    Answer, From, Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Request, SensorPage, State, Tree,
 };
 use protocol::packet::{BYTES, PacketError, WORDS};
 use protocol::parameters::Parameter;
@@ -95,6 +95,24 @@ enum Values {
         meaning: u16,
         incomplete: u16,
         stimuli: u16,
+    },
+    Tree {
+        page: &'static str,
+        parent: Option<u8>,
+        up: u8,
+        depth: u8,
+        round: u8,
+        children: u8,
+        works: u8,
+        sent: u16,
+        taken: u16,
+        dropped: u16,
+    },
+    Ports {
+        page: &'static str,
+        ports: [[u8; 2]; 4],
+        works: [bool; 4],
+        changes: u16,
     },
     Read {
         parameter: String,
@@ -374,6 +392,15 @@ fn network(page: NetworkPage) -> Values {
         NetworkPage::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
             Values::Refused { page: "refused", length, crc, foreign, meaning, incomplete, stimuli }
         }
+        NetworkPage::Tree(Tree { parent, up, depth, round, children, works, sent, taken, dropped }) => {
+            Values::Tree { page: "tree", parent, up, depth, round, children, works, sent, taken, dropped }
+        }
+        NetworkPage::Ports(Ports { ports, changes }) => Values::Ports {
+            page: "ports",
+            ports: ports.map(|port| [port.number, port.port]),
+            works: ports.map(|port| port.works),
+            changes,
+        },
     }
 }
 
@@ -410,6 +437,9 @@ fn value(number: u8, words: [i16; WORDS]) -> Value {
         },
         Some(Parameter::Timing) => Value::Timing { period_us: a.cast_unsigned() },
         Some(Parameter::Mode) => Value::Mode { mode: a },
+        Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {
+            Value::Unknown { words }
+        }
         Some(Parameter::Row(_)) => {
             Value::Row { a_m: meters(a), d_m: meters(b), alpha_rad: radians(c), theta_offset_rad: radians(d) }
         }

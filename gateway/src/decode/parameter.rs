@@ -127,6 +127,9 @@ impl Display for Words {
             Some(Parameter::Mode) => {
                 write!(f, "{a}, {}", if a == 1 { "obey stimuli" } else { "measure" })
             }
+            Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {
+                write!(f, "{a} {b} {c} {d} {e}")
+            }
             Some(Parameter::Row(_)) => {
                 write!(f, "a {:.4} m, d {:.4} m, ", meters(a), meters(b))?;
                 write!(f, "alpha {:.4} rad, theta offset {:.4} rad", radians(c), radians(d))
@@ -224,6 +227,7 @@ const fn fields(parameter: Parameter) -> &'static [(&'static str, Read)] {
         ],
         Parameter::Timing => &[("period_us", period)],
         Parameter::Mode => &[("mode", mode)],
+        Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => &[],
         Parameter::Row(_) => &[
             ("a_m", nearest::<14>),
             ("d_m", nearest::<14>),

@@ -150,6 +150,8 @@ impl Display for Page {
                 write!(f, "refused: length {length}, CRC {crc}, foreign {foreign}, meaning {meaning}, ")?;
                 write!(f, "incomplete {incomplete}, stimuli {stimuli}")
             }
+            NetworkPage::Tree(tree) => write!(f, "tree: {tree:?}"),
+            NetworkPage::Ports(ports) => write!(f, "ports: {ports:?}"),
         }
     }
 }

@@ -654,7 +654,7 @@ impl Lane {
                 let first = present.heard.map_or(heard, |(first, _)| first);
                 present.heard = Some((first, heard));
             }
-            NetworkPage::Refused(_) => {}
+            NetworkPage::Refused(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
         }
     }
 

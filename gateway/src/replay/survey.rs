@@ -219,7 +219,7 @@ impl Bus {
                         cell.heartbeat(&heartbeat, is_before, is_in_part);
                     }
                     NetworkPage::Heard(heard) => cell.report(heard, at_report),
-                    NetworkPage::Refused(_) => {}
+                    NetworkPage::Refused(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
                 }
             }
             // Configured anew before its first heartbeat: what it computed with before, nobody knows.

@@ -348,6 +348,7 @@ impl Table {
                 cell.report(heard, passed);
             }
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refuses(refused),
+            Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. } => {}
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
             Message::Sum { .. } => self.counters.count(Event::Stranger),

@@ -1,0 +1,289 @@
+//! What two cells say to each other over the wire between their ports, and how a bench simulates such a wire.
+//!
+//! A wire leads from one port to another and belongs to no bus. The bench simulates it on the cells' bus by
+//! classic frames with 29-bit identifiers that only its other end takes; they never go onto a real bus.
+//!
+//! ```text
+//!   identifier   28 | 27 ... 1 | 0                byte  0     1 ... 5     6  7
+//!                 1 |   wire   | direction              kind  the kind's   CRC-16 over the identifier
+//!                                                                          (4 bytes) and bytes 0 to 5
+//! ```
+//!
+//! | kind | name | bytes 1 to 5 | says |
+//! |---|---|---|---|
+//! | 1 | hello | version, number, port + flags, round, depth | I am here, and so far from the gateway |
+//! | 2 | join | | may I send my sums to you? |
+//! | 3 | grant | round, depth | yes; this is how far I am |
+//! | 4 | refuse | | no; or: you are no child of mine |
+//! | 5 | leave | | I am no child of yours any more |
+//! | 6 | left | | I have heard it: from now on I take no sum of yours |
+//! | 7 | state | epoch | I am your child: my sums from this epoch on are for you |
+//! | 8 | missed | epoch | I did not take your sum of this epoch |
+//! | 9 | seek | round | I have no way up: a new round, later than this one, please |
+//! | 10 | number | walk, first, last | number yourself and those below you from these |
+//! | 11 | return | walk, first, last | done; these are left (none when first > last) |
+
+use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
+use crate::packet::{Epoch, crc16};
+
+/// Set in the identifier of every simulated wire.
+pub const FLAG: u32 = 0x1000_0000;
+/// Wires that a bus can simulate: as many as two bytes number.
+pub const MAX: usize = 1 << 16;
+/// Ports of a cell.
+pub const PORTS: usize = 4;
+/// Where a root is wired to the gateway's side: beside its ports.
+pub const UPLINK: usize = PORTS;
+/// Bytes of a message, its CRC among them.
+pub const BYTES: usize = 8;
+
+/// One direction of one simulated wire: whoever sends on it.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct Lane {
+    /// The wire's number on its bus.
+    pub wire: u16,
+    /// Which of its two directions.
+    pub back: bool,
+}
+
+/// How far somebody is from the gateway.
+///
+/// A label only ever improves: a later round, or the same with a lesser depth. A cell takes a parent only
+/// whose label is better than its own, so that parents never form a circle.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub struct Label {
+    /// The exploration from which the depth is, modulo 2^8.
+    pub round: u8,
+    /// Wires to the gateway's side: 0 is the gateway, 1 a root.
+    pub depth: u8,
+}
+
+impl Label {
+    /// Whether this one is better: of a later round, or nearer in the same.
+    #[must_use]
+    pub const fn is_better_than(self, other: Self) -> bool {
+        match self.round.wrapping_sub(other.round).cast_signed() {
+            0 => self.depth < other.depth,
+            later => later > 0,
+        }
+    }
+
+    /// The label of a child.
+    #[must_use]
+    pub const fn below(self) -> Self {
+        Self { round: self.round, depth: self.depth.saturating_add(1) }
+    }
+}
+
+/// What is said again and again over every port.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Hello {
+    /// The protocol's version.
+    pub version: u8,
+    /// The cell's number; 0 of a cell without one, and of the gateway.
+    pub number: u8,
+    /// The port that it says this on.
+    pub port: u8,
+    /// It hears the other end.
+    pub hears: bool,
+    /// Its sums go out here: whoever hears it is its parent.
+    pub up: bool,
+    /// It, or a cell below it, has no number yet.
+    pub unnumbered: bool,
+    /// How far it is; none without a way to the gateway.
+    pub label: Option<Label>,
+}
+
+/// A message over a wire.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum PortMessage {
+    /// I am here.
+    Hello(Hello),
+    /// May I send my sums to you?
+    Join,
+    /// Yes; this is how far I am.
+    Grant(Label),
+    /// No; or: you are no child of mine.
+    Refuse,
+    /// I am no child of yours any more.
+    Leave,
+    /// I have heard it.
+    Left,
+    /// I am your child: my sums from this epoch on are for you.
+    State(Epoch),
+    /// I did not take your sum of this epoch.
+    Missed(Epoch),
+    /// I have no way up, and a round later than this one would help.
+    Seek(u8),
+    /// Number yourself and those below you.
+    Number(Walk),
+    /// Everybody here has a number.
+    Return(Walk),
+}
+
+/// Numbers to give away, in a walk over the tree.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Walk {
+    /// Which walk.
+    pub walk: u8,
+    /// The first number that is free.
+    pub first: u8,
+    /// The last of them.
+    pub last: u8,
+}
+
+const HEARS: u8 = 1 << 3;
+const UP: u8 = 1 << 4;
+const UNNUMBERED: u8 = 1 << 5;
+const LABELLED: u8 = 1 << 6;
+
+impl PortMessage {
+    fn encode(self) -> [u8; 6] {
+        match self {
+            Self::Hello(hello) => {
+                let flag = |set, flag| if set { flag } else { 0 };
+                let flags = flag(hello.hears, HEARS)
+                    | flag(hello.up, UP)
+                    | flag(hello.unnumbered, UNNUMBERED)
+                    | flag(hello.label.is_some(), LABELLED);
+                let (round, depth) = hello.label.map_or((0, 0), |label| (label.round, label.depth));
+                [1, hello.version, hello.number, (hello.port & 7) | flags, round, depth]
+            }
+            Self::Join => [2, 0, 0, 0, 0, 0],
+            Self::Grant(label) => [3, label.round, label.depth, 0, 0, 0],
+            Self::Refuse => [4, 0, 0, 0, 0, 0],
+            Self::Leave => [5, 0, 0, 0, 0, 0],
+            Self::Left => [6, 0, 0, 0, 0, 0],
+            Self::State(epoch) => [7, epoch.0, 0, 0, 0, 0],
+            Self::Missed(epoch) => [8, epoch.0, 0, 0, 0, 0],
+            Self::Seek(round) => [9, round, 0, 0, 0, 0],
+            Self::Number(walk) => [10, walk.walk, walk.first, walk.last, 0, 0],
+            Self::Return(walk) => [11, walk.walk, walk.first, walk.last, 0, 0],
+        }
+    }
+
+    const fn decode(bytes: [u8; 6]) -> Option<Self> {
+        let [kind, a, b, c, d, e] = bytes;
+        let walk = Walk { walk: a, first: b, last: c };
+        Some(match kind {
+            1 => Self::Hello(Hello {
+                version: a,
+                number: b,
+                port: c & 7,
+                hears: c & HEARS != 0,
+                up: c & UP != 0,
+                unnumbered: c & UNNUMBERED != 0,
+                label: if c & LABELLED == 0 { None } else { Some(Label { round: d, depth: e }) },
+            }),
+            2 => Self::Join,
+            3 => Self::Grant(Label { round: a, depth: b }),
+            4 => Self::Refuse,
+            5 => Self::Leave,
+            6 => Self::Left,
+            7 => Self::State(Epoch(a)),
+            8 => Self::Missed(Epoch(a)),
+            9 => Self::Seek(a),
+            10 => Self::Number(walk),
+            11 => Self::Return(walk),
+            _ => return None,
+        })
+    }
+}
+
+impl Lane {
+    /// The identifier of its frames, with the flag of 29 bits.
+    #[must_use]
+    pub const fn raw_id(self) -> u32 {
+        EXTENDED | FLAG | ((self.wire as u32) << 1) | self.back as u32
+    }
+
+    /// The lane whose frames bear this identifier, with its flags.
+    #[must_use]
+    pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
+        let bits = raw_id & EXTENDED_MASK & !FLAG;
+        if raw_id & (EXTENDED | REMOTE | FLAG) != EXTENDED | FLAG || (bits >> 1) as usize >= MAX {
+            return None;
+        }
+        let [low, high, ..] = (bits >> 1).to_le_bytes();
+        Some(Self { wire: u16::from_le_bytes([low, high]), back: bits & 1 == 1 })
+    }
+
+    /// The same wire, the other way.
+    #[must_use]
+    pub const fn reversed(self) -> Self {
+        Self { wire: self.wire, back: !self.back }
+    }
+
+    /// The frame that says this.
+    #[must_use]
+    pub fn frame(self, message: PortMessage) -> Frame {
+        let body = message.encode();
+        let [a, b, c, d, e, f] = body;
+        let [low, high] = self.checksum(body).to_le_bytes();
+        Frame::classic(self.raw_id(), &[a, b, c, d, e, f, low, high]).unwrap_or(Frame::EMPTY)
+    }
+
+    /// What a frame of this lane says; `None` when it is not one, or damaged, or of a kind that does not exist.
+    #[must_use]
+    pub fn read(self, frame: &Frame) -> Option<PortMessage> {
+        let &[a, b, c, d, e, f, low, high] = frame.data() else { return None };
+        let body = [a, b, c, d, e, f];
+        let sound = frame.raw_id() == self.raw_id() && self.checksum(body) == u16::from_le_bytes([low, high]);
+        if sound { PortMessage::decode(body) } else { None }
+    }
+
+    fn checksum(self, body: [u8; 6]) -> u16 {
+        let [i0, i1, i2, i3] = (self.raw_id() & EXTENDED_MASK).to_le_bytes();
+        let [a, b, c, d, e, f] = body;
+        crc16(&[i0, i1, i2, i3, a, b, c, d, e, f])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_lane_is_its_identifier() {
+        let lane = Lane { wire: 3, back: true };
+        assert_eq!(lane.raw_id(), 0x9000_0007);
+        assert_eq!(Lane::from_raw_id(0x9000_0007), Some(lane));
+        for other in [0x1000_0007, 0x8000_0007, 0xD000_0007, 0x9002_0000] {
+            assert_eq!(Lane::from_raw_id(other), None, "{other:08X}");
+        }
+    }
+
+    #[test]
+    fn a_label_of_a_later_round_or_a_lesser_depth_is_better() {
+        let label = |round, depth| Label { round, depth };
+        assert!(label(1, 9).is_better_than(label(0, 1)));
+        assert!(label(0, 9).is_better_than(label(255, 1)));
+        assert!(label(4, 1).is_better_than(label(4, 2)));
+        assert!(!label(4, 2).is_better_than(label(4, 2)));
+        assert!(label(4, 2).is_better_than(label(4, 2).below()));
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_said_is_heard_on_this_lane_only(wire: u16, back: bool, body: [u8; 6]) {
+            let lane = Lane { wire, back };
+            if let Some(message) = PortMessage::decode(body) {
+                let frame = lane.frame(message);
+                prop_assert_eq!(lane.read(&frame), Some(message));
+                prop_assert_eq!(lane.reversed().read(&frame), None);
+            }
+        }
+
+        #[test]
+        fn one_wrong_bit_is_noticed(bit in 0_usize..64, body: [u8; 5]) {
+            let [a, b, c, ..] = body;
+            let lane = Lane { wire: 7, back: false };
+            let frame = lane.frame(PortMessage::Number(Walk { walk: a, first: b, last: c }));
+            let mut data: [u8; BYTES] = frame.data().try_into().unwrap();
+            data[bit / 8] ^= 1 << (bit % 8);
+            let damaged = Frame::classic(frame.raw_id(), &data).unwrap();
+            prop_assert_eq!(lane.read(&damaged), None);
+        }
+    }
+}
