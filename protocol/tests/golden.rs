@@ -13,12 +13,15 @@ use protocol::candump::{self, Line};
 use protocol::fixed::{Acc, Q};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{
-    Answer, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, Refused, Request, SensorPage,
-    SkinSensors, State,
+    Answer, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState, Ports, Refused,
+    Request, SensorPage, SkinSensors, State, Tree,
 };
 use protocol::packet::{Epoch, Half, Packet, PacketError, Paired, WORDS, crc16, data_id};
-use protocol::parameters::{Contact, Parameter, ParameterError, Parameters, Pose, Row};
+use protocol::parameters::{
+    Contact, Cuts, Events, Parameter, ParameterError, Parameters, Pose, Reply, Row, Sensing, Slots,
+};
 use protocol::time::Micros;
+use protocol::wire::{Hello, Label, Lane, PortMessage, Walk};
 
 const FD: &str = include_str!("golden/fd.log");
 const LENIENT: &str = include_str!("golden/lenient.log");
@@ -26,6 +29,7 @@ const BAD: &str = include_str!("golden/bad.log");
 const CLASSIC: &str = include_str!("golden/classic.log");
 const SESSION: &str = include_str!("golden/session.log");
 const REFUSALS: &str = include_str!("golden/refusals.log");
+const WIRE: &str = include_str!("golden/wire.log");
 const DOCUMENT: &str = include_str!("golden/document.log");
 
 /// One frame of a log, with the comment above it.
@@ -140,6 +144,106 @@ impl<'a> Meaning<'a> {
         State(bits)
     }
 
+    /// Bit numbers with a plus between them, or `none`.
+    fn bits(&mut self, key: &str) -> u8 {
+        let text = self.take(key);
+        text.split('+')
+            .filter(|&bit| bit != "none")
+            .fold(0, |bits, bit| bits | 1 << bit.parse::<u8>().unwrap())
+    }
+
+    /// Flags with a plus between them, or `none`; each must be one of `known`.
+    fn flags<const N: usize>(&self, text: &str, known: [&str; N]) -> [bool; N] {
+        let set: Vec<_> = text.split('+').filter(|&flag| flag != "none").collect();
+        assert!(set.iter().all(|flag| known.contains(flag)), "{}: {text}", self.text);
+        known.map(|flag| set.contains(&flag))
+    }
+
+    fn port(&mut self, key: &str) -> PortState {
+        let fields: Vec<_> = self.take(key).split('/').collect();
+        let &[number, port, flags] = fields.as_slice() else { panic!("{}: {key}", self.text) };
+        let [hears, works, other_version] = self.flags(flags, ["hears", "works", "other-version"]);
+        PortState {
+            number: number.parse().unwrap(),
+            port: port.parse().unwrap(),
+            hears,
+            works,
+            other_version,
+        }
+    }
+
+    fn label(&mut self) -> Option<Label> {
+        let (round, depth) = self.take("label").split_once('/')?;
+        Some(Label { round: round.parse().unwrap(), depth: depth.parse().unwrap() })
+    }
+
+    fn walk(&mut self) -> Walk {
+        Walk { walk: self.number("walk"), first: self.number("first"), last: self.number("last") }
+    }
+
+    fn wire(mut self) -> (Lane, PortMessage) {
+        let lane = Lane { wire: self.number("wire"), back: self.number::<u8>("back") == 1 };
+        let message = match self.what {
+            "hello" => {
+                let flags = self.take("flags");
+                let [hears, up, unnumbered] = self.flags(flags, ["hears", "up", "unnumbered"]);
+                PortMessage::Hello(Hello {
+                    version: self.number("version"),
+                    number: self.number("number"),
+                    port: self.number("port"),
+                    hears,
+                    up,
+                    unnumbered,
+                    label: self.label(),
+                })
+            }
+            "join" => PortMessage::Join,
+            "grant" => PortMessage::Grant(self.label().expect(self.text)),
+            "refuse" => PortMessage::Refuse,
+            "leave" => PortMessage::Leave,
+            "left" => PortMessage::Left,
+            "state" => PortMessage::State(self.epoch()),
+            "missed" => PortMessage::Missed(self.epoch()),
+            "seek" => PortMessage::Seek(self.number("round")),
+            "number" => PortMessage::Number(self.walk()),
+            "return" => PortMessage::Return(self.walk()),
+            _ => panic!("{}: not understood", self.text),
+        };
+        assert!(self.fields.is_empty(), "{}: {:?} left over", self.text, self.fields);
+        (lane, message)
+    }
+
+    fn reply(&mut self) -> Reply {
+        match self.take("reply") {
+            "torque" => Reply::Torque,
+            "sum" => Reply::Sum(Slots {
+                slot_us: self.number("slot_us"),
+                deepest: self.number("deepest"),
+                carry: self.number::<u8>("carry") == 1,
+            }),
+            _ => panic!("{}: not understood", self.text),
+        }
+    }
+
+    fn sensing(&mut self) -> Sensing {
+        match self.take("sensing") {
+            "off" => Sensing::Off,
+            "continuous" => Sensing::Continuous { period_ms: self.number("period_ms") },
+            "event" => Sensing::Event,
+            _ => panic!("{}: not understood", self.text),
+        }
+    }
+
+    fn events(&mut self) -> Events {
+        Events {
+            contact: self.one("contact"),
+            proximity: self.one("proximity"),
+            temperature: self.one("temperature"),
+            acceleration: self.one("acceleration"),
+            hysteresis: self.one("hysteresis"),
+        }
+    }
+
     /// The words of a parameter, through the struct that gives them their meaning.
     fn words(&mut self, number: u8) -> [i16; WORDS] {
         if self.has("words") {
@@ -175,9 +279,10 @@ impl<'a> Meaning<'a> {
                 };
             }
             Parameter::Mode => return [self.number("on"), 0, 0, 0, 0, 0],
-            Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => {
-                panic!("{}: given in words", self.text)
-            }
+            Parameter::Reply => return self.reply().words(),
+            Parameter::Sensing => return self.sensing().words(),
+            Parameter::Events => return self.events().words(),
+            Parameter::Cuts => return Cuts { deaf: self.bits("deaf") }.words(),
             Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
             Parameter::Identity => panic!("{}: identity is given in words", self.text),
         }
@@ -200,6 +305,24 @@ impl<'a> Meaning<'a> {
                 stimuli: self.number("stimuli"),
                 stimuli_late: self.number("stimuli_late"),
                 torques: self.number("torques"),
+            }),
+            "tree" => NetworkPage::Tree(Tree {
+                parent: match self.take("parent") {
+                    "none" => None,
+                    number => Some(number.parse().expect(self.text)),
+                },
+                up: self.number("up"),
+                depth: self.number("depth"),
+                round: self.number("round"),
+                children: self.bits("children"),
+                works: self.bits("works"),
+                sent: self.number("sent"),
+                taken: self.number("taken"),
+                dropped: self.number("dropped"),
+            }),
+            "ports" => NetworkPage::Ports(Ports {
+                ports: ["port0", "port1", "port2", "port3"].map(|key| self.port(key)),
+                changes: self.number("changes"),
             }),
             _ => NetworkPage::Refused(Refused {
                 length: self.number("length"),
@@ -254,7 +377,7 @@ impl<'a> Meaning<'a> {
             "sensors" => {
                 Message::Sensors { from: self.cell("from"), epoch: self.epoch(), page: self.sensors() }
             }
-            "heartbeat" | "heard" | "refused" => {
+            "heartbeat" | "heard" | "refused" | "tree" | "ports" => {
                 Message::Network { from: self.node("from"), epoch: self.epoch(), page: self.network() }
             }
             "read" | "write" => self.configure(),
@@ -358,9 +481,11 @@ fn every_kind_command_and_page_has_its_golden_frame() {
             "{command}"
         );
     }
-    for (kind, counts) in
-        [(Kind::Sensors, &[0, 1][..]), (Kind::Network, &[0, 1, 2]), (Kind::Stimulus, &[0, 1, 0x80, 0x81])]
-    {
+    for (kind, counts) in [
+        (Kind::Sensors, &[0, 1][..]),
+        (Kind::Network, &[0, 1, 2, 3, 4]),
+        (Kind::Stimulus, &[0, 1, 0x80, 0x81]),
+    ] {
         for &count in counts {
             assert!(
                 seen.iter().any(|packet| packet.id.kind == kind && packet.count == count),
@@ -494,6 +619,11 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
         let mut spoilt = sound;
         let wanted = match Parameter::from_number(*number) {
             None => (*number, Answer::UNKNOWN),
+            Some(Parameter::Reply) => (*number, cannot_be(Reply::from_words(*words))),
+            Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
+            Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
+            // The cell of the session is not in test mode.
+            Some(Parameter::Cuts) => (*number, Answer::CANNOT_BE),
             Some(parameter) => match spoilt.set(parameter, *words) {
                 Err(error) => (*number, error.code()),
                 Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
@@ -502,7 +632,35 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
         assert_eq!((*refused, *reason), wanted, "{pair:?}");
         codes.insert(*reason);
     }
-    assert!(codes.into_iter().eq([1, 2, 3, 4, 5, 6, 18]));
+    assert!(codes.into_iter().eq([1, 2, 3, 4, 5, 6, 18, 19]));
+}
+
+fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
+    assert!(read.is_none(), "{read:?} can be");
+    Answer::CANNOT_BE
+}
+
+#[test]
+fn wires_bytes_and_meaning_agree_both_ways() {
+    let read = |frame: &Frame| Lane::from_raw_id(frame.raw_id()).map(|lane| (lane, lane.read(frame)));
+    let mut kinds = BTreeSet::new();
+    let mut odd = 0;
+    for golden in lines(WIRE) {
+        match golden.comment {
+            "bad foreign" => assert_eq!(read(&golden.frame), None, "{}", golden.text),
+            "bad wire" => {
+                assert!(matches!(read(&golden.frame), Some((_, None))), "{}", golden.text);
+            }
+            comment => {
+                let (lane, message) = Meaning::new(comment).wire();
+                assert_eq!(read(&golden.frame), Some((lane, Some(message))), "{}", golden.text);
+                kinds.insert(golden.frame.data()[0]);
+                odd += u32::from(lane.frame(message).to_string() != golden.text);
+            }
+        }
+    }
+    assert!(kinds.into_iter().eq(1..=11), "every kind is there");
+    assert_eq!(odd, 4, "frames that nobody should write so");
 }
 
 /// The document's arithmetic of Algorithm 1, on its own example: 3 N on a cell with

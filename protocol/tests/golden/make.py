@@ -18,6 +18,7 @@ in the units of the document (quarter turns, Nm, N, g, degrees Celsius, m), as e
     classic.log     pairs of classic frames, with the times between them
     session.log     a cell is configured, hears joints, is pressed and answers
     refusals.log    writes that a commit refuses, and the refusal
+    wire.log        what cells say over the wires between them: bytes <-> meaning, and what is refused
     document.log    the frames spelled out in docs/protocol.md
 """
 
@@ -203,6 +204,37 @@ def counters(sender, epoch, page, values):
     return Packet(meaning, 4, sender, [signed(value) for value in values], epoch, page)
 
 
+NOBODY = 255
+
+
+def tree(sender, epoch, parent, up, depth, round_, children, works, counters_of_sums):
+    """`parent` is a cell's number, 0 for the gateway's side, or None."""
+    byte = NOBODY if parent is None else parent
+    sent, taken, dropped = counters_of_sums
+    words = [byte | up << 8, depth | round_ << 8, children | works << 8, sent, taken, dropped]
+    bits = lambda ports: "+".join(str(p) for p in range(8) if ports >> p & 1) or "none"
+    meaning = (
+        f"tree from={node(sender)} epoch={epoch} parent={'none' if parent is None else parent} up={up}"
+        f" depth={depth} round={round_} children={bits(children)} works={bits(works)}"
+        f" sent={sent} taken={taken} dropped={dropped}"
+    )
+    return Packet(meaning, 4, sender, [signed(word) for word in words], epoch, 3)
+
+
+PORT = {"hears": 12, "works": 13, "other-version": 14}
+
+
+def ports(sender, epoch, four, changes):
+    """`four` has a number, a port and flags for each port."""
+    words, texts = [], []
+    for number_there, port_there, *flags in four:
+        words.append(signed(number_there | port_there << 8 | sum(1 << PORT[flag] for flag in flags)))
+        texts.append("/".join([str(number_there), str(port_there), "+".join(flags) or "none"]))
+    fields = " ".join(f"port{index}={text}" for index, text in enumerate(texts))
+    meaning = f"ports from={node(sender)} epoch={epoch} {fields} changes={changes}"
+    return Packet(meaning, 4, sender, [*words, signed(changes)], epoch, 4)
+
+
 # Parameters: (number, fields as text, words).
 
 
@@ -241,6 +273,40 @@ def timing(period_us):
 
 def mode(on):
     return 5, f"on={on}", [on]
+
+
+def reply_torque():
+    return 6, "reply=torque", [0]
+
+
+def reply_sum(slot_us, deepest, carry):
+    text = f"reply=sum slot_us={slot_us} deepest={deepest} carry={carry}"
+    return 6, text, [1, signed(slot_us), deepest, carry]
+
+
+def sensing(kind, period_ms=0):
+    period = f" period_ms={period_ms}" if kind == "continuous" else ""
+    return 7, f"sensing={kind}{period}", [("off", "continuous", "event").index(kind), signed(period_ms)]
+
+
+def events(contact_n, proximity, temperature, acceleration_g, hysteresis):
+    words = [
+        nearest(contact_n, FORCE),
+        nearest(proximity, UNIT),
+        nearest(temperature, TEMPERATURE),
+        nearest(acceleration_g, ACCELERATION),
+        nearest(hysteresis, UNIT),
+    ]
+    text = (
+        f"contact={number(words[0], FORCE)} proximity={number(words[1], UNIT)}"
+        f" temperature={number(words[2], TEMPERATURE)} acceleration={number(words[3], ACCELERATION)}"
+        f" hysteresis={number(words[4], UNIT)}"
+    )
+    return 8, text, words
+
+
+def cuts(*deaf):
+    return 9, f"deaf={'+'.join(map(str, deaf)) or 'none'}", [sum(1 << port for port in deaf)]
 
 
 def row(joint, a, d, alpha, theta_offset):
@@ -290,6 +356,73 @@ def configuration_hash(parameters):
         image += struct.pack("<6h", *words, *[0] * (6 - len(words)))
     assert len(image) == 120
     return crc16(image)
+
+
+# --- Wires ---------------------------------------------------------------------------------------
+
+
+class Wire:
+    """Eight bytes under an identifier of 29 bits: kind, five bytes, CRC over identifier and kind to byte 5."""
+
+    def __init__(self, meaning, lane, kind, *rest):
+        self.meaning, self.lane = meaning, lane
+        self.body = bytes([kind, *rest, *[0] * (5 - len(rest))])
+
+    def id(self):
+        wire, back = self.lane
+        return 0x10000000 | wire << 1 | back
+
+    def crc(self):
+        return crc16(struct.pack("<I", self.id()) + self.body)
+
+    def bytes(self):
+        return self.body + struct.pack("<H", self.crc())
+
+    def classic(self):
+        return f"{self.id():08X}#{self.bytes().hex().upper()}"
+
+
+def over(lane, text):
+    name, *fields = text.split(" ", 1)
+    return " ".join([name, f"wire={lane[0]}", f"back={lane[1]}", *fields])
+
+
+HELLO = {"hears": 3, "up": 4, "unnumbered": 5}
+
+
+def hello(lane, number_here, port, flags=(), label=None, version=1):
+    """`label` is (round, depth), or None."""
+    bits = port | sum(1 << HELLO[flag] for flag in flags) | (label is not None) << 6
+    text = "none" if label is None else f"{label[0]}/{label[1]}"
+    meaning = (
+        f"hello version={version} number={number_here} port={port} flags={'+'.join(flags) or 'none'} label={text}"
+    )
+    return Wire(over(lane, meaning), lane, 1, version, number_here, bits, *(label or (0, 0)))
+
+
+def bare_wire(lane, name):
+    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "left": 6}[name])
+
+
+def grant(lane, round_, depth):
+    return Wire(over(lane, f"grant label={round_}/{depth}"), lane, 3, round_, depth)
+
+
+def state_of(lane, epoch):
+    return Wire(over(lane, f"state epoch={epoch}"), lane, 7, epoch)
+
+
+def missed(lane, epoch):
+    return Wire(over(lane, f"missed epoch={epoch}"), lane, 8, epoch)
+
+
+def seek(lane, round_):
+    return Wire(over(lane, f"seek round={round_}"), lane, 9, round_)
+
+
+def walk(lane, name, which, first, last):
+    kind = {"number": 10, "return": 11}[name]
+    return Wire(over(lane, f"{name} walk={which} first={first} last={last}"), lane, kind, which, first, last)
 
 
 # --- What a cell computes ------------------------------------------------------------------------
@@ -370,6 +503,10 @@ class Log:
         for packet in packets:
             self.add(packet.meaning, packet.fd())
 
+    def say(self, *wires):
+        for wire in wires:
+            self.add(wire.meaning, wire.classic())
+
     def text(self):
         return "\n".join(self.lines) + "\n"
 
@@ -421,7 +558,7 @@ def fd():
         *(sensors(cell(), epoch(), skin(words()[:3], words()[0], words()[:2])) for _ in range(2)),
     )
 
-    log.title("network: heartbeats, one for every bit of the state, then the counters")
+    log.title("network: heartbeats, one for every bit of the state, then the counters, the tree, the ports")
     log.put(
         heartbeat(12, 7, 100001, 0xBEEF, 4711, 3, ("configured", "active"), 2),
         heartbeat(1, 0, 0, 0, 0, 0),
@@ -434,9 +571,18 @@ def fd():
         counters(254, 255, 2, [65535, 65534, 32768, 32767, 1, 0]),
         *(counters(cell(), epoch(), page, [u16() for _ in range(6)]) for page in (1, 2)),
     )
+    log.put(
+        tree(12, 7, 3, 1, 4, 2, 0b0101, 0b0111, (1000, 200, 3)),
+        tree(1, 0, 0, 4, 0, 255, 0b1111, 0b11111, (65535, 32768, 1)),
+        tree(254, 255, 254, 3, 253, 128, 0b1000, 0b1000, (0, 65535, 32767)),
+        tree(9, 200, None, 0, 0, 7, 0, 0b0010, (5, 6, 7)),
+        ports(12, 7, [(3, 2, "hears", "works"), (0, 0), (254, 3, "hears"), (7, 0, "hears", "other-version")], 2),
+        ports(254, 255, [(254, 3, *PORT)] * 4, 65535),
+        ports(1, 0, [(0, 4, "hears", "works"), (0, 0), (0, 0), (0, 0)], 0),
+    )
 
     log.title("configure: reading")
-    log.put(*(read(12, parameter, parameter) for parameter in (0, 1, 2, 3, 4, 5, 16, 21, 127)))
+    log.put(*(read(12, parameter, parameter) for parameter in (0, *range(1, 10), 16, 21, 127)))
     log.put(read(EVERYONE, 255, 0), read(254, 0, 99))
 
     log.title("configure: writing")
@@ -457,6 +603,22 @@ def fd():
         write(254, 0, raw(99, [1, -1, MAX, MIN, 0, 256])),
     )
 
+    log.title("configure: what is switched at run time")
+    log.put(
+        write(EVERYONE, 20, reply_sum(1500, 6, 1)),
+        write(12, 21, reply_sum(65535, 253, 0)),
+        write(EVERYONE, 22, reply_torque()),
+        write(12, 23, sensing("continuous", 16)),
+        write(12, 24, sensing("continuous", 65535)),
+        write(EVERYONE, 25, sensing("event")),
+        write(12, 26, sensing("off")),
+        write(12, 27, events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5"))),
+        write(12, 28, events(Fraction(MAX, 1024), Fraction(MAX, 2**14), Fraction(MAX, 64), Fraction(MAX, 4096), 1)),
+        write(12, 29, cuts(0, 2)),
+        write(12, 30, cuts(0, 1, 2, 3, 4)),
+        write(12, 31, cuts()),
+    )
+
     log.title("configured: values, and every reason of a refusal")
     log.put(
         value(12, 0, raw(0, [signed(100001 & 0xFFFF), 100001 >> 16, 1, signed(0xBEEF), 0x1203, 0]), False),
@@ -464,7 +626,11 @@ def fd():
         value(12, 2, pose((0, 0, 0), (0, 0, 1)), False),
         value(12, 3, mode(1), True),
         value(254, 255, commit(0xBEEF), True),
-        *(refusal(12, 200, 1, reason) for reason in (1, 2, 3, 4, 5, 6, 16, 17, 18)),
+        value(12, 4, reply_sum(1500, 6, 1), True),
+        value(12, 5, sensing("off"), False),
+        value(12, 6, events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5")), False),
+        value(12, 7, cuts(3), True),
+        *(refusal(12, 200, 1, reason) for reason in (1, 2, 3, 4, 5, 6, 16, 17, 18, 19)),
         refusal(254, 255, 127, 16),
     )
 
@@ -503,6 +669,7 @@ def lenient():
     put(stimulus(3, 1, acceleration([1, 2, 3])), words=[1, 2, 3, -4, -5, -6])
     log.title("the epoch of a stimulus that holds from the next joints on")
     put(stimulus(3, None, PRESSED), epoch=77)
+    put(ports(3, 1, [(5, 2, "hears"), (0, 0), (0, 0), (0, 0)], 1), words=[5 | 2 << 8 | 1 << 12, 0, 0, 0, 1, 77])
     log.title("the words of a read")
     put(read(3, 5, 2), words=[1, 2, 3, 4, 5, 6])
     log.title("a refusal with the bit of a write, and with words after the reason")
@@ -577,7 +744,7 @@ def bad():
     log.title("pages that do not exist")
     for page in (2, 127, 128, 129, 255):
         meaningless(f"page kind=sensors page={page}", 3, 12, page)
-    for page in (3, 128, 255):
+    for page in (5, 128, 255):
         meaningless(f"page kind=network page={page}", 4, 12, page)
     for count, page in ((2, 2), (0x82, 2), (0xFF, 0x7F)):
         meaningless(f"page kind=stimulus page={page}", 7, 12, count)
@@ -773,16 +940,93 @@ def refusals():
 
     log.title("numbers that are not written like this, or not at all")
     case(raw(0, [1] * 6), 0, 1)
-    for unknown in (6, 15, 22, 126):
+    for unknown in (10, 15, 22, 126):
         case(raw(unknown, [1] * 6), unknown, 18)
     log.title("words that cannot even be staged")
     for parameter, reason in at_once:
         assert parameter[0] in by_number
         case(parameter, parameter[0], reason)
+    log.title("words that a switch cannot have, and a cut outside test mode")
+    for parameter in (
+        raw(6, [2, 1500, 6, 1]),
+        raw(6, [-1, 1500, 6, 1]),
+        raw(6, [1, 0, 6, 1]),
+        raw(6, [1, 1500, -1, 1]),
+        raw(6, [1, 1500, 254, 1]),
+        raw(7, [3, 16]),
+        raw(7, [-1, 16]),
+        raw(7, [1, 0]),
+        *(raw(8, [-1 if i == word else 1 for i in range(5)]) for word in range(5)),
+        raw(8, [1, 1, 1, 1, 16385]),
+        cuts(0),
+        cuts(),
+    ):
+        case(parameter, parameter[0], 19)
     log.title("what only the commit finds")
     for parameter, reason in at_commit:
         assert parameter[0] in by_number
         case(parameter, 127, reason)
+    return log
+
+
+def wire():
+    log = Log("wire.log", "What cells and the gateway's side say to each other over wires, and what is no word of that.")
+    log.title("every kind, in the order of a cell's life")
+    there, here = (12, 0), (12, 1)
+    log.say(
+        hello(there, 0, 2, ["unnumbered"]),
+        hello(here, 0, 4, ["hears"], (3, 0)),
+        bare_wire(there, "join"),
+        grant(here, 3, 0),
+        state_of(there, 255),
+        hello(there, 7, 2, ["hears", "up"], (3, 1)),
+        missed(here, 9),
+        seek(there, 3),
+        walk(here, "number", 5, 1, 254),
+        walk(there, "return", 5, 200, 199),
+        bare_wire(there, "leave"),
+        bare_wire(here, "left"),
+        bare_wire(here, "refuse"),
+    )
+    log.title("the greatest and the least of everything")
+    log.say(
+        hello((0, 0), 0, 0, version=0),
+        hello((65535, 1), 254, 7, list(HELLO), (255, 255), version=255),
+        grant((65535, 0), 255, 255),
+        state_of((0, 1), 0),
+        missed((1, 0), 128),
+        seek((255, 1), 255),
+        walk((256, 0), "number", 255, 255, 0),
+        walk((257, 1), "return", 0, 1, 1),
+    )
+    log.title("a label that nobody says is there is not looked at; the highest bit of a hello's flags neither")
+
+    def odd(meaning_of, *rest):
+        log.add(meaning_of.meaning, Wire("", meaning_of.lane, *rest).classic())
+
+    odd(hello(there, 7, 2), 1, 1, 7, 2, 9, 9)
+    odd(hello(there, 7, 2), 1, 1, 7, 2 | 0x80, 0, 0)
+    odd(bare_wire(there, "join"), 2, 1, 2, 3, 4, 5)
+    odd(grant(here, 3, 0), 3, 3, 0, 9, 9, 9)
+
+    log.title("kinds that do not exist")
+    for kind in (0, 12, 255):
+        log.add("bad wire", Wire("", there, kind, 1, 2, 3).classic())
+    log.title("damaged, on another lane, of another length")
+    good = hello(there, 7, 2, ["hears", "up"], (3, 1))
+    for bit in (0, 7, 8, 47, 48, 63):
+        flipped = bytearray(good.bytes())
+        flipped[bit // 8] ^= 1 << bit % 8
+        log.add("bad wire", f"{good.id():08X}#{flipped.hex().upper()}")
+    data = good.bytes().hex().upper()
+    log.add("bad wire", f"{good.id() ^ 1:08X}#{data}")
+    log.add("bad wire", f"{good.id() + 2:08X}#{data}")
+    log.add("bad wire", f"{good.id():08X}#{data[:14]}")
+    log.add("bad wire", f"{good.id():08X}#")
+    log.title("no wire: another identifier, a remote frame")
+    log.add("bad foreign", f"{good.id() ^ 0x10000000:08X}#{data}")
+    log.add("bad foreign", f"{good.id() | 0x20000:08X}#{data}")
+    log.add("bad foreign", f"{good.id():08X}#R8")
     return log
 
 
@@ -805,7 +1049,7 @@ def document():
 
 def main():
     stale = 0
-    for log in (fd(), lenient(), bad(), classic(), session(), refusals(), document()):
+    for log in (fd(), lenient(), bad(), classic(), session(), refusals(), wire(), document()):
         path = HERE / log.name
         if "--check" in sys.argv[1:]:
             if not path.exists() or path.read_text() != log.text():
