@@ -108,7 +108,8 @@ fn describe(out: &mut String, skin: &Description) -> fmt::Result {
         };
         let reply = match bus.reply {
             Reply::Torque => "torque".to_owned(),
-            Reply::Sum { slot_us } => format!("sum, slots of {slot_us} us"),
+            Reply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
+            Reply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
         };
         write!(out, "bus {} ({format}, {reply}): ", bus.name)?;
         let mut by_joint = BTreeMap::new();

@@ -121,7 +121,10 @@ fn the_reply_and_the_format_are_the_wanted_ones() {
     for bus in &skin.buses {
         assert_eq!(bus.format, protocol::can::Format::Classic);
         // 15 ms for no more than 20 slots.
-        assert!(matches!(bus.reply, protocol::skin::Reply::Sum { slot_us: 750..2_000 }), "{bus:?}");
+        assert!(
+            matches!(bus.reply, protocol::skin::Reply::Sum { slot_us: 750..2_000, carry: true }),
+            "{bus:?}"
+        );
     }
 }
 

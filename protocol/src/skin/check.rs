@@ -31,11 +31,55 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     let safety = safety(&raw.safety)?;
     let cells = cells(&raw.cell, &robot, &buses, contact)?;
     let skin = Skin { name: raw.name, robot, timing, buses, controller, safety, cells };
-    if skin.period_us().is_none() {
+    let Some(period_us) = skin.period_us() else {
         let path = [Key("timing"), Key("joint_broadcast_hz")];
         return Err(Fault::new(&path, raw.timing.joint_broadcast_hz, "at least 15.3 Hz are possible"));
+    };
+    for (index, bus) in skin.buses.iter().enumerate() {
+        match bus.reply {
+            Reply::Torque => {}
+            Reply::Sum { slot_us, .. } => tree(&skin, index, slot_us, period_us)?,
+        }
     }
     Ok(skin)
+}
+
+/// Sums need a way from every cell to the gateway's side, and a slot for each depth of the tree in one period.
+fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
+    let at = |key| [Key("bus"), Index(index), Key(key)];
+    if !skin.cells_of(index).any(|cell| cell.root) {
+        let why = "sums need a way to the gateway, and no cell of this bus has root = true: give it to one";
+        return Err(Fault::new(&at("reply"), "\"sum\"", why));
+    }
+    let depths = skin.wires(index).depths();
+    let depth = |cell: &Cell| depths.get(cell.node.index()).copied().flatten();
+    let is_cut_off = |cell: &Cell| cell.bus == index && depth(cell).is_none();
+    if let Some(first) = skin.cells.iter().position(is_cut_off) {
+        let node = skin.cells.get(first).map_or(0, |cell| cell.node.get());
+        let others = match skin.cells.iter().filter(|cell| is_cut_off(cell)).count() - 1 {
+            0 => String::new(),
+            1 => " (nor does another cell)".to_owned(),
+            count => format!(" (nor do {count} other cells)"),
+        };
+        let why = format!(
+            "no wire leads from here to a root of its bus{others}, which sums need: name neighbors on both ends, or \
+             set root = true"
+        );
+        return Err(Fault::new(&[Key("cell"), Index(first), Key("node")], node, why));
+    }
+    let slots = 1 + skin.cells_of(index).filter_map(depth).max().map_or(0, u32::from);
+    if u64::from(slots) * u64::from(slot_us) <= u64::from(period_us) {
+        return Ok(());
+    }
+    let greatest = u32::from(period_us).checked_div(slots).unwrap_or(0);
+    let remedy = if greatest > 0 {
+        format!("at most {greatest} us fit")
+    } else {
+        "no slots fit: send joints less often, or use more roots or buses".to_owned()
+    };
+    let why =
+        format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {remedy}");
+    Err(Fault::new(&at("slot_us"), slot_us, why))
 }
 
 fn finite(path: &[Step], value: f64) -> Checked<f64> {
@@ -194,22 +238,7 @@ fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
             if !seen.insert(bus.name.as_str()) {
                 return Err(Fault::new(&at("name"), quoted, "this bus is named twice"));
             }
-            let reply = match (bus.reply.as_str(), bus.slot_us) {
-                ("torque", None) => Reply::Torque,
-                ("torque", Some(got)) => {
-                    return Err(Fault::new(&at("slot_us"), got, "only with reply = \"sum\""));
-                }
-                ("sum", Some(got)) => match u32::try_from(got) {
-                    Ok(slot_us) if slot_us > 0 => Reply::Sum { slot_us },
-                    _ => return Err(Fault::new(&at("slot_us"), got, "must be above 0")),
-                },
-                ("sum", None) => {
-                    return Err(Fault::new(&at("reply"), "\"sum\"", "slot_us is needed with it"));
-                }
-                (got, _) => {
-                    return Err(Fault::new(&at("reply"), format!("{got:?}"), "\"torque\" or \"sum\""));
-                }
-            };
+            let reply = reply(index, bus)?;
             let format = match bus.format.as_str() {
                 "fd" => Format::Fd,
                 "classic" => Format::Classic,
@@ -219,6 +248,23 @@ fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
             Ok(Bus { name: bus.name.clone(), reply, format, bitrate, data_bitrate })
         })
         .collect()
+}
+
+/// What the cells of a bus answer with.
+fn reply(index: usize, bus: &raw::Bus) -> Checked<Reply> {
+    let at = |key| [Key("bus"), Index(index), Key(key)];
+    let only_sum = "only with reply = \"sum\"";
+    match (bus.reply.as_str(), bus.slot_us, bus.carry) {
+        ("torque", None, None) => Ok(Reply::Torque),
+        ("torque", Some(got), _) => Err(Fault::new(&at("slot_us"), got, only_sum)),
+        ("torque", None, Some(got)) => Err(Fault::new(&at("carry"), got, only_sum)),
+        ("sum", Some(got), carry) => match u32::try_from(got) {
+            Ok(slot_us) if slot_us > 0 => Ok(Reply::Sum { slot_us, carry: carry.unwrap_or(true) }),
+            _ => Err(Fault::new(&at("slot_us"), got, "must be above 0")),
+        },
+        ("sum", None, _) => Err(Fault::new(&at("reply"), "\"sum\"", "slot_us is needed with it")),
+        (got, ..) => Err(Fault::new(&at("reply"), format!("{got:?}"), "\"torque\" or \"sum\"")),
+    }
 }
 
 /// The bit rates of hardware, which need not be said.
@@ -322,7 +368,37 @@ fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Contact) -> Chec
             }
         }
     }
+    contradictions(&cells)?;
     Ok(cells)
+}
+
+/// Every wire has two ends: whom a cell names so often must name it as often.
+fn contradictions(cells: &[Cell]) -> Checked<()> {
+    let mut mentions = HashMap::new();
+    for cell in cells {
+        for &neighbor in cell.neighbors.iter().flatten() {
+            *mentions.entry((cell.bus, cell.node, neighbor)).or_insert(0) += 1;
+        }
+    }
+    for (index, cell) in cells.iter().enumerate() {
+        let node = cell.node;
+        let mut named = HashMap::new();
+        for (port, neighbor) in cell.neighbors.iter().enumerate() {
+            let Some(neighbor) = *neighbor else { continue };
+            let so_far = named.entry(neighbor).or_insert(0);
+            *so_far += 1;
+            let back = mentions.get(&(cell.bus, neighbor, node)).copied().unwrap_or(0);
+            if *so_far > back {
+                let path = [Key("cell"), Index(index), Key("neighbors"), Index(port)];
+                let why = format!(
+                    "this wire has no other end: name node {node} in a further one of the neighbors of node {neighbor}, \
+                     or put 0 here"
+                );
+                return Err(Fault::new(&path, neighbor, why));
+            }
+        }
+    }
+    Ok(())
 }
 
 fn cell(index: usize, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Cell> {
@@ -331,8 +407,9 @@ fn cell(index: usize, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Conta
         let names = buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
         Fault::new(&at("bus"), format_args!("{:?}", raw.bus), format_args!("no such bus; there is {names}"))
     })?;
-    let node =
-        CellId::new(raw.node).map_err(|_| Fault::new(&at("node"), raw.node, "a cell's node is 1 to 254"))?;
+    let node = CellId::new(raw.node).map_err(|_| {
+        Fault::new(&at("node"), raw.node, "a cell's node is 1 to 254; further cells need another bus")
+    })?;
     let joint = u8::try_from(raw.joint).ok().filter(|&k| k > 0 && usize::from(k) <= robot.joints.len());
     let joint = joint.ok_or_else(|| {
         Fault::new(&at("joint"), raw.joint, format_args!("the robot has joints 1 to {}", robot.joints.len()))

@@ -5,6 +5,7 @@
 
 mod check;
 mod raw;
+mod wires;
 
 use std::path::Path;
 
@@ -13,6 +14,8 @@ use crate::document::{self, DocumentError};
 use crate::fixed::Q1_14;
 use crate::id::CellId;
 use crate::parameters::{Contact, Parameters, Pose, Row};
+
+pub use wires::Wires;
 
 /// A checked description.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,6 +93,8 @@ pub enum Reply {
     Sum {
         /// Width of a slot in µs.
         slot_us: u32,
+        /// Whether what rounding takes away is carried into a cell's next value.
+        carry: bool,
     },
 }
 

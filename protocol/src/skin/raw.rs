@@ -60,6 +60,7 @@ pub(super) struct Bus {
     pub(super) reply: String,
     pub(super) format: String,
     pub(super) slot_us: Option<i64>,
+    pub(super) carry: Option<bool>,
     pub(super) bitrate: Option<i64>,
     pub(super) data_bitrate: Option<i64>,
 }

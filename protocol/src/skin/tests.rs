@@ -44,7 +44,27 @@ joint = 1
 position = [0.0, 0.1, 0.0]
 orientation = [0.7071068, 0.0, 0.0, 0.7071068]
 alpha_c = 0.5
+neighbors = [0, 0, 0, 1]
 "#;
+
+/// A skin whose only bus has these cells, numbered from 1: what is wired to their ports, and whether they are
+/// roots.
+pub(super) fn wired(cells: &[([i64; 4], bool)]) -> Skin {
+    Skin::parse("skin.toml", &wired_text("reply = \"torque\"", cells)).unwrap()
+}
+
+fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
+    let (head, _) = GOOD.split_once("[[cell]]").unwrap();
+    let mut text = head.replacen("reply = \"torque\"", reply, 1);
+    for (at, (neighbors, root)) in cells.iter().enumerate() {
+        let node = at + 1;
+        text.push_str(&format!(
+            "[[cell]]\nbus = \"vcan0\"\nnode = {node}\njoint = 1\nposition = [0.1, 0.0, 0.0]\n\
+             orientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = {neighbors:?}\nroot = {root}\n"
+        ));
+    }
+    text
+}
 
 fn says(from: &str, to: &str) -> String {
     assert!(GOOD.contains(from), "{from}");
@@ -77,7 +97,10 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("node = 2", "node = 1"),
         "skin.toml:40: cell[1].node = 1: cell[0] has this node on \"vcan0\" already"
     );
-    assert_eq!(says("node = 2", "node = 255"), "skin.toml:40: cell[1].node = 255: a cell's node is 1 to 254");
+    assert_eq!(
+        says("node = 2", "node = 255"),
+        "skin.toml:40: cell[1].node = 255: a cell's node is 1 to 254; further cells need another bus"
+    );
     assert_eq!(
         says("joint = 1", "joint = 3"),
         "skin.toml:41: cell[1].joint = 3: the robot has joints 1 to 2"
@@ -134,6 +157,70 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         "skin.toml:20: bus[0].name = \"a-very-long-name\": \
          an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`"
     );
+}
+
+#[test]
+fn a_wire_has_two_ends() {
+    assert_eq!(
+        says("neighbors = [2, 0, 0, 0]", "neighbors = [2, 2, 0, 0]"),
+        "skin.toml:36: cell[0].neighbors[1] = 2: this wire has no other end: \
+         name node 1 in a further one of the neighbors of node 2, or put 0 here"
+    );
+    assert_eq!(
+        says("neighbors = [0, 0, 0, 1]", "neighbors = [0, 0, 0, 0]"),
+        "skin.toml:36: cell[0].neighbors[0] = 2: this wire has no other end: \
+         name node 1 in a further one of the neighbors of node 2, or put 0 here"
+    );
+    assert_eq!(
+        says("neighbors = [2, 0, 0, 0]", "neighbors = [0, 0, 0, 0]"),
+        "skin.toml:45: cell[1].neighbors[3] = 1: this wire has no other end: \
+         name node 2 in a further one of the neighbors of node 1, or put 0 here"
+    );
+}
+
+#[test]
+fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
+    const CHAIN: [([i64; 4], bool); 4] =
+        [([2, 0, 0, 0], true), ([1, 3, 0, 0], false), ([2, 4, 0, 0], false), ([3, 0, 0, 0], false)];
+    let parse = |reply: &str, cells: &[_]| Skin::parse("skin.toml", &wired_text(reply, cells));
+    let bus = |reply: &str| parse(reply, &CHAIN).unwrap().buses[0].reply;
+    let fault = |reply: &str, cells: &[_]| parse(reply, cells).unwrap_err().to_string();
+    assert_eq!(bus("reply = \"sum\"\nslot_us = 4000"), Reply::Sum { slot_us: 4_000, carry: true });
+    let without = "reply = \"sum\"\nslot_us = 1\ncarry = false";
+    assert_eq!(bus(without), Reply::Sum { slot_us: 1, carry: false });
+    assert_eq!(
+        fault("reply = \"torque\"\ncarry = true", &CHAIN),
+        "skin.toml:22: bus[0].carry = true: only with reply = \"sum\""
+    );
+    assert_eq!(
+        fault("reply = \"sum\"\nslot_us = 4001", &CHAIN),
+        "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us from joints to joints: \
+         at most 4000 us fit"
+    );
+    let mut cells = CHAIN;
+    cells[0].1 = false;
+    assert_eq!(
+        fault(without, &cells),
+        "skin.toml:21: bus[0].reply = \"sum\": sums need a way to the gateway, and no cell of this bus has \
+         root = true: give it to one"
+    );
+    let cut = |cells: &[_]| fault(without, cells).split_once(": no wire").unwrap().1.to_owned();
+    cells = CHAIN;
+    (cells[1].0, cells[2].0) = ([1, 0, 0, 0], [0, 4, 0, 0]);
+    assert_eq!(
+        fault(without, &cells),
+        "skin.toml:50: cell[2].node = 3: no wire leads from here to a root of its bus (nor does another cell), \
+         which sums need: name neighbors on both ends, or set root = true"
+    );
+    assert_eq!(
+        parse("reply = \"torque\"", &cells).unwrap().wires(0).depths()[..4],
+        [Some(0), Some(1), None, None]
+    );
+    assert!(
+        cut(&[([0; 4], true), ([0; 4], false)]).starts_with(" leads from here to a root of its bus, which")
+    );
+    let three = [([0; 4], true), ([0; 4], false), ([0; 4], false), ([0; 4], false)];
+    assert!(cut(&three).starts_with(" leads from here to a root of its bus (nor do 2 other cells), which"));
 }
 
 #[test]

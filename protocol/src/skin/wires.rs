@@ -1,0 +1,240 @@
+//! The wires of a bus: which port leads where, and on which lane of the bus each end speaks.
+//!
+//! Wires are numbered in the order of their first mention: cells in the file's order, ports 0 to 3. After them
+//! comes one wire for each root, to the gateway's side, in the file's order. Two wires between the same two
+//! cells pair in the order of their ports. Whoever is mentioned first speaks on [`Lane::back`] = false, the
+//! other end on true; of a root's wire the cell is the first end.
+//!
+//! ```text
+//!   cell 1   neighbors = [2, 2, 0, 0], root = true      wire 0   1 port 0 <-> 2 port 1
+//!   cell 2   neighbors = [3, 1, 1, 0]                        1   1 port 1 <-> 2 port 2
+//!   cell 3   neighbors = [0, 0, 0, 2]                        2   2 port 0 <-> 3 port 3
+//!                                                            3   1 uplink <-> the gateway's side
+//! ```
+
+use std::collections::VecDeque;
+
+use super::{Cell, Skin};
+use crate::id::CellId;
+use crate::wire::{Lane, MAX, PORTS, UPLINK};
+
+/// A port of a cell; [`UPLINK`] is where a root is wired to the gateway's side.
+type End = (CellId, usize);
+
+// A bus never has more wires than lanes can number.
+const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX);
+
+/// The wires of one bus.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Wires {
+    /// By cell ([`CellId::index`]) and port, the lane on which it sends.
+    lanes: Vec<[Option<Lane>; PORTS + 1]>,
+    /// By wire, the end mentioned first and the other one, which is none at the gateway's side.
+    ends: Vec<(End, Option<End>)>,
+}
+
+impl Skin {
+    /// The wires of one bus, given as an index into [`Skin::buses`].
+    #[must_use]
+    pub fn wires(&self, bus: usize) -> Wires {
+        let cells: Vec<_> = self.cells_of(bus).collect();
+        Wires::new(&cells)
+    }
+}
+
+impl Wires {
+    /// The wires of these cells, all of one bus. A mention that has no other end, which no checked skin has,
+    /// is no wire.
+    pub(super) fn new(cells: &[&Cell]) -> Self {
+        let mut wires = Self { lanes: vec![[None; PORTS + 1]; CellId::COUNT], ends: Vec::new() };
+        for cell in cells {
+            for (port, neighbor) in cell.neighbors.iter().enumerate() {
+                let Some(neighbor) = *neighbor else { continue };
+                if wires.lane(cell.node, port).is_some() {
+                    continue;
+                }
+                let other = cells.iter().find(|other| other.node == neighbor);
+                let back = other.and_then(|other| {
+                    let mut ports = (0..PORTS).zip(&other.neighbors);
+                    let names_us = |&(port, back): &(usize, &Option<CellId>)| {
+                        *back == Some(cell.node) && wires.lane(neighbor, port).is_none()
+                    };
+                    ports.find(names_us).map(|(port, _)| port)
+                });
+                if let Some(back) = back {
+                    wires.add((cell.node, port), Some((neighbor, back)));
+                }
+            }
+        }
+        for cell in cells.iter().filter(|cell| cell.root) {
+            wires.add((cell.node, UPLINK), None);
+        }
+        wires
+    }
+
+    fn add(&mut self, first: End, second: Option<End>) {
+        let Ok(wire) = u16::try_from(self.ends.len()) else { return };
+        self.ends.push((first, second));
+        for (end, back) in [(Some(first), false), (second, true)] {
+            let slot = end.and_then(|(cell, port)| {
+                self.lanes.get_mut(cell.index()).and_then(|lanes| lanes.get_mut(port))
+            });
+            if let Some(slot) = slot {
+                *slot = Some(Lane { wire, back });
+            }
+        }
+    }
+
+    fn lane(&self, cell: CellId, port: usize) -> Option<Lane> {
+        *self.lanes.get(cell.index())?.get(port)?
+    }
+
+    /// The lanes that a cell sends on, by port, with [`UPLINK`] for a root's wire to the gateway's side. What
+    /// it hears there comes on the reversed lane.
+    #[must_use]
+    pub fn of_cell(&self, cell: CellId) -> [Option<Lane>; PORTS + 1] {
+        self.lanes.get(cell.index()).copied().unwrap_or_default()
+    }
+
+    /// The roots in the file's order, each with the lane on which the gateway's side speaks to it.
+    pub fn roots(&self) -> impl Iterator<Item = (CellId, Lane)> {
+        let uplinks = self.ends.iter().filter(|(_, second)| second.is_none());
+        uplinks.filter_map(|&((cell, port), _)| Some((cell, self.lane(cell, port)?.reversed())))
+    }
+
+    /// Where a port leads: to a port of another cell; `None` for a free one, and for an uplink, which leads to
+    /// the gateway's side.
+    #[must_use]
+    pub fn other_end(&self, cell: CellId, port: usize) -> Option<(CellId, usize)> {
+        let lane = self.lane(cell, port)?;
+        let &(first, second) = self.ends.get(usize::from(lane.wire))?;
+        if lane.back { Some(first) } else { second }
+    }
+
+    /// How many wires there are, those of the roots among them.
+    #[must_use]
+    pub const fn count(&self) -> usize {
+        self.ends.len()
+    }
+
+    /// By cell ([`CellId::index`]), how many wires it is from the nearest root, which itself is at 0; `None`
+    /// when no wire leads there from a root.
+    #[must_use]
+    pub fn depths(&self) -> [Option<u8>; CellId::COUNT] {
+        let mut depths = [None; CellId::COUNT];
+        let mut next: VecDeque<_> = self.roots().map(|(root, _)| (root, 0_u8)).collect();
+        while let Some((cell, depth)) = next.pop_front() {
+            let Some(slot @ None) = depths.get_mut(cell.index()) else { continue };
+            *slot = Some(depth);
+            let ends = (0..PORTS).filter_map(|port| self.other_end(cell, port));
+            next.extend(ends.map(|(other, _)| (other, depth.saturating_add(1))));
+        }
+        depths
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::skin::tests::wired;
+
+    fn id(number: usize) -> CellId {
+        CellId::new(i64::try_from(number).unwrap()).unwrap()
+    }
+
+    fn lane(wire: u16, back: bool) -> Option<Lane> {
+        Some(Lane { wire, back })
+    }
+
+    #[test]
+    fn wires_are_numbered_as_they_are_mentioned_and_roots_come_last() {
+        let skin = wired(&[([2, 2, 0, 0], true), ([3, 1, 1, 0], false), ([0, 0, 0, 2], true)]);
+        let wires = skin.wires(0);
+        assert_eq!(wires.count(), 5);
+        let none = None;
+        assert_eq!(wires.of_cell(id(1)), [lane(0, false), lane(1, false), none, none, lane(3, false)]);
+        assert_eq!(wires.of_cell(id(2)), [lane(2, false), lane(0, true), lane(1, true), none, none]);
+        assert_eq!(wires.of_cell(id(3)), [none, none, none, lane(2, true), lane(4, false)]);
+        let roots: Vec<_> = wires.roots().collect();
+        assert_eq!(roots, [(id(1), Lane { wire: 3, back: true }), (id(3), Lane { wire: 4, back: true })]);
+        assert_eq!(wires.other_end(id(1), 1), Some((id(2), 2)));
+        assert_eq!(wires.other_end(id(1), 2), None, "a free port");
+        assert_eq!(wires.other_end(id(1), UPLINK), None, "the gateway's side");
+        assert_eq!(wires.of_cell(id(200)), [None; PORTS + 1], "no such cell");
+    }
+
+    #[test]
+    fn a_cell_is_as_deep_as_its_shortest_way_to_a_root() {
+        // 1 - 2 - 3 - 4 - 1 in a ring; 5 hangs below 3.
+        let skin = wired(&[
+            ([2, 4, 0, 0], true),
+            ([1, 3, 0, 0], false),
+            ([2, 4, 5, 0], false),
+            ([3, 1, 0, 0], false),
+            ([3, 0, 0, 0], false),
+        ]);
+        let depths = skin.wires(0).depths();
+        assert_eq!(depths[..6], [Some(0), Some(1), Some(2), Some(1), Some(3), None]);
+    }
+
+    /// Cells whose ports are joined at random, and of which the first is a root.
+    fn wiring() -> impl Strategy<Value = Vec<([i64; PORTS], bool)>> {
+        let joints = proptest::collection::vec((0..24_usize, 0..PORTS, 0..24_usize, 0..PORTS), 0..60);
+        (joints, proptest::collection::vec(any::<bool>(), 24)).prop_map(|(joints, roots)| {
+            let mut cells: Vec<_> = roots.into_iter().map(|root| ([0; PORTS], root)).collect();
+            for (a, p, b, q) in joints {
+                if a != b && cells[a].0[p] == 0 && cells[b].0[q] == 0 {
+                    cells[a].0[p] = i64::try_from(b + 1).unwrap();
+                    cells[b].0[q] = i64::try_from(a + 1).unwrap();
+                }
+            }
+            cells
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn every_wire_has_two_ends_with_opposite_lanes(cells in wiring()) {
+            let wires = wired(&cells).wires(0);
+            let mut speakers = HashMap::new();
+            for (at, (neighbors, root)) in cells.iter().enumerate() {
+                let cell = id(at + 1);
+                let lanes = wires.of_cell(cell);
+                prop_assert_eq!(lanes[UPLINK].is_some(), *root);
+                for (port, lane) in lanes.into_iter().enumerate().filter_map(|(port, lane)| Some((port, lane?))) {
+                    prop_assert_eq!(speakers.insert(lane, cell), None, "one speaker a lane");
+                    if port == UPLINK {
+                        continue;
+                    }
+                    let (other, back) = wires.other_end(cell, port).unwrap();
+                    prop_assert_eq!(i64::from(other.get()), neighbors[port]);
+                    prop_assert_eq!(wires.other_end(other, back), Some((cell, port)));
+                    prop_assert_eq!(wires.of_cell(other)[back], Some(lane.reversed()));
+                }
+                let wired = neighbors.iter().filter(|&&neighbor| neighbor != 0).count();
+                prop_assert_eq!(lanes[..PORTS].iter().flatten().count(), wired, "no end is left out");
+            }
+            for (root, lane) in wires.roots() {
+                prop_assert_eq!(speakers.insert(lane, root), None, "the gateway's side has its own lanes");
+            }
+            prop_assert_eq!(speakers.len(), 2 * wires.count());
+            prop_assert!(speakers.keys().all(|lane| usize::from(lane.wire) < wires.count()), "dense");
+        }
+
+        #[test]
+        fn depths_differ_by_one_wire_at_most(cells in wiring()) {
+            let wires = wired(&cells).wires(0);
+            let depths = wires.depths();
+            for (at, (_, root)) in cells.iter().enumerate() {
+                let others = (0..PORTS).filter_map(|port| wires.other_end(id(at + 1), port));
+                let nearest = others.map(|(other, _)| depths[other.index()]).min_by_key(|depth| depth.unwrap_or(u8::MAX));
+                let expected = if *root { Some(0) } else { nearest.flatten().map(|depth| depth + 1) };
+                prop_assert_eq!(depths[at], expected);
+            }
+        }
+    }
+}
