@@ -6,5 +6,7 @@ pub mod flash;
 #[cfg(feature = "host")]
 pub mod io;
 pub mod kernel;
+pub mod network;
 pub mod node;
 pub mod sine;
+pub mod sum;

@@ -12,6 +12,7 @@
 
 mod configuration;
 mod stimuli;
+mod summing;
 mod switches;
 
 use heapless::Deque;
@@ -23,13 +24,15 @@ use protocol::message::{
     VERSION,
 };
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
-use protocol::parameters::{Parameter, Parameters};
+use protocol::parameters::{Parameter, Parameters, Reply};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage};
 
 use crate::contact::Torque;
 use crate::flash::Kept;
 use crate::kernel::Kernel;
+use crate::network::Network;
+use crate::sum::{Begin, Sum, Words};
 use configuration::{Configuration, Written};
 use stimuli::{Arrival, Stimuli};
 use switches::Switches;
@@ -89,6 +92,15 @@ impl Identity {
     }
 }
 
+/// What is being written into flash.
+#[derive(Clone, Copy, Debug)]
+enum Storing {
+    /// Parameters that somebody committed, with the request's tag.
+    Parameters(Parameters, u8),
+    /// The number that the network gave.
+    Number,
+}
+
 /// How far a cell is with claiming its number.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Claim {
@@ -117,10 +129,23 @@ pub struct Node {
     sent: u16,
     halves: [Half; HEARD],
     outbox: Deque<Message, OUTBOX>,
-    storing: Option<(Parameters, u8)>,
+    storing: Option<Storing>,
     switches: Switches,
-    wired: u8,
+    network: Network,
+    sums: Sum,
+    /// By port, whose sums are heard.
+    heard_sums: [Option<CellId>; PORTS],
     hears_changed: bool,
+    /// The parent that this epoch's sum is for, and its port.
+    parent: Option<(usize, Option<CellId>)>,
+    /// Whether the parent's sum of this epoch was heard.
+    heard_parent: bool,
+    /// Sums in a row that the parent did not take, without and with the present epoch's.
+    misses: (u8, u8),
+    changes: u16,
+    /// A sync that waits for the present epoch's end.
+    asked: bool,
+    tell_tree: bool,
     claim: Claim,
     next_heartbeat: Micros,
     defended: Option<Micros>,
@@ -149,10 +174,18 @@ impl Node {
             outbox: Deque::new(),
             storing: None,
             switches: Switches::default(),
-            wired: 0,
+            network: Network::new(now),
+            sums: Sum::default(),
+            heard_sums: [None; PORTS],
             hears_changed: false,
+            parent: None,
+            heard_parent: false,
+            misses: (0, 0),
+            changes: 0,
+            asked: false,
+            tell_tree: true,
             claim: Claim::Unsaid,
-            next_heartbeat: now + Span(u64::from(identity.serial) * 1_000 % FIRST_WORD.0),
+            next_heartbeat: first_word(identity, now),
             defended: None,
             taken: None,
         }
@@ -161,17 +194,16 @@ impl Node {
     /// The same cell in a network: bit p says that port p leads somewhere, bit 4 that it is wired to the
     /// gateway's side.
     #[must_use]
-    pub const fn with_ports(mut self, wired: u8) -> Self {
-        self.wired = wired;
+    pub fn with_ports(mut self, wired: u8) -> Self {
+        let number = self.identity.cell.map_or(0, CellId::get);
+        let phase = Span(u64::from(self.identity.serial) * 1_000 % HEARTBEAT.0);
+        self.network = self.network.wired(wired, number, phase);
         self
     }
 
-    /// Takes what came in through a port.
-    pub const fn handle_port(&mut self, _now: Micros, _port: usize, _message: PortMessage) {}
-
-    /// The next message for a port.
-    pub const fn poll_port_transmit(&mut self) -> Option<(usize, PortMessage)> {
-        None
+    /// The next message for a port: to be sent before the packets of the same call.
+    pub fn poll_port_transmit(&mut self) -> Option<(usize, PortMessage)> {
+        self.network.poll_transmit()
     }
 
     /// Whether the identifiers that it hears have changed since the last call.
@@ -204,25 +236,29 @@ impl Node {
 
     /// When [`Node::handle_timeout`] has something to do; calling it earlier does no harm.
     #[must_use]
-    pub const fn poll_timeout(&self) -> Micros {
-        self.next_heartbeat
+    pub fn poll_timeout(&self) -> Micros {
+        let sums = self.sums.poll_timeout().unwrap_or(Micros(u64::MAX));
+        self.next_heartbeat.min(self.network.poll_timeout()).min(sums)
     }
 
     /// What has to go into flash; then comes [`Node::handle_stored`].
     #[must_use]
     pub fn poll_store(&self) -> Option<Kept> {
-        self.storing.map(|(parameters, _)| Kept { number: self.identity.cell, parameters: Some(parameters) })
+        let parameters = match self.storing? {
+            Storing::Parameters(parameters, _) => Some(parameters),
+            Storing::Number => self.configuration.in_use().map(|in_use| in_use.parameters),
+        };
+        Some(Kept { number: self.identity.cell, parameters })
     }
 
     /// Flash was written, or could not be.
     pub fn handle_stored(&mut self, written: bool) {
-        if let Some((parameters, tag)) = self.storing.take() {
-            let answer = self.configuration.stored(parameters, written);
-            self.flags =
-                self.flags.with(State::FLASH_DAMAGED, self.flags.has(State::FLASH_DAMAGED) && !written);
-            if let Some(from) = self.identity.cell {
-                self.push(Message::Configured { from, tag, answer });
-            }
+        // A number that could not be kept is given anew after the next start.
+        let Some(Storing::Parameters(parameters, tag)) = self.storing.take() else { return };
+        let answer = self.configuration.stored(parameters, written);
+        self.flags = self.flags.with(State::FLASH_DAMAGED, self.flags.has(State::FLASH_DAMAGED) && !written);
+        if let Some(from) = self.identity.cell {
+            self.push(Message::Configured { from, tag, answer });
         }
     }
 
@@ -234,7 +270,8 @@ impl Node {
     /// By slot of a pair's waiting half.
     fn slots(&self) -> [Option<Id>; HEARD] {
         let mut slots = [None; HEARD];
-        for (slot, id) in slots.iter_mut().zip(self.identity.hears()) {
+        let sums = self.heard_sums.map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
+        for (slot, id) in slots.iter_mut().zip(self.identity.hears().into_iter().chain(sums)) {
             *slot = id;
         }
         slots
@@ -242,7 +279,10 @@ impl Node {
 
     /// Takes in that time has passed. Harmless when called early.
     pub fn handle_timeout(&mut self, now: Micros) {
-        if now < self.next_heartbeat {
+        self.network.handle_time(now);
+        self.after_network(now);
+        self.handle_sums(now);
+        if now < self.next_heartbeat || self.identity.cell.is_none() {
             return;
         }
         if self.claim == Claim::Unsaid {
@@ -256,6 +296,12 @@ impl Node {
 
     fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
+        if self.network.exists() {
+            self.tell_tree(now);
+            if self.network.ports_changed(now) {
+                self.push_ports(now);
+            }
+        }
         // After a hang the missed ones are skipped, and the phase is kept.
         let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
         self.next_heartbeat = self.next_heartbeat + Span((missed + 1) * HEARTBEAT.0);
@@ -313,7 +359,7 @@ impl Node {
         };
         match message {
             Message::Joints { epoch, joints } => {
-                self.take_joints(age, epoch, &joints);
+                self.take_joints(now, age, epoch, &joints);
                 self.heartbeat_before_the_next_joints(now);
             }
             Message::Halt => {
@@ -325,24 +371,29 @@ impl Node {
             Message::Network { page, .. } => self.hear_own_number(now, &page),
             // Whose number is in doubt answers nothing.
             Message::Sync | Message::Report | Message::Configure { .. } if self.claim != Claim::Settled => {}
+            Message::Sync if self.sums.is_on() && !self.sums.is_settled() => self.asked = true,
             Message::Sync => self.push_heartbeat(),
             Message::Report => {
                 self.push_network(NetworkPage::Heard(self.heard));
                 self.push_network(NetworkPage::Refused(self.refused));
                 self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
                 self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
+                if self.network.exists() {
+                    self.push_tree(now);
+                    self.push_ports(now);
+                }
             }
-            Message::Configure { tag, request, .. } => self.configure(tag, request),
+            Message::Configure { tag, request, .. } => self.configure(now, tag, request),
+            Message::Sum { from, epoch, torque, count } => {
+                self.take_sum(now, from, epoch, Words { torque, count });
+            }
             // None of these is heard, see `Identity::hears`.
-            Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Configured { .. } => {}
+            Message::Torque { .. } | Message::Sensors { .. } | Message::Configured { .. } => {}
         }
     }
 
     /// Computes and answers; the paper's Eq. 8 and Algorithm 1.
-    fn take_joints(&mut self, age: Span, epoch: Epoch, joints: &Joints) {
+    fn take_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
         if self.epoch == Some(epoch) {
             count(&mut self.heard.joints_repeated);
             return;
@@ -358,14 +409,22 @@ impl Node {
         self.stimuli.latch(epoch);
         if in_use.is_some_and(|in_use| age.0 > u64::from(in_use.parameters.period_us)) {
             count(&mut self.heard.joints_late);
-            return;
+            return self.sums.skip();
         }
         count(&mut self.heard.joints);
         if self.claim != Claim::Settled || self.flags.has(State::HALTED) {
-            return;
+            return self.sums.skip();
         }
-        let Some(in_use) = in_use else { return };
+        let Some(in_use) = in_use else { return self.sums.skip() };
         let force = in_use.force(self.stimuli.skin());
+        if self.sums.is_on() {
+            let torque =
+                force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));
+            let period = Span(in_use.parameters.period_us.into());
+            self.active = force.is_active();
+            let begin = Begin { at: now - age, period, ..self.freeze(epoch) };
+            return self.begin_sum(now, &begin, torque);
+        }
         if !force.is_active() {
             self.end_contact();
             return;
@@ -420,7 +479,7 @@ impl Node {
         }
     }
 
-    fn configure(&mut self, tag: u8, request: Request) {
+    fn configure(&mut self, now: Micros, tag: u8, request: Request) {
         let Some(from) = self.identity.cell else { return };
         let number = match request {
             Request::Read { number } | Request::Write { number, .. } => number,
@@ -445,18 +504,29 @@ impl Node {
             (Some(parameter), Request::Write { words, .. }) => {
                 let test_mode = self.flags.has(State::TEST_MODE);
                 if let Some(answer) = self.switches.write(parameter, words, test_mode) {
+                    self.switch(now);
                     return self.push(Message::Configured { from, tag, answer });
                 }
                 match self.configuration.write(parameter, words) {
                     Written::Answer(answer) => answer,
                     Written::Store(parameters) => {
-                        self.storing = Some((parameters, tag));
+                        self.storing = Some(Storing::Parameters(parameters, tag));
                         return;
                     }
                 }
             }
         };
         self.push(Message::Configured { from, tag, answer });
+    }
+
+    /// Switches were set.
+    fn switch(&mut self, now: Micros) {
+        self.network.set_deaf(self.switches.cuts.deaf);
+        self.sums.set_slots(match self.switches.reply {
+            Reply::Torque => None,
+            Reply::Sum(slots) => Some(slots),
+        });
+        self.after_network(now);
     }
 
     fn identity_words(&self) -> [i16; WORDS] {
@@ -527,6 +597,14 @@ impl Node {
     fn push(&mut self, message: Message) {
         let fits = self.outbox.push_back(message).is_ok();
         debug_assert!(fits, "a shell takes what is to be sent after each call");
+    }
+}
+
+/// When a cell claims its number; never while it has none.
+const fn first_word(identity: Identity, now: Micros) -> Micros {
+    match identity.cell {
+        Some(_) => Micros(now.0 + identity.serial as u64 * 1_000 % FIRST_WORD.0),
+        None => Micros(u64::MAX),
     }
 }
 

@@ -1,0 +1,546 @@
+//! How cells that are wired to each other become a tree, and stay one.
+//!
+//! ```text
+//!   message of a port ─> handle ─────┐             ┌─> poll_transmit ─> message for a port
+//!                now ──> handle_time ┼─ [Network] ─┼─> up, children ──> whose sums are whose
+//!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a number for this cell
+//! ```
+//!
+//! Whoever has a way to the gateway says so in its hellos, with a [`Label`]: how far it is, and in which round of
+//! exploration. A cell without a parent asks the nearest port whose label is better than every label that it had
+//! itself (join, grant). Labels only improve, and a parent's is better than its child's: so there is never a
+//! circle, whatever is lost or late. Where no label is good enough, the cell asks for a new round (seek), which
+//! goes up to the gateway and comes down as better labels for all.
+
+mod port;
+
+use heapless::Deque;
+use protocol::message::{PortState, VERSION};
+use protocol::packet::Epoch;
+use protocol::time::{Micros, Span};
+use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK, Walk};
+
+use port::Port;
+
+/// From one hello to the next.
+const HELLO: Span = Span::from_millis(250);
+/// How long a cell waits for a grant before it asks another one.
+const JOIN_PATIENCE: Span = Span::from_millis(5);
+/// From one search for a way to the next, at first and at most.
+const SEEK: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
+/// So long a cell without a way looks for another before it tells those below it.
+const GRACE: Span = Span::from_millis(8);
+/// Ports, and a root's wire to the gateway's side.
+const ALL: usize = PORTS + 1;
+/// Messages that wait for ports; a shell takes them after every call.
+const OUTBOX: usize = 32;
+
+/// How a parent was lost, and so whether it may still take a sum.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Lost {
+    /// It says nothing, hears nothing, or will not have this child: it takes no more sums.
+    Gone,
+    /// It has no way itself: until it says that it let this child go, it may take sums.
+    NoWay,
+}
+
+/// Who hears this cell's sums.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+struct Parent {
+    port: usize,
+    label: Label,
+}
+
+/// A walk that gives numbers, while it is with this cell and those below it.
+#[derive(Clone, Copy, Debug)]
+struct Walking {
+    walk: Walk,
+    /// The port that has it now.
+    at: usize,
+}
+
+/// A cell's part of the network.
+#[derive(Debug)]
+pub struct Network {
+    wired: u8,
+    deaf: u8,
+    number: u8,
+    ports: [Port; ALL],
+    parent: Option<Parent>,
+    /// The best label that this cell ever had: only better ones are followed.
+    best: Option<Label>,
+    joining: Option<(usize, Micros)>,
+    /// Since when there is no parent, and whether those below know it.
+    orphan: Option<(Micros, bool)>,
+    /// When a new round is asked for again, and how long after the last time that is.
+    seek: Option<(Micros, Span)>,
+    /// The last round that somebody below asked for, and when.
+    passed_on: Option<(u8, Micros)>,
+    /// The parent that was left last: its port, and whether it has heard that.
+    left: Option<(usize, bool)>,
+    walking: Option<Walking>,
+    last_walk: Option<u8>,
+    given: Option<u8>,
+    was_unnumbered: bool,
+    reported: [PortState; PORTS],
+    changes: u16,
+    tree_changed: bool,
+    next_hello: Micros,
+    outbox: Deque<(usize, PortMessage), OUTBOX>,
+}
+
+impl Network {
+    /// A cell that is not wired.
+    #[must_use]
+    pub fn new(now: Micros) -> Self {
+        Self {
+            wired: 0,
+            deaf: 0,
+            number: 0,
+            ports: [Port::default(); ALL],
+            parent: None,
+            best: None,
+            joining: None,
+            orphan: None,
+            seek: None,
+            passed_on: None,
+            left: None,
+            walking: None,
+            last_walk: None,
+            given: None,
+            was_unnumbered: false,
+            reported: [PortState::default(); PORTS],
+            changes: 0,
+            tree_changed: false,
+            next_hello: now,
+            outbox: Deque::new(),
+        }
+    }
+
+    /// The same cell with wires at the ports `wired`; hellos of many cells are spread by `phase`.
+    #[must_use]
+    pub fn wired(mut self, wired: u8, number: u8, phase: Span) -> Self {
+        (self.wired, self.number) = (wired, number);
+        self.next_hello = self.next_hello + phase;
+        self
+    }
+
+    /// Whether it is wired at all.
+    #[must_use]
+    pub const fn exists(&self) -> bool {
+        self.wired != 0
+    }
+
+    /// Ports that hear nothing.
+    pub const fn set_deaf(&mut self, deaf: u8) {
+        self.deaf = deaf;
+    }
+
+    /// Whether a port hears nothing.
+    #[must_use]
+    pub const fn is_deaf(&self, port: usize) -> bool {
+        self.deaf >> port & 1 != 0
+    }
+
+    /// The port whose other end hears this cell's sums.
+    #[must_use]
+    pub fn up(&self) -> Option<usize> {
+        self.parent.map(|parent| parent.port)
+    }
+
+    /// Wires to the root of the tree; 0 is a root.
+    #[must_use]
+    pub fn depth(&self) -> Option<u8> {
+        self.parent.map(|parent| parent.label.depth)
+    }
+
+    /// The round of the label.
+    #[must_use]
+    pub fn round(&self) -> u8 {
+        self.best.map_or(0, |label| label.round)
+    }
+
+    /// The parent's number: 0 for the gateway's side.
+    #[must_use]
+    pub fn parent_number(&self) -> Option<u8> {
+        match self.up()? {
+            UPLINK => Some(0),
+            port => self.number_at(port),
+        }
+    }
+
+    /// The number of the cell at a port.
+    #[must_use]
+    pub fn number_at(&self, port: usize) -> Option<u8> {
+        self.ports.get(port)?.number()
+    }
+
+    /// Whether the cell at a port is a child.
+    #[must_use]
+    pub fn is_child(&self, port: usize) -> bool {
+        self.ports.get(port).is_some_and(Port::is_child)
+    }
+
+    /// The port where the child with this number is.
+    #[must_use]
+    pub fn child_with(&self, number: u8) -> Option<usize> {
+        (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
+    }
+
+    /// Whether the parent that was left last has heard so, or there was none: then it takes no sum any more.
+    #[must_use]
+    pub fn is_let_go(&self) -> bool {
+        self.left.is_none_or(|(_, heard)| heard)
+    }
+
+    /// The parent that was left last takes no sum any more, for another reason.
+    pub const fn forget_left(&mut self) {
+        self.left = None;
+    }
+
+    /// How often the parent changed.
+    #[must_use]
+    pub const fn changes(&self) -> u16 {
+        self.changes
+    }
+
+    /// Bit p: the cell at port p is a child.
+    #[must_use]
+    pub fn children(&self) -> u8 {
+        self.bits(Port::is_child)
+    }
+
+    /// Bit p: port p works in both directions.
+    #[must_use]
+    pub fn working(&self, now: Micros) -> u8 {
+        self.bits(|port| port.works(now))
+    }
+
+    fn bits(&self, wanted: impl Fn(&Port) -> bool) -> u8 {
+        let bit = |(place, port): (usize, &Port)| u8::from(wanted(port)) << place;
+        self.ports.iter().take(PORTS).enumerate().map(bit).sum()
+    }
+
+    /// What the ports lead to.
+    #[must_use]
+    pub fn port_states(&self, now: Micros) -> [PortState; PORTS] {
+        let mut states = [PortState::default(); PORTS];
+        for (state, port) in states.iter_mut().zip(&self.ports) {
+            *state = port.state(now);
+        }
+        states
+    }
+
+    /// Whether the ports lead to something else than when this was asked last.
+    pub fn ports_changed(&mut self, now: Micros) -> bool {
+        let states = self.port_states(now);
+        core::mem::replace(&mut self.reported, states) != states
+    }
+
+    /// Whether the place in the tree is another than when this was asked last.
+    pub const fn tree_changed(&mut self) -> bool {
+        core::mem::replace(&mut self.tree_changed, false)
+    }
+
+    /// A number that a walk gave this cell, once.
+    pub const fn given(&mut self) -> Option<u8> {
+        self.given.take()
+    }
+
+    /// The next message for a port.
+    pub fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
+        self.outbox.pop_front()
+    }
+
+    /// When [`Network::handle_time`] has something to do.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Micros {
+        if !self.exists() {
+            return Micros(u64::MAX);
+        }
+        let join = self.joining.map(|(_, asked)| asked + JOIN_PATIENCE);
+        let seek = self.seek.map(|(at, _)| at).filter(|_| self.joining.is_none());
+        let tell = self.orphan.filter(|(_, told)| !told).map(|(since, _)| since + GRACE);
+        let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.silent_at());
+        [join, seek, tell, silent].into_iter().flatten().fold(self.next_hello, Micros::min)
+    }
+
+    /// Says something to the cell at a port.
+    pub fn say(&mut self, port: usize, message: PortMessage) {
+        if self.wired >> port & 1 != 0 {
+            // A shell takes messages after every call; what does not fit is said again by the next hello.
+            let _ = self.outbox.push_back((port, message));
+        }
+    }
+
+    fn hello(&mut self, now: Micros, port: usize) {
+        let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
+        let hello = Hello {
+            version: VERSION,
+            number: self.number,
+            port: port.to_le_bytes()[0],
+            hears,
+            up: self.up() == Some(port),
+            unnumbered: self.is_unnumbered(),
+            label: self.parent.map(|parent| parent.label.below()),
+        };
+        self.say(port, PortMessage::Hello(hello));
+    }
+
+    fn hello_to_all(&mut self, now: Micros) {
+        for port in 0..ALL {
+            self.hello(now, port);
+        }
+    }
+
+    fn is_unnumbered(&self) -> bool {
+        self.number == 0 || self.ports.iter().any(Port::is_unnumbered)
+    }
+
+    /// Takes what came in through a port, except what is about sums: `State` and `Missed`.
+    pub fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
+        if self.wired >> port & 1 == 0 || self.is_deaf(port) {
+            return;
+        }
+        match message {
+            PortMessage::Hello(hello) => self.take_hello(now, port, hello),
+            PortMessage::Join => self.let_in(now, port),
+            PortMessage::Grant(label) => self.join(now, port, label),
+            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Gone),
+            PortMessage::Refuse => {
+                if self.joining.is_some_and(|(asked, _)| asked == port) {
+                    self.distrust(now, port);
+                    self.joining = None;
+                    self.search(now);
+                }
+            }
+            PortMessage::Leave => {
+                self.ports.get_mut(port).into_iter().for_each(Port::disown);
+                self.say(port, PortMessage::Left);
+            }
+            PortMessage::Left => {
+                if let Some((left, heard)) = &mut self.left {
+                    *heard |= *left == port;
+                }
+            }
+            PortMessage::Seek(round) => self.pass_on(now, port, round),
+            PortMessage::Number(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
+            PortMessage::Return(walk) => self.go_on_walking(port, walk),
+            PortMessage::Number(_) | PortMessage::State(_) | PortMessage::Missed(_) => {}
+        }
+        self.tell_unnumbered(now);
+    }
+
+    fn take_hello(&mut self, now: Micros, port: usize, hello: Hello) {
+        let Some(there) = self.ports.get_mut(port) else { return };
+        let anew = there.take(now, hello);
+        let is_child = there.is_child();
+        if hello.version != VERSION {
+            return;
+        }
+        if anew || !hello.hears {
+            self.hello(now, port);
+        }
+        if hello.up && !is_child {
+            self.say(port, PortMessage::Refuse);
+        }
+        match self.parent {
+            Some(parent) if parent.port == port => match hello.label {
+                _ if !hello.hears => self.lose_parent(now, Lost::Gone),
+                // It is as near as it was, or nearer, or of a later round.
+                Some(label) if !parent.label.is_better_than(label) => self.follow(now, port, label),
+                // It started anew, or has no way itself.
+                Some(_) | None => self.lose_parent(now, Lost::NoWay),
+            },
+            Some(_) => {}
+            None => self.search(now),
+        }
+    }
+
+    /// The parent's label is this: those below hear it when that is news.
+    fn follow(&mut self, now: Micros, port: usize, label: Label) {
+        let news = self.parent.is_none_or(|parent| parent.label != label);
+        self.parent = Some(Parent { port, label });
+        if news {
+            self.best = Some(label.below());
+            self.tree_changed = true;
+            self.hello_to_all(now);
+        }
+    }
+
+    fn let_in(&mut self, now: Micros, port: usize) {
+        let label = self.parent.filter(|parent| parent.port != port).map(|parent| parent.label.below());
+        match label.zip(self.ports.get_mut(port)) {
+            Some((label, child)) => {
+                child.adopt(now);
+                self.tree_changed = true;
+                self.say(port, PortMessage::Grant(label));
+            }
+            None => self.say(port, PortMessage::Refuse),
+        }
+    }
+
+    fn is_good(&self, label: Label) -> bool {
+        self.best.is_none_or(|best| label.is_better_than(best))
+    }
+
+    fn join(&mut self, now: Micros, port: usize, label: Label) {
+        if self.up() == Some(port) {
+            return;
+        }
+        if self.parent.is_some() || !self.is_good(label) {
+            return self.say(port, PortMessage::Leave);
+        }
+        self.joining = None;
+        self.orphan = None;
+        self.seek = None;
+        self.changes = self.changes.wrapping_add(1);
+        self.follow(now, port, label);
+    }
+
+    /// The parent does not take this cell's sums any more: another way has to be found.
+    pub fn lose_parent(&mut self, now: Micros, how: Lost) {
+        let Some(parent) = self.parent.take() else { return };
+        self.tree_changed = true;
+        self.orphan = Some((now, false));
+        self.left = Some((parent.port, how == Lost::Gone));
+        self.say(parent.port, PortMessage::Leave);
+        self.distrust(now, parent.port);
+        self.search(now);
+    }
+
+    fn distrust(&mut self, now: Micros, port: usize) {
+        self.ports.get_mut(port).into_iter().for_each(|port| port.distrust(now));
+    }
+
+    /// Asks the nearest port that is good enough, or for a new round where none is.
+    fn search(&mut self, now: Micros) {
+        if self.parent.is_some() {
+            return;
+        }
+        if self.orphan.is_none() {
+            self.orphan = Some((now, false));
+        }
+        if let Some((asked, at)) = self.joining {
+            if now.since(at) < JOIN_PATIENCE {
+                return;
+            }
+            self.joining = None;
+            self.distrust(now, asked);
+        }
+        let labelled = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.label(now)?)));
+        let good = labelled().filter(|(_, label)| self.is_good(*label));
+        let nearest =
+            good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
+        if let Some((port, _)) = nearest {
+            self.joining = Some((port, now));
+            return self.say(port, PortMessage::Join);
+        }
+        // Who never had a way has nothing to compare: the first hello with a label is good enough.
+        let Some(best) = self.best else { return };
+        let (at, wait) = self.seek.unwrap_or((now, SEEK.0));
+        if now >= at {
+            self.seek = Some((now + wait, Span(wait.0 * 2).min(SEEK.1)));
+            for port in 0..ALL {
+                if self.ports.get(port).is_some_and(|port| port.label(now).is_some()) {
+                    self.say(port, PortMessage::Seek(best.round));
+                }
+            }
+        }
+    }
+
+    /// Somebody needs a round later than this one.
+    fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
+        let Some(parent) = self.parent.filter(|parent| parent.port != port) else { return };
+        if parent.label.round.wrapping_sub(round).cast_signed() > 0 {
+            return self.hello(now, port);
+        }
+        if self.passed_on.is_some_and(|(of, at)| of == round && now.since(at) < SEEK.0) {
+            return;
+        }
+        self.passed_on = Some((round, now));
+        self.say(parent.port, PortMessage::Seek(round));
+    }
+
+    /// Numbers are given away: this cell takes the first if it has none, and then each child's turn comes.
+    fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
+        if self.last_walk.replace(walk.walk) == Some(walk.walk) {
+            return;
+        }
+        if self.number == 0 && walk.first <= walk.last {
+            self.number = walk.first;
+            self.given = Some(walk.first);
+            walk.first += 1;
+            self.hello_to_all(now);
+        }
+        self.walk_from(0, walk);
+    }
+
+    fn go_on_walking(&mut self, port: usize, walk: Walk) {
+        if self.walking.is_some_and(|walking| walking.at == port && walking.walk.walk == walk.walk) {
+            self.walk_from(port + 1, walk);
+        }
+    }
+
+    fn walk_from(&mut self, first: usize, walk: Walk) {
+        let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
+        let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
+        self.walking = next.map(|at| Walking { walk, at });
+        match (next, self.up()) {
+            (Some(port), _) => self.say(port, PortMessage::Number(walk)),
+            (None, Some(up)) => self.say(up, PortMessage::Return(walk)),
+            (None, None) => {}
+        }
+    }
+
+    fn tell_unnumbered(&mut self, now: Micros) {
+        let unnumbered = self.is_unnumbered();
+        if core::mem::replace(&mut self.was_unnumbered, unnumbered) != unnumbered
+            && let Some(up) = self.up()
+        {
+            self.hello(now, up);
+        }
+    }
+
+    /// Takes in that time has passed. Harmless when called early.
+    pub fn handle_time(&mut self, now: Micros) {
+        if !self.exists() {
+            return;
+        }
+        if now >= self.next_hello {
+            // After a hang the missed ones are skipped.
+            let missed = now.since(self.next_hello).0 / HELLO.0;
+            self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
+            let before = self.children();
+            self.ports.iter_mut().for_each(|port| port.pass(now));
+            self.tree_changed |= before != self.children();
+            self.hello_to_all(now);
+            if let Some((port, false)) = self.left
+                && self.up() != Some(port)
+            {
+                self.say(port, PortMessage::Leave);
+            }
+        }
+        let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
+        if self.parent.as_ref().is_some_and(silent) {
+            self.lose_parent(now, Lost::Gone);
+        }
+        if let Some((since, false)) = self.orphan
+            && now.since(since) >= GRACE
+        {
+            self.orphan = Some((since, true));
+            self.hello_to_all(now);
+        }
+        if self.parent.is_none() {
+            self.search(now);
+        }
+        self.tell_unnumbered(now);
+    }
+
+    /// Says that the sums from this epoch on are for the parent.
+    pub fn state(&mut self, epoch: Epoch) {
+        if let Some(up) = self.up().filter(|up| *up != UPLINK) {
+            self.say(up, PortMessage::State(epoch));
+        }
+    }
+}

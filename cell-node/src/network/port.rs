@@ -1,0 +1,103 @@
+//! What is known of one port.
+
+use protocol::message::{PortState, VERSION};
+use protocol::time::{Micros, Span};
+use protocol::wire::{Hello, Label};
+
+/// A port from which nothing came for so long leads nowhere: two hellos and some jitter.
+pub(super) const SILENT: Span = Span::from_millis(600);
+/// A child that was let in so long ago knows it, and says so in its hellos.
+const KNOWS: Span = Span::from_millis(300);
+
+/// One port.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Port {
+    /// The last hello, and when it came.
+    heard: Option<(Hello, Micros)>,
+    /// Since when the cell there is a child of this one.
+    child: Option<Micros>,
+    /// Its hellos count again when they are later than this: it was a parent and was lost.
+    distrusted: Option<Micros>,
+}
+
+impl Port {
+    /// Takes a hello; whether this is the first one for long.
+    pub(super) fn take(&mut self, now: Micros, hello: Hello) -> bool {
+        let anew = self.hello(now).is_none();
+        self.heard = Some((hello, now));
+        // It has been told, and does not think so: it is a child no longer.
+        let forgot = !hello.up && self.child.is_some_and(|since| now.since(since) > KNOWS);
+        if forgot {
+            self.child = None;
+        }
+        anew
+    }
+
+    /// The last hello, unless it is long ago.
+    pub(super) fn hello(&self, now: Micros) -> Option<&Hello> {
+        self.heard.as_ref().filter(|(_, at)| now.since(*at) <= SILENT).map(|(hello, _)| hello)
+    }
+
+    /// Whether it works in both directions, and the other end speaks this version.
+    pub(super) fn works(&self, now: Micros) -> bool {
+        self.hello(now).is_some_and(|hello| hello.hears && hello.version == VERSION)
+    }
+
+    /// How far the cell at the other end is, if sums could go there.
+    pub(super) fn label(&self, now: Micros) -> Option<Label> {
+        let at = self.heard.map(|(_, at)| at)?;
+        let trusted = self.distrusted.is_none_or(|since| at > since);
+        self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.label)
+    }
+
+    /// The number of the cell at the other end, if it has one.
+    pub(super) fn number(&self) -> Option<u8> {
+        self.heard.map(|(hello, _)| hello.number).filter(|number| *number != 0)
+    }
+
+    /// Whether a cell without a number is there or below.
+    pub(super) fn is_unnumbered(&self) -> bool {
+        self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
+    }
+
+    pub(super) const fn is_child(&self) -> bool {
+        self.child.is_some()
+    }
+
+    pub(super) const fn adopt(&mut self, now: Micros) {
+        self.child = Some(now);
+    }
+
+    pub(super) const fn disown(&mut self) {
+        self.child = None;
+    }
+
+    /// It was a parent and was lost: only what it says from now on counts.
+    pub(super) const fn distrust(&mut self, now: Micros) {
+        self.distrusted = Some(now);
+    }
+
+    /// Lets time pass: a child from which nothing comes is none.
+    pub(super) fn pass(&mut self, now: Micros) {
+        if self.hello(now).is_none() {
+            self.child = None;
+        }
+    }
+
+    /// When it falls silent, if nothing more comes.
+    pub(super) fn silent_at(&self) -> Option<Micros> {
+        self.heard.map(|(_, at)| at + SILENT + Span(1))
+    }
+
+    /// As it is reported.
+    pub(super) fn state(&self, now: Micros) -> PortState {
+        let Some(hello) = self.hello(now) else { return PortState::default() };
+        PortState {
+            number: hello.number,
+            port: hello.port,
+            hears: true,
+            works: hello.hears,
+            other_version: hello.version != VERSION,
+        }
+    }
+}

@@ -1,0 +1,205 @@
+//! The cell in a network: whose sums are whose, and when they are said.
+
+use protocol::id::CellId;
+use protocol::message::{Message, NetworkPage, Ports, State, Tree};
+use protocol::packet::Epoch;
+use protocol::time::{Micros, Span};
+use protocol::wire::{PORTS, PortMessage, UPLINK};
+
+use super::{Claim, Node, Storing, first_word};
+use crate::contact::Torque;
+use crate::network::Lost;
+use crate::sum::{Begin, Words};
+
+/// Sums in a row that a parent does not take, after which it is no parent any more.
+const MISSES: u8 = 2;
+
+impl Node {
+    /// Takes what came in through a port.
+    pub fn handle_port(&mut self, now: Micros, port: usize, message: PortMessage) {
+        if !self.network.exists() || self.network.is_deaf(port) {
+            return;
+        }
+        match message {
+            PortMessage::State(epoch) if self.network.is_child(port) => {
+                self.sums.state(now, port, epoch);
+            }
+            PortMessage::Missed(epoch) if self.network.up() == Some(port) => self.was_missed(now, epoch),
+            PortMessage::State(_) | PortMessage::Missed(_) => {}
+            PortMessage::Leave => {
+                self.sums.disown(port);
+                self.network.handle(now, port, message);
+            }
+            PortMessage::Hello(_)
+            | PortMessage::Join
+            | PortMessage::Grant(_)
+            | PortMessage::Refuse
+            | PortMessage::Left
+            | PortMessage::Seek(_)
+            | PortMessage::Number(_)
+            | PortMessage::Return(_) => self.network.handle(now, port, message),
+        }
+        self.after_network(now);
+    }
+
+    /// Takes in what the network has come to.
+    pub(super) fn after_network(&mut self, now: Micros) {
+        if !self.network.exists() {
+            return;
+        }
+        if let Some(cell) = self.network.given().and_then(|number| CellId::new(number.into()).ok()) {
+            self.identity.cell = Some(cell);
+            self.claim = Claim::Unsaid;
+            self.next_heartbeat = first_word(self.identity, now);
+            self.storing = Some(Storing::Number);
+            self.hears_changed = true;
+        }
+        for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
+            self.sums.disown(port);
+        }
+        if core::mem::replace(&mut self.changes, self.network.changes()) != self.network.changes() {
+            self.misses = (0, 0);
+            self.sums.break_off();
+        }
+        if self.network.up().is_none() {
+            self.sums.fall_silent();
+        }
+        self.tell_tree |= self.network.tree_changed();
+        if self.claim == Claim::Settled {
+            self.tell_tree(now);
+        }
+        self.listen();
+    }
+
+    /// Says where it is in the tree, if that is news.
+    pub(super) fn tell_tree(&mut self, now: Micros) {
+        if core::mem::replace(&mut self.tell_tree, false) {
+            self.push_tree(now);
+        }
+    }
+
+    /// Hears the sums of the parent and of the children.
+    fn listen(&mut self) {
+        let mut wanted = [None; PORTS];
+        for (port, wanted) in wanted.iter_mut().enumerate() {
+            let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
+            let number = self.network.number_at(port).filter(|_| is_ours && self.sums.is_on());
+            *wanted = number.and_then(|number| CellId::new(number.into()).ok());
+        }
+        if core::mem::replace(&mut self.heard_sums, wanted) != wanted {
+            self.hears_changed = true;
+        }
+    }
+
+    /// The tree as it is for the sums of an epoch.
+    pub(super) fn freeze(&mut self, epoch: Epoch) -> Begin {
+        let up = self.network.up();
+        // A parent that was left and may not know it takes no sum from who was silent for an epoch.
+        let was_silent = self.sums.said().is_none_or(|(of, _)| of.next() != epoch);
+        if was_silent {
+            self.network.forget_left();
+        }
+        let number = up.and_then(|up| CellId::new(self.network.number_at(up)?.into()).ok());
+        self.parent = up.map(|up| (up, number));
+        self.heard_parent = false;
+        Begin {
+            epoch,
+            at: Micros(0),
+            period: Span(0),
+            depth: self.network.depth(),
+            speaks: up.is_some() && self.network.is_let_go(),
+            children: self.network.children(),
+        }
+    }
+
+    pub(super) fn begin_sum(&mut self, now: Micros, begin: &Begin, own: Option<Torque>) {
+        self.sums.begin(begin, own.map(|torque| torque.exact()).as_ref());
+        self.handle_sums(now);
+    }
+
+    /// A neighbour's sum.
+    pub(super) fn take_sum(&mut self, now: Micros, from: CellId, epoch: Epoch, words: Words) {
+        if let Some((port, Some(parent))) = self.parent
+            && parent == from
+        {
+            self.heard_parent |= !self.network.is_deaf(port) && self.sums.epoch() == Some(epoch);
+        } else if let Some(port) = self.network.child_with(from.get())
+            && !self.network.is_deaf(port)
+        {
+            self.sums.take(now, port, epoch, words);
+            self.handle_sums(now);
+        }
+    }
+
+    /// Says what is due, and looks who is missing.
+    pub(super) fn handle_sums(&mut self, now: Micros) {
+        let Some(from) = self.identity.cell else { return };
+        if let Some((epoch, words, anew)) = self.sums.say(now) {
+            if anew {
+                self.network.state(epoch);
+            }
+            let saturated = words.torque.iter().any(|word| word.is_saturated());
+            self.flags = self.flags.with(State::SATURATED, self.flags.has(State::SATURATED) || saturated);
+            self.push(Message::Sum { from, epoch, torque: words.torque, count: words.count });
+        }
+        let Some((epoch, missed)) = self.sums.check(now) else { return };
+        for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
+            self.network.say(port, PortMessage::Missed(epoch));
+        }
+        let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
+        let (_, before) = self.misses;
+        self.misses = match self.parent {
+            Some((UPLINK, _)) | None => (0, 0),
+            Some(_) if !said => (before, before),
+            Some(_) if self.heard_parent => (before, 0),
+            Some(_) => (before, before + 1),
+        };
+        self.give_up(now);
+        if core::mem::replace(&mut self.asked, false) {
+            self.push_heartbeat();
+        }
+    }
+
+    /// The parent says that it did not take a sum: it has to be told anew whom they are for.
+    fn was_missed(&mut self, now: Micros, epoch: Epoch) {
+        self.sums.break_off();
+        if self.sums.epoch() != Some(epoch) {
+            return;
+        }
+        self.heard_parent = false;
+        if self.sums.is_checked() {
+            self.misses.1 = self.misses.0 + 1;
+            self.give_up(now);
+        } else {
+            self.parent = self.parent.map(|(port, _)| (port, None));
+        }
+    }
+
+    fn give_up(&mut self, now: Micros) {
+        if self.misses.1 >= MISSES {
+            self.misses = (0, 0);
+            self.sums.fall_silent();
+            self.network.lose_parent(now, Lost::Gone);
+            self.after_network(now);
+        }
+    }
+
+    pub(super) fn push_tree(&mut self, now: Micros) {
+        self.push_network(NetworkPage::Tree(Tree {
+            parent: self.network.parent_number(),
+            up: self.network.up().map_or(0, |up| up.to_le_bytes()[0]),
+            depth: self.network.depth().unwrap_or(0),
+            round: self.network.round(),
+            children: self.network.children(),
+            works: self.network.working(now),
+            sent: self.sums.sent,
+            taken: self.sums.taken,
+            dropped: self.sums.dropped,
+        }));
+    }
+
+    pub(super) fn push_ports(&mut self, now: Micros) {
+        let ports = self.network.port_states(now);
+        self.push_network(NetworkPage::Ports(Ports { ports, changes: self.network.changes() }));
+    }
+}

@@ -1,0 +1,310 @@
+//! Sums of torques along a tree: the paper's Eq. 28, in Q7.8.
+//!
+//! ```text
+//!   joints ──> begin: own torque, exact      ┐                ┌─> due ──> when to speak next
+//!   sum of a child ──> take: largest count ──┼─ [Sum] ────────┼─> say ──> six words and a count
+//!   a child's word ──> state                 ┘                └─> missed: children whose sums did not come
+//! ```
+//!
+//! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell,
+//! epoch by epoch without a gap. So a child that fell silent for one epoch is free to send its sums to another.
+//! A sum of zeros ends the lease: nothing is to come.
+
+use protocol::fixed::{Acc, Q7_8};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Slots;
+use protocol::time::{Micros, Span};
+use protocol::wire::PORTS;
+
+/// Fraction bits that rounding takes away.
+const SHORTENED: u32 = 30 - 8;
+
+/// A sum as it stands on the bus.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Words {
+    /// Nm.
+    pub torque: [Q7_8; WORDS],
+    /// Cells in it.
+    pub count: u8,
+}
+
+impl Words {
+    /// Whether it says that nothing more is to come.
+    #[must_use]
+    pub fn is_end(&self) -> bool {
+        self.torque == [Q7_8::ZERO; WORDS]
+    }
+}
+
+/// What is known of the sums of one child.
+#[derive(Clone, Copy, Debug, Default)]
+struct Child {
+    /// The epoch whose sum is to come next.
+    next: Option<Epoch>,
+    /// The sum of the present epoch.
+    taken: Option<Words>,
+    /// One that came before its child said that it is for this cell.
+    waiting: Option<(Epoch, Words)>,
+}
+
+/// What one cell adds up.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Sum {
+    slots: Option<Slots>,
+    epoch: Option<Epoch>,
+    /// When the joints of this epoch stood on the bus.
+    began: Micros,
+    period: Span,
+    depth: u8,
+    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
+    own: Option<[i32; WORDS]>,
+    /// What rounding took away, in steps of 2^-30 Nm.
+    carry: [i64; WORDS],
+    children: [Child; PORTS],
+    /// Whether the present epoch's sum may be sent.
+    speaks: bool,
+    /// When it is to be sent.
+    due: Option<Micros>,
+    /// The last one that was sent, and its epoch.
+    said: Option<(Epoch, Words)>,
+    /// The parent has to be told anew whom the sums are for.
+    restate: bool,
+    /// When it is looked who is missing.
+    check: Option<Micros>,
+    /// Sums sent, resends among them.
+    pub sent: u16,
+    /// Sums taken from children.
+    pub taken: u16,
+    /// Sums of children that were not taken.
+    pub dropped: u16,
+}
+
+/// An epoch, as sums see it.
+#[derive(Clone, Copy, Debug)]
+pub struct Begin {
+    /// Its number.
+    pub epoch: Epoch,
+    /// When its joints stood on the bus.
+    pub at: Micros,
+    /// From one broadcast to the next.
+    pub period: Span,
+    /// Wires to the root; `None` without a way up.
+    pub depth: Option<u8>,
+    /// Whether sums may go up in this epoch.
+    pub speaks: bool,
+    /// Bit p: the cell at port p is a child.
+    pub children: u8,
+}
+
+impl Sum {
+    /// Sums are said in these slots from the next joints on, or not at all.
+    pub fn set_slots(&mut self, slots: Option<Slots>) {
+        if slots.is_none() {
+            *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
+        }
+        self.slots = slots;
+    }
+
+    /// Whether sums are said.
+    #[must_use]
+    pub const fn is_on(&self) -> bool {
+        self.slots.is_some()
+    }
+
+    /// New joints: `own` is this cell's torque at full width, `None` when it feels nothing.
+    pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; WORDS]>) {
+        let Some(slots) = self.slots else { return };
+        let before = self.epoch.replace(begin.epoch);
+        let follows = before.is_some_and(|before| before.next() == begin.epoch);
+        for (port, child) in self.children.iter_mut().enumerate() {
+            let is_child = begin.children >> port & 1 == 1;
+            let goes_on = follows && child.taken.is_some_and(|words| !words.is_end());
+            // Who was silent for an epoch has to say again whom its sums are for.
+            let next = (is_child && goes_on).then_some(begin.epoch);
+            let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
+            *child = Child { next, taken: None, waiting };
+        }
+        self.period = begin.period;
+        self.began = begin.at;
+        self.depth = begin.depth.unwrap_or(slots.deepest);
+        self.speaks = begin.speaks && begin.depth.is_some();
+        self.own = match own {
+            Some(exact) => Some(self.round(exact, slots.carry)),
+            None => {
+                self.carry = [0; WORDS];
+                // What was said last is not to be held for ever.
+                let ends = self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
+                ends.then_some([0; WORDS])
+            }
+        };
+        let slot = slots.deepest.saturating_sub(self.depth);
+        self.due = self.own.is_some().then(|| self.began + Span(u64::from(slot) * u64::from(slots.slot_us)));
+        let settled = Span(u64::from(slots.slot_us) * (u64::from(slots.deepest) + 2));
+        self.check = Some(self.began + settled.min(Span(begin.period.0 * 7 / 8)));
+    }
+
+    /// Q7.8, to the nearest; what that took away goes into the next one.
+    fn round(&mut self, exact: &[Acc<30>; WORDS], carries: bool) -> [i32; WORDS] {
+        let mut words = [0; WORDS];
+        for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
+            let wanted = exact.steps() + if carries { *carry } else { 0 };
+            let rounded = (wanted + (1 << (SHORTENED - 1))) >> SHORTENED;
+            *carry = wanted - (rounded << SHORTENED);
+            *word = i32::try_from(rounded).unwrap_or(if rounded < 0 { i32::MIN } else { i32::MAX });
+        }
+        words
+    }
+
+    /// A child says that its sums from this epoch on are for this cell.
+    pub fn state(&mut self, now: Micros, port: usize, epoch: Epoch) {
+        if self.epoch != Some(epoch) {
+            return;
+        }
+        let Some(child) = self.children.get_mut(port) else { return };
+        child.next = Some(epoch);
+        if let Some((_, words)) = child.waiting.take() {
+            self.dropped = self.dropped.wrapping_sub(1);
+            self.take(now, port, epoch, words);
+        }
+    }
+
+    /// A child's sum: the one with the largest count stays.
+    pub fn take(&mut self, now: Micros, port: usize, epoch: Epoch, words: Words) {
+        let present = self.epoch == Some(epoch);
+        let Some(child) = self.children.get_mut(port) else { return };
+        if child.next != Some(epoch) || !present {
+            self.dropped = self.dropped.wrapping_add(1);
+            child.waiting = Some((epoch, words));
+            return;
+        }
+        if child.taken.is_some_and(|before| before.count >= words.count) {
+            return;
+        }
+        child.taken = Some(words);
+        self.taken = self.taken.wrapping_add(1);
+        self.plan(now);
+    }
+
+    /// There is something new to say: in this cell's slot, or in the next one after it.
+    fn plan(&mut self, now: Micros) {
+        let Some(slots) = self.slots else { return };
+        let width = u64::from(slots.slot_us);
+        let own_slot = u64::from(slots.deepest.saturating_sub(self.depth)) * width;
+        let said = self.said.is_some_and(|(of, _)| Some(of) == self.epoch);
+        let passed = now.since(self.began).0;
+        let at = if said { own_slot.max((passed / width + 1) * width) } else { own_slot.max(passed) };
+        let at = self.began + Span(at);
+        self.due = Some(self.due.map_or(at, |due| due.min(at)));
+    }
+
+    /// A child is none any more.
+    pub fn disown(&mut self, port: usize) {
+        if let Some(child) = self.children.get_mut(port) {
+            // What was taken in this epoch stays: its sender sends no other for it.
+            child.next = None;
+            child.waiting = None;
+        }
+    }
+
+    /// The way up is lost: nothing more of this epoch is said.
+    pub const fn fall_silent(&mut self) {
+        self.speaks = false;
+        self.due = None;
+    }
+
+    /// When there is something to do.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Micros> {
+        self.due.into_iter().chain(self.check).min()
+    }
+
+    /// The sum to be sent, when its time has come: cumulative, all that is known of this epoch. With it, whether the
+    /// parent has to be told that it is for it.
+    pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
+        let epoch = self.epoch?;
+        self.due.take_if(|due| *due <= now)?;
+        if !self.speaks {
+            return None;
+        }
+        let words = self.words();
+        if self.said == Some((epoch, words)) {
+            return None;
+        }
+        let follows = |(of, before): (Epoch, Words)| of == epoch || (of.next() == epoch && !before.is_end());
+        let goes_on = self.said.is_some_and(follows) && !core::mem::take(&mut self.restate);
+        self.said = Some((epoch, words));
+        self.sent = self.sent.wrapping_add(1);
+        Some((epoch, words, !goes_on))
+    }
+
+    fn words(&self) -> Words {
+        let mut sum = self.own.map_or([0; WORDS], |own| own.map(i64::from));
+        let mut count = u32::from(self.own.is_some());
+        let mut saturated = [false; WORDS];
+        for words in self.children.iter().filter_map(|child| child.taken) {
+            count += u32::from(words.count);
+            for ((sum, saturated), word) in sum.iter_mut().zip(&mut saturated).zip(words.torque) {
+                *saturated |= word.is_saturated();
+                *sum += i64::from(word.to_bits());
+            }
+        }
+        let mut torque = [Q7_8::ZERO; WORDS];
+        for ((word, sum), saturated) in torque.iter_mut().zip(sum).zip(saturated) {
+            let least = i64::from(i16::MIN);
+            let held = if saturated { if sum < 0 { least } else { i16::MAX.into() } } else { sum };
+            let fits = held.clamp(least, i16::MAX.into());
+            *word = Q7_8::from_bits(i16::try_from(fits).unwrap_or(i16::MAX));
+        }
+        Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) }
+    }
+
+    /// The last sum that was sent, and its epoch.
+    #[must_use]
+    pub const fn said(&self) -> Option<(Epoch, Words)> {
+        self.said
+    }
+
+    /// The present epoch.
+    #[must_use]
+    pub const fn epoch(&self) -> Option<Epoch> {
+        self.epoch
+    }
+
+    /// The parent did not take the last sum: the next one has to be stated anew.
+    pub const fn break_off(&mut self) {
+        self.restate = true;
+    }
+
+    /// Joints that are not answered: whoever goes on after them has to be stated anew.
+    pub fn skip(&mut self) {
+        self.epoch = None;
+        self.children = Default::default();
+        (self.due, self.check, self.own) = (None, None, None);
+    }
+
+    /// Whether it has been looked who is missing in this epoch.
+    #[must_use]
+    pub const fn is_checked(&self) -> bool {
+        self.check.is_none()
+    }
+
+    /// Whether all of this epoch is done.
+    #[must_use]
+    pub const fn is_settled(&self) -> bool {
+        self.due.is_none() && self.check.is_none()
+    }
+
+    /// When the time has come to look: bit p says that the sum of the child at port p should have come and did not.
+    /// Such a sum is not taken any more.
+    pub fn check(&mut self, now: Micros) -> Option<(Epoch, u8)> {
+        self.check.take_if(|check| *check <= now)?;
+        let mut missed = 0;
+        for (port, child) in self.children.iter_mut().enumerate() {
+            if child.next.is_some() && child.taken.is_none() {
+                child.next = None;
+                missed |= 1 << port;
+            }
+        }
+        Some((self.epoch?, missed))
+    }
+}

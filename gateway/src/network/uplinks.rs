@@ -1,0 +1,214 @@
+//! The gateway's end of the wires to the roots: where every way up ends, and numbers come from.
+//!
+//! ```text
+//!   message of a root ─> handle ──────┐             ┌─> poll_transmit ─> message for a root
+//!                now ──> handle_time ─┼─ [Uplinks] ─┘
+//!   number that is used ─> claimed ───┘
+//! ```
+
+use std::collections::{BTreeSet, VecDeque};
+
+use protocol::id::CellId;
+use protocol::message::VERSION;
+use protocol::time::{Micros, Span};
+use protocol::wire::{Hello, Label, PortMessage, Walk};
+
+/// From one hello to the next.
+const HELLO: Span = Span::from_millis(250);
+/// A root from which nothing came for so long is not heard any more.
+const SILENT: Span = Span::from_millis(600);
+/// A walk from which nothing came back for so long is lost.
+const LOST: Span = Span::from_millis(400);
+/// The port of the gateway's side, in its hellos.
+const PORT: u8 = 0;
+
+/// One root's wire.
+#[derive(Clone, Copy, Debug)]
+struct Wire {
+    /// Which wire, in the order of the description.
+    root: usize,
+    heard: Option<(Hello, Micros)>,
+    is_child: bool,
+}
+
+/// A walk that gives numbers below one root.
+#[derive(Clone, Copy, Debug)]
+struct Walking {
+    root: usize,
+    walk: Walk,
+    since: Micros,
+}
+
+/// The gateway's ends of all roots' wires of one bus.
+#[derive(Debug)]
+pub struct Uplinks {
+    wires: Vec<Wire>,
+    round: u8,
+    used: BTreeSet<u8>,
+    walks: u8,
+    walking: Option<Walking>,
+    /// Not before this a walk begins: who was given a number by a lost one has to claim it first.
+    wait: Micros,
+    next_hello: Micros,
+    outbox: VecDeque<(usize, PortMessage)>,
+}
+
+impl Uplinks {
+    /// Wires to so many roots; the first walk has the number `walk`, another one than that of an earlier gateway.
+    #[must_use]
+    pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
+        let wire = |root| Wire { root, heard: None, is_child: false };
+        Self {
+            wires: (0..roots).map(wire).collect(),
+            round: 1,
+            used: BTreeSet::new(),
+            walks: walk,
+            walking: None,
+            wait: Micros(0),
+            next_hello: now,
+            outbox: VecDeque::new(),
+        }
+    }
+
+    /// A cell with this number is on the bus.
+    pub fn claimed(&mut self, cell: CellId) {
+        self.used.insert(cell.get());
+    }
+
+    /// The next message for a root, by its place among the roots.
+    pub fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
+        self.outbox.pop_front()
+    }
+
+    /// When [`Uplinks::handle_time`] has something to do.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Micros {
+        let lost = self.walking.map(|walking| walking.since + LOST);
+        let waits = Some(self.wait).filter(|_| self.walking.is_none() && self.wants_numbers().is_some());
+        [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
+    }
+
+    /// The round of exploration.
+    #[must_use]
+    pub const fn round(&self) -> u8 {
+        self.round
+    }
+
+    /// Takes what a root said over its wire.
+    pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
+        let label = Label { round: self.round, depth: 0 };
+        let Some(wire) = self.wires.get_mut(root) else { return };
+        match message {
+            PortMessage::Hello(hello) => {
+                let anew = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
+                wire.heard = Some((hello, now));
+                let mistaken = hello.up && !wire.is_child;
+                if mistaken {
+                    // This gateway is a new one; the root may stay where it is.
+                    wire.is_child = true;
+                }
+                if hello.up && hello.label.is_some_and(|own| own.is_better_than(label.below())) {
+                    self.renew(now, hello.label.map_or(self.round, |own| own.round));
+                } else if anew || !hello.hears {
+                    self.hello(now, root);
+                }
+            }
+            PortMessage::Join => {
+                wire.is_child = true;
+                self.outbox.push_back((root, PortMessage::Grant(label)));
+            }
+            PortMessage::Leave => {
+                wire.is_child = false;
+                self.outbox.push_back((root, PortMessage::Left));
+            }
+            PortMessage::Seek(round) => self.renew(now, round),
+            PortMessage::Return(walk) => self.end_walk(now, root, walk),
+            PortMessage::Grant(_)
+            | PortMessage::Refuse
+            | PortMessage::Left
+            | PortMessage::State(_)
+            | PortMessage::Missed(_)
+            | PortMessage::Number(_) => {}
+        }
+        self.walk(now);
+    }
+
+    /// A round later than this one begins, unless it has already.
+    fn renew(&mut self, now: Micros, round: u8) {
+        if self.round.wrapping_sub(round).cast_signed() <= 0 {
+            self.round = round.wrapping_add(1);
+        }
+        self.hello_to_all(now);
+    }
+
+    fn hello(&mut self, now: Micros, root: usize) {
+        let heard = self.wires.get(root).and_then(|wire| wire.heard);
+        let hello = Hello {
+            version: VERSION,
+            number: 0,
+            port: PORT,
+            hears: heard.is_some_and(|(_, at)| now.since(at) <= SILENT),
+            up: false,
+            unnumbered: false,
+            label: Some(Label { round: self.round, depth: 0 }),
+        };
+        self.outbox.push_back((root, PortMessage::Hello(hello)));
+    }
+
+    fn hello_to_all(&mut self, now: Micros) {
+        for root in 0..self.wires.len() {
+            self.hello(now, root);
+        }
+    }
+
+    /// Takes in that time has passed.
+    pub fn handle_time(&mut self, now: Micros) {
+        if now >= self.next_hello {
+            let missed = now.since(self.next_hello).0 / HELLO.0;
+            self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
+            self.hello_to_all(now);
+        }
+        if self.walking.is_some_and(|walking| now.since(walking.since) >= LOST) {
+            self.walking = None;
+            self.wait = now + LOST;
+        }
+        self.walk(now);
+    }
+
+    /// A root with a cell below it that has no number.
+    fn wants_numbers(&self) -> Option<usize> {
+        let wants = |wire: &&Wire| wire.is_child && wire.heard.is_some_and(|(hello, _)| hello.unnumbered);
+        self.wires.iter().find(wants).map(|wire| wire.root)
+    }
+
+    /// Sends a walk to a root that wants one, with the first free numbers.
+    fn walk(&mut self, now: Micros) {
+        if self.walking.is_some() || now < self.wait {
+            return;
+        }
+        let Some((root, (first, last))) = self.wants_numbers().zip(self.free()) else { return };
+        self.walks = self.walks.wrapping_add(1);
+        let walk = Walk { walk: self.walks, first, last };
+        self.walking = Some(Walking { root, walk, since: now });
+        self.outbox.push_back((root, PortMessage::Number(walk)));
+    }
+
+    /// The first numbers in a row that nobody has.
+    fn free(&self) -> Option<(u8, u8)> {
+        let first = (1..=CellId::MAX.get()).find(|number| !self.used.contains(number))?;
+        let last = (first..=CellId::MAX.get()).take_while(|number| !self.used.contains(number)).last()?;
+        Some((first, last))
+    }
+
+    fn end_walk(&mut self, now: Micros, root: usize, left: Walk) {
+        let Some(walking) = self.walking.filter(|it| it.root == root && it.walk.walk == left.walk) else {
+            return;
+        };
+        self.used.extend(walking.walk.first..left.first.min(walking.walk.last.saturating_add(1)));
+        self.walking = None;
+        if left.first == walking.walk.first {
+            // It gave none: what it knows of those below it is not yet what they are.
+            self.wait = now + Span::from_millis(20);
+        }
+    }
+}
