@@ -294,14 +294,24 @@ impl Bus {
     /// # Errors
     /// The reason, and how many were sent before it.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
-        let mut sent = 0;
         let failed = |sent, cause| SendError { sent, wanted: frames.len(), cause };
         if !self.fd && frames.iter().any(|frame| frame.format() == Format::Fd) {
             return Err(failed(0, BusError::FdFrame { name: self.name.clone() }));
         }
+        self.patiently(frames.len(), |sent| self.send_some(frames.get(sent..).unwrap_or_default()))
+    }
+
+    /// Has everything sent, waiting for room in between; `some` sends from so many on, and says how many.
+    fn patiently(
+        &self,
+        wanted: usize,
+        some: impl Fn(usize) -> std::io::Result<usize>,
+    ) -> Result<(), SendError> {
+        let mut sent = 0;
+        let failed = |sent, cause| SendError { sent, wanted, cause };
         let mut give_up = None;
-        while let Some(rest) = frames.get(sent..).filter(|rest| !rest.is_empty()) {
-            let error = match self.send_some(rest) {
+        while sent < wanted {
+            let error = match some(sent) {
                 Ok(count) => {
                     sent += count;
                     give_up = None;
@@ -350,6 +360,32 @@ impl Bus {
             self.down.store(true, Ordering::Relaxed);
         }
         sent.is_ok_and(|sent| sent == frames.len())
+    }
+
+    /// Receives what passes these filters from now on, at most [`Filter::MAX`], in place of what was asked for
+    /// before. What was sent on the bus before by this socket, or has come to it already, is not touched. For one
+    /// thread at a time.
+    ///
+    /// # Errors
+    /// When there are too many, or the bus does not take them.
+    pub fn set_filters(&self, filters: &[Filter]) -> Result<(), BusError> {
+        if filters.len() > Filter::MAX {
+            return Err(BusError::Filters { name: self.name.clone(), got: filters.len() });
+        }
+        match self.kind {
+            BusKind::SocketCan => kernel::set_filters(&self.socket, filters)
+                .map_err(|error| self.io_error("set the filters of", error)),
+            BusKind::Embedded => {
+                let parts: Vec<_> = embedded::FilterPart::split(filters).map(|part| part.encode()).collect();
+                let send = |sent| {
+                    let Some(part) = parts.get::<usize>(sent) else { return Ok(0) };
+                    let flags = rustix::net::SendFlags::DONTWAIT | rustix::net::SendFlags::NOSIGNAL;
+                    rustix::net::send(&self.socket, part, flags)?;
+                    Ok(1)
+                };
+                Ok(self.patiently(parts.len(), send)?)
+            }
+        }
     }
 
     fn send_some(&self, frames: &[Frame]) -> std::io::Result<usize> {

@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::embedded::{Answer, Hello, VERSION, address};
+use protocol::bus::embedded::{Answer, FilterPart, Hello, VERSION, address};
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{FD_FORMAT, Frame};
 use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType};
@@ -165,6 +165,53 @@ fn wait_until_routed(bench: &Bench) {
         assert!(b.wait(Some(LONG)).unwrap());
         b.receive(&mut Inbox::new()).unwrap();
     }
+}
+
+#[test]
+fn filters_change_in_order_with_the_frames() {
+    let bench = Bench::new();
+    let other = bench.open(&[]);
+    let client =
+        bench.open_with(Options { own_frames: true, filters: vec![exact(1), exact(2)], ..bench.options() });
+    // What it sends itself is in order with its filters.
+    client.send(&[frame(1, 1), frame(3, 1)]).unwrap();
+    client.set_filters(&[exact(2), exact(3), exact(LAST)]).unwrap();
+    client.send(&[frame(1, 2), frame(2, 2), frame(3, 2)]).unwrap();
+    client.set_filters(&[]).unwrap();
+    client.send(&[frame(1, 3), frame(2, 3), frame(3, 3)]).unwrap();
+    // More of them than one datagram holds, the ones that matter at both ends.
+    let many: Vec<_> = [3, LAST].into_iter().chain(0x100..0x200).chain([1]).map(exact).collect();
+    client.set_filters(&many).unwrap();
+    wait_until_routed(&bench);
+    other.send(&[frame(1, 4), frame(2, 4), frame(3, 4), frame(0x1FF, 4), frame(LAST, 0)]).unwrap();
+    let expected = [(1, 1), (2, 2), (3, 2), (1, 4), (3, 4), (0x1FF, 4)].map(|(id, number)| frame(id, number));
+    assert_eq!(read_all(&client), expected);
+
+    let error = client.set_filters(&vec![Filter::ALL; 513]).unwrap_err().to_string();
+    assert_eq!(error, "513 filters are too many for one socket on vcan0: at most 512");
+    client.set_filters(&vec![exact(LAST); 512]).unwrap();
+    wait_until_routed(&bench);
+    other.send(&[frame(1, 5), frame(LAST, 0)]).unwrap();
+    assert_eq!(read_all(&client), []);
+    assert_eq!(bench.end().garbage, 0);
+}
+
+#[test]
+fn filters_that_never_end_are_garbage_and_those_in_force_stay() {
+    let bench = Bench::new();
+    let client = bench.open(&[exact(1), exact(LAST)]);
+    let part = |first, last| FilterPart { first, last, filters: vec![Filter::ALL; 8] }.encode();
+    for count in 0..64 {
+        rustix::net::send(&client, &part(count == 0, false), SendFlags::empty()).unwrap();
+    }
+    for _ in 0..2 {
+        rustix::net::send(&client, &part(false, true), SendFlags::empty()).unwrap();
+    }
+    rustix::net::send(&client, &part(true, false), SendFlags::empty()).unwrap();
+    wait_until_routed(&bench);
+    bench.open(&[]).send(&[frame(1, 1), frame(2, 1), frame(LAST, 0)]).unwrap();
+    assert_eq!(read_all(&client), [frame(1, 1)]);
+    assert_eq!(bench.end().garbage, 2, "the part that made too many, and one of nothing");
 }
 
 #[test]

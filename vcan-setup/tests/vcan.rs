@@ -60,6 +60,20 @@ fn the_kernel_keeps_every_rule() {
 
 #[test]
 #[ignore = "needs vcan"]
+fn the_kernel_changes_filters_of_an_open_socket() {
+    let exact = |id| Filter { id, mask: Filter::EXACT_MASK };
+    let frame = |id| Frame::classic(id, &[1]).unwrap();
+    let other = sender();
+    let client = open(&Options { filters: vec![exact(1)], ..Options::default() });
+    other.send(&[frame(1), frame(2)]).unwrap();
+    client.set_filters(&[exact(2), exact(LAST)]).unwrap();
+    other.send(&[frame(1), frame(2), frame(LAST)]).unwrap();
+    let ids: Vec<_> = read(&client, &mut Inbox::new()).iter().map(Frame::id).collect();
+    assert_eq!(ids, [1, 2]);
+}
+
+#[test]
+#[ignore = "needs vcan"]
 fn the_kernel_refuses_what_the_table_says() {
     let [fd, classic] = [true, false].map(|fd| open(&Options { fd, ..Options::default() }));
     for refused in cases::refused() {

@@ -7,10 +7,13 @@
 //!   hello    client -> bus, first     "skinbus", version, own 0/1, fd 0/1, error mask u32, buffer u64,
 //!                                     reserved u8, then id u32 and mask u32 per filter: 23 + 8n bytes
 //!   answer   bus -> client, first     "skinbus", version, 0 welcome / 1 refused, granted buffer u64: 17 bytes
+//!   filters  client -> bus, later     "F", 1 first part + 2 last part, then id u32 and mask u32 per filter, at most
+//!                                     8: 2 + 8n bytes
 //!   dropped  bus -> client, later     "D", frames dropped so far u32: 5 bytes
 //! ```
 //!
-//! After a welcome the filters are in force. In a frame that is given back to its sender, the reserved
+//! After a welcome the filters are in force. A client changes them by *filters*, in one part or several; with the last
+//! part they are in force for what the bus takes from then on, frames of this client and of others. In a frame that is given back to its sender, the reserved
 //! byte 6 is 1; the bus clears that byte in every other frame.
 
 use std::fs::DirBuilder;
@@ -29,7 +32,7 @@ use thiserror::Error;
 use super::{BusError, Filter, Options};
 
 /// The version of what is said beside frames.
-pub const VERSION: u8 = 1;
+pub const VERSION: u8 = 2;
 /// Which byte of a frame marks it as the receiver's own.
 pub const OWN_BYTE: usize = 6;
 /// The longest hello in bytes.
@@ -66,10 +69,7 @@ impl Hello {
         bytes.extend_from_slice(&self.error_mask.to_le_bytes());
         bytes.extend_from_slice(&self.buffer.to_le_bytes());
         bytes.push(0);
-        for filter in &self.filters {
-            bytes.extend_from_slice(&filter.id.to_le_bytes());
-            bytes.extend_from_slice(&filter.mask.to_le_bytes());
-        }
+        encode_filters(&self.filters, &mut bytes);
         bytes
     }
 
@@ -80,22 +80,76 @@ impl Hello {
         let rest = head.strip_prefix(MAGIC)?;
         let &[VERSION, own @ 0..=1, fd @ 0..=1, m0, m1, m2, m3, ref rest @ ..] = rest else { return None };
         let (buffer, [0]) = rest.split_first_chunk()? else { return None };
-        let (filters, []) = filters.as_chunks::<8>() else { return None };
-        if filters.len() > Filter::MAX {
-            return None;
-        }
-        let filter = |&[a, b, c, d, e, f, g, h]: &[u8; 8]| Filter {
-            id: u32::from_le_bytes([a, b, c, d]),
-            mask: u32::from_le_bytes([e, f, g, h]),
-        };
         Some(Self {
-            filters: filters.iter().map(filter).collect(),
+            filters: decode_filters(filters).filter(|filters| filters.len() <= Filter::MAX)?,
             own_frames: own == 1,
             fd: fd == 1,
             error_mask: u32::from_le_bytes([m0, m1, m2, m3]),
             buffer: u64::from_le_bytes(*buffer),
         })
     }
+}
+
+/// Filters that take the place of those in force: all of them when it is the first and the last part.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct FilterPart {
+    /// What came of an unfinished change before is forgotten.
+    pub first: bool,
+    /// All filters are known.
+    pub last: bool,
+    /// Some of them.
+    pub filters: Vec<Filter>,
+}
+
+impl FilterPart {
+    const HEAD: u8 = b'F';
+    const FIRST: u8 = 1;
+    const LAST: u8 = 2;
+    /// So many fit into a datagram that is no longer than an FD frame's, which is what a bus reads.
+    const FILTERS: usize = 8;
+
+    /// These filters in as many parts as they need.
+    pub fn split(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
+        let parts = filters.len().div_ceil(Self::FILTERS).max(1);
+        (0..parts).map(move |part| Self {
+            first: part == 0,
+            last: part == parts - 1,
+            filters: filters.iter().skip(part * Self::FILTERS).take(Self::FILTERS).copied().collect(),
+        })
+    }
+
+    /// The datagram.
+    #[must_use]
+    pub fn encode(&self) -> Vec<u8> {
+        let flag = |set, flag| if set { flag } else { 0 };
+        let mut bytes = vec![Self::HEAD, flag(self.first, Self::FIRST) | flag(self.last, Self::LAST)];
+        encode_filters(&self.filters, &mut bytes);
+        bytes
+    }
+
+    /// Reads the datagram; `None` when it is none. Never panics.
+    #[must_use]
+    pub fn decode(bytes: &[u8]) -> Option<Self> {
+        let &[Self::HEAD, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
+        let filters = decode_filters(rest).filter(|filters| filters.len() <= Self::FILTERS)?;
+        Some(Self { first: flags & Self::FIRST != 0, last: flags & Self::LAST != 0, filters })
+    }
+}
+
+fn encode_filters(filters: &[Filter], bytes: &mut Vec<u8>) {
+    for filter in filters {
+        bytes.extend_from_slice(&filter.id.to_le_bytes());
+        bytes.extend_from_slice(&filter.mask.to_le_bytes());
+    }
+}
+
+fn decode_filters(bytes: &[u8]) -> Option<Vec<Filter>> {
+    let (filters, []) = bytes.as_chunks::<8>() else { return None };
+    let filter = |&[a, b, c, d, e, f, g, h]: &[u8; 8]| Filter {
+        id: u32::from_le_bytes([a, b, c, d]),
+        mask: u32::from_le_bytes([e, f, g, h]),
+    };
+    Some(filters.iter().map(filter).collect())
 }
 
 /// What the bus says to a hello.
@@ -348,7 +402,7 @@ mod tests {
         let filter = Filter { id: 0x001, mask: 0xC000_07FF };
         let hello =
             Hello { filters: vec![filter], own_frames: true, fd: true, error_mask: 0x1FF, buffer: 0x10_0000 };
-        let expected = b"skinbus\x01\x01\x01\xff\x01\0\0\0\0\x10\0\0\0\0\0\0\x01\0\0\0\xff\x07\0\xc0";
+        let expected = b"skinbus\x02\x01\x01\xff\x01\0\0\0\0\x10\0\0\0\0\0\0\x01\0\0\0\xff\x07\0\xc0";
         assert_eq!(hello.encode(), expected);
     }
 
@@ -356,6 +410,10 @@ mod tests {
     fn no_control_datagram_is_as_long_as_a_frame() {
         let lens = (0..=Filter::MAX)
             .map(|count| HELLO_HEAD + 8 * count)
+            .chain((0..=Filter::MAX).flat_map(|count| {
+                let filters = vec![Filter::ALL; count];
+                FilterPart::split(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
+            }))
             .chain([Answer::Refused { version: 1 }.encode().len(), encode_dropped(0).len()]);
         assert!(lens.into_iter().all(|len| len != CLASSIC_BYTES && len != FD_BYTES && len != 0));
     }
@@ -375,6 +433,20 @@ mod tests {
         }
 
         #[test]
+        fn every_change_of_filters_comes_back_in_parts_that_a_bus_can_read(words in proptest::collection::vec(any::<(u32, u32)>(), 0..40)) {
+            let filters: Vec<_> = words.into_iter().map(|(id, mask)| Filter { id, mask }).collect();
+            let parts: Vec<_> = FilterPart::split(&filters).collect();
+            for part in &parts {
+                let bytes = part.encode();
+                prop_assert!(bytes.len() <= FD_BYTES);
+                prop_assert_eq!(FilterPart::decode(&bytes), Some(part.clone()));
+            }
+            prop_assert!(parts.first().is_some_and(|part| part.first) && parts.last().is_some_and(|part| part.last));
+            prop_assert_eq!(parts.iter().filter(|part| part.first || part.last).count(), parts.len().min(2));
+            prop_assert_eq!(parts.into_iter().flat_map(|part| part.filters).collect::<Vec<_>>(), filters);
+        }
+
+        #[test]
         fn every_answer_comes_back(granted: u64, version: u8, total: u32) {
             for answer in [Answer::Welcome { granted }, Answer::Refused { version }] {
                 prop_assert_eq!(Answer::decode(&answer.encode()), Some(answer));
@@ -384,7 +456,8 @@ mod tests {
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
-            let _ = (Hello::decode(&bytes), Answer::decode(&bytes), decode_dropped(&bytes));
+            let _ = (Hello::decode(&bytes), FilterPart::decode(&bytes));
+            let _ = (Answer::decode(&bytes), decode_dropped(&bytes));
         }
     }
 }

@@ -9,7 +9,7 @@ use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
 use super::batch::Batch;
 use super::io as calls;
-use super::{BusError, Options};
+use super::{BusError, Filter, Options};
 
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: i32 = 72;
@@ -63,9 +63,7 @@ pub(super) fn open(name: &str, options: &Options) -> Result<(CanFdSocket, usize)
         return Err(BusError::ClassicOnly { name: name.to_owned(), mtu: interface.mtu });
     }
 
-    let filters: Vec<_> =
-        options.filters.iter().map(|filter| CanFilter::from((filter.id, filter.mask))).collect();
-    socket.set_filters(&filters).map_err(failed)?;
+    set_filters(&socket, &options.filters).map_err(failed)?;
     socket.set_error_filter(options.error_mask).map_err(failed)?;
     socket
         .set_socket_option_int(socketcan::socket::SOL_CAN_RAW, libc::CAN_RAW_FD_FRAMES, options.fd.into())
@@ -76,6 +74,12 @@ pub(super) fn open(name: &str, options: &Options) -> Result<(CanFdSocket, usize)
     discard(&socket);
     let granted = set_receive_buffer(&socket, options.receive_buffer).map_err(failed)?;
     Ok((socket, granted))
+}
+
+/// Puts filters in force, in place of those that were.
+pub(super) fn set_filters(socket: &CanFdSocket, filters: &[Filter]) -> io::Result<()> {
+    let filters: Vec<_> = filters.iter().map(|filter| CanFilter::from((filter.id, filter.mask))).collect();
+    socket.set_filters(&filters)
 }
 
 /// Lets so many bytes wait unread in a socket of any sort; how many the kernel granted and counts, which is twice

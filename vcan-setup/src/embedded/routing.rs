@@ -4,6 +4,7 @@
 //! where it can match: an exact identifier is found in a table, whatever the number of clients.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 
 use protocol::bus::Filter;
 use protocol::bus::embedded::Hello;
@@ -59,12 +60,22 @@ impl Class {
     }
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Wants {
+    /// What it is listed for, and no more.
+    filters: Vec<Filter>,
     own_frames: bool,
     fd: bool,
+    error_mask: u32,
     /// The last frame that was delivered, so that a second match does not deliver it again.
     last: u64,
+}
+
+impl Wants {
+    fn classes(&self) -> impl Iterator<Item = Class> + use<'_> {
+        let errors = (self.error_mask != 0).then_some(Class::Errors(self.error_mask & EXTENDED_MASK));
+        self.filters.iter().copied().map(Class::of).chain(errors)
+    }
 }
 
 /// Who wants what.
@@ -100,14 +111,29 @@ impl Router {
     pub fn insert(&mut self, client: ClientId, hello: &Hello) {
         self.remove(client);
         if self.clients.len() <= client.0 {
-            self.clients.resize(client.0 + 1, None);
+            self.clients.resize_with(client.0 + 1, || None);
         }
-        let wants = Wants { own_frames: hello.own_frames, fd: hello.fd, last: 0 };
+        let Hello { ref filters, own_frames, fd, error_mask, buffer: _ } = *hello;
+        let wants = Wants { filters: filters.clone(), own_frames, fd, error_mask, last: 0 };
+        self.list(client, &wants);
         if let Some(slot) = self.clients.get_mut(client.0) {
             *slot = Some(wants);
         }
-        let errors = (hello.error_mask != 0).then_some(Class::Errors(hello.error_mask & EXTENDED_MASK));
-        for class in hello.filters.iter().copied().map(Class::of).chain(errors) {
+    }
+
+    /// Puts other filters in force for a client that there is; the rest of its wishes stays.
+    pub fn set_filters(&mut self, client: ClientId, filters: Vec<Filter>) {
+        let Some(mut wants) = self.clients.get_mut(client.0).and_then(Option::take) else { return };
+        self.unlist(client, &wants);
+        wants.filters = filters;
+        self.list(client, &wants);
+        if let Some(slot) = self.clients.get_mut(client.0) {
+            *slot = Some(wants);
+        }
+    }
+
+    fn list(&mut self, client: ClientId, wants: &Wants) {
+        for class in wants.classes() {
             match class {
                 Class::Errors(mask) => self.errors.push((mask, client)),
                 Class::All => self.all.push(client),
@@ -125,20 +151,34 @@ impl Router {
 
     /// Forgets a client; nothing happens if there is none.
     pub fn remove(&mut self, client: ClientId) {
-        if self.clients.get_mut(client.0).and_then(Option::take).is_none() {
-            return;
+        if let Some(wants) = self.clients.get_mut(client.0).and_then(Option::take) {
+            self.unlist(client, &wants);
         }
-        self.errors.retain(|&(_, other)| other != client);
-        self.all.retain(|&other| other != client);
-        self.masked.retain(|&(_, other)| other != client);
-        self.inverted.retain(|&(_, other)| other != client);
-        for list in &mut self.standard {
-            list.retain(|&other| other != client);
+    }
+
+    /// Looks only where the client is listed: hundreds of them change their filters while frames are waiting.
+    fn unlist(&mut self, client: ClientId, wants: &Wants) {
+        for class in wants.classes() {
+            match class {
+                Class::Errors(_) => self.errors.retain(|&(_, other)| other != client),
+                Class::All => self.all.retain(|&other| other != client),
+                Class::Masked(_) => self.masked.retain(|&(_, other)| other != client),
+                Class::Inverted(_) => self.inverted.retain(|&(_, other)| other != client),
+                Class::Standard(id) => {
+                    if let Some(list) = self.standard.get_mut(usize::from(id)) {
+                        list.retain(|&other| other != client);
+                    }
+                }
+                Class::Extended(id) => {
+                    if let Entry::Occupied(mut list) = self.extended.entry(id) {
+                        list.get_mut().retain(|&other| other != client);
+                        if list.get().is_empty() {
+                            list.remove();
+                        }
+                    }
+                }
+            }
         }
-        self.extended.retain(|_, list| {
-            list.retain(|&other| other != client);
-            !list.is_empty()
-        });
     }
 
     /// Names each client that gets a frame, once, and whether the frame is its own.
@@ -285,6 +325,18 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(2000))]
+        #[test]
+        fn filters_that_were_changed_are_as_if_they_had_been_the_first(before in proptest::collection::vec(filter(), 0..5), after in proptest::collection::vec(filter(), 0..5), error_mask in 0..8_u32, id in word()) {
+            let id = sound(id);
+            let mut router = Router::new();
+            router.insert(ClientId(1), &Hello { error_mask, own_frames: true, ..hello(&before) });
+            router.set_filters(ClientId(1), after.clone());
+            let expected = if passes(&after, error_mask, id) { vec![(1, true)] } else { vec![] };
+            prop_assert_eq!(receivers(&mut router, 1, id, Format::Classic), expected);
+            router.remove(ClientId(1));
+            prop_assert_eq!(receivers(&mut router, 0, id, Format::Classic), vec![]);
+        }
+
         #[test]
         fn classes_change_nothing(filters in proptest::collection::vec(filter(), 0..5), error_mask in prop_oneof![Just(0_u32), 0..8_u32], id in word()) {
             let id = sound(id);

@@ -6,8 +6,11 @@ use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::thread::JoinHandle;
 
+use protocol::bus::Filter;
 use protocol::bus::batch::{BATCH, Batch, Outgoing};
-use protocol::bus::embedded::{Answer, HELLO_MAX, Hello, VERSION, encode_dropped, usual_directory};
+use protocol::bus::embedded::{
+    Answer, FilterPart, HELLO_MAX, Hello, VERSION, encode_dropped, usual_directory,
+};
 use protocol::can::FD_BYTES;
 use rustix::buffer::spare_capacity;
 use rustix::event::epoll::{self, EventData, EventFlags};
@@ -59,7 +62,7 @@ pub struct Totals {
     pub refused: u64,
     /// Frames taken from clients.
     pub frames: u64,
-    /// Datagrams of clients that were no frame.
+    /// Datagrams of clients that were neither a frame nor filters.
     pub garbage: u64,
     /// Frames times the clients that were to get them.
     pub routed: u64,
@@ -78,6 +81,8 @@ struct Client {
     /// What it said when it came; nothing is routed before.
     greeted: bool,
     fd: bool,
+    /// Filters that it has begun to put in force.
+    filters: Option<Vec<Filter>>,
     /// Its socket is full; `epoll` tells when it is not.
     blocked: bool,
     /// It is in the list of those to whom something has to be sent.
@@ -213,8 +218,15 @@ impl Server {
             self.totals.refused += 1;
             return;
         }
-        let queue = Queue::new(QUEUE);
-        let client = Client { socket, queue, greeted: false, fd: true, blocked: false, dirty: false };
+        let client = Client {
+            socket,
+            queue: Queue::new(QUEUE),
+            greeted: false,
+            fd: true,
+            filters: None,
+            blocked: false,
+            dirty: false,
+        };
         match self.clients.get_mut(index) {
             Some(slot) => *slot = Some(client),
             None => self.clients.push(Some(client)),
@@ -294,6 +306,7 @@ impl Server {
                 }
                 match bytes.and_then(|bytes| Parcel::accept(bytes, fd)) {
                     Some(parcel) => self.route(id, parcel),
+                    None if bytes.is_some_and(|bytes| self.refilter(id, bytes)) => {}
                     None => self.totals.garbage += 1,
                 }
             }
@@ -301,6 +314,24 @@ impl Server {
                 return;
             }
         }
+    }
+
+    /// Takes a part of a client's new filters, and whether it is one.
+    fn refilter(&mut self, id: ClientId, bytes: &[u8]) -> bool {
+        let Some(mut part) = FilterPart::decode(bytes) else { return false };
+        let Some(client) = self.clients.get_mut(id.0).and_then(Option::as_mut) else { return false };
+        let begun = if part.first { Some(Vec::new()) } else { client.filters.take() };
+        let Some(mut filters) = begun else { return false };
+        filters.append(&mut part.filters);
+        if filters.len() > Filter::MAX {
+            return false;
+        }
+        if part.last {
+            self.router.set_filters(id, filters);
+        } else {
+            client.filters = Some(filters);
+        }
+        true
     }
 
     fn is_hung_up(&mut self, id: ClientId) -> bool {
