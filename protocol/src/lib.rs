@@ -15,6 +15,7 @@ pub mod parameters;
 #[cfg(feature = "host")]
 pub mod skin;
 pub mod time;
+pub mod touch;
 #[cfg(feature = "host")]
 pub mod usage;
 pub mod wire;

@@ -11,6 +11,7 @@
 //! its reason, and nothing else.
 
 mod configuration;
+mod sensing;
 mod stimuli;
 mod summing;
 mod switches;
@@ -34,6 +35,7 @@ use crate::kernel::Kernel;
 use crate::network::Network;
 use crate::sum::{Begin, Sum, Words};
 use configuration::{Configuration, Written};
+use sensing::Sensing;
 use stimuli::{Arrival, Stimuli};
 use switches::Switches;
 
@@ -135,6 +137,7 @@ pub struct Node {
     sums: Sum,
     /// By port, whose sums are heard.
     heard_sums: [Option<CellId>; PORTS],
+    sensing: Sensing,
     hears_changed: bool,
     /// The parent that this epoch's sum is for, and its port.
     parent: Option<(usize, Option<CellId>)>,
@@ -177,6 +180,7 @@ impl Node {
             network: Network::new(now),
             sums: Sum::default(),
             heard_sums: [None; PORTS],
+            sensing: Sensing::default(),
             hears_changed: false,
             parent: None,
             heard_parent: false,
@@ -238,7 +242,8 @@ impl Node {
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let sums = self.sums.poll_timeout().unwrap_or(Micros(u64::MAX));
-        self.next_heartbeat.min(self.network.poll_timeout()).min(sums)
+        let sensing = self.sensing.due().unwrap_or(Micros(u64::MAX));
+        self.next_heartbeat.min(self.network.poll_timeout()).min(sums).min(sensing)
     }
 
     /// What has to go into flash; then comes [`Node::handle_stored`].
@@ -282,6 +287,7 @@ impl Node {
         self.network.handle_time(now);
         self.after_network(now);
         self.handle_sums(now);
+        self.sense_in_time(now);
         if now < self.next_heartbeat || self.identity.cell.is_none() {
             return;
         }
@@ -302,6 +308,7 @@ impl Node {
                 self.push_ports(now);
             }
         }
+        self.sense_with_heartbeat(now);
         // After a hang the missed ones are skipped, and the phase is kept.
         let missed = now.since(self.next_heartbeat).0 / HEARTBEAT.0;
         self.next_heartbeat = self.next_heartbeat + Span((missed + 1) * HEARTBEAT.0);
@@ -359,7 +366,13 @@ impl Node {
         };
         match message {
             Message::Joints { epoch, joints } => {
+                let taken = self.heard.joints;
                 self.take_joints(now, age, epoch, &joints);
+                // What was latched at joints that were too old is told with the next.
+                if self.heard.joints != taken {
+                    self.sense(now);
+                }
+                self.sense_before_the_next_joints(now);
                 self.heartbeat_before_the_next_joints(now);
             }
             Message::Halt => {
@@ -383,7 +396,11 @@ impl Node {
                     self.push_ports(now);
                 }
             }
-            Message::Configure { tag, request, .. } => self.configure(now, tag, request),
+            Message::Configure { tag, request, .. } => {
+                self.configure(now, tag, request);
+                // Another mode is another beginning, and who leaves test mode feels nothing any more.
+                self.sense(now);
+            }
             Message::Sum { from, epoch, torque, count } => {
                 self.take_sum(now, from, epoch, Words { torque, count });
             }
@@ -461,6 +478,7 @@ impl Node {
 
     fn push_sensors(&mut self, page: SensorPage) {
         let Some(from) = self.identity.cell else { return };
+        self.sensing.sends(&page);
         self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
@@ -610,7 +628,12 @@ const fn first_word(identity: Identity, now: Micros) -> Micros {
 
 /// Heartbeats of a bus are spread over the period by node number.
 const fn phase(cell: CellId) -> Span {
-    Span(HEARTBEAT.0 * cell.get() as u64 / 255)
+    spread(HEARTBEAT, cell)
+}
+
+/// When in a period a cell speaks.
+const fn spread(period: Span, cell: CellId) -> Span {
+    Span(period.0 * cell.get() as u64 / 255)
 }
 
 const fn count(counter: &mut u16) {

@@ -1,0 +1,224 @@
+//! When a cell says what it feels without being asked: continuously, on events, or not at all.
+//!
+//! ```text
+//!   Off         silence; a report asks
+//!   Continuous  |s       s       s       s       s       s     a page 0 each period, phases spread by node
+//!   Event       |s   s ss    s             s             s     on change, on release, with each heartbeat
+//! ```
+//!
+//! A change is measured from what was *sent* last and not from what was felt last, so that a slow drift is
+//! seen. Touch and release have two thresholds, so that noise at one of them is no stream of events. What is
+//! said follows from what is felt and from the times alone: the same inputs, the same frames.
+
+use protocol::fixed::Q3_12;
+use protocol::id::CellId;
+use protocol::message::{SensorPage, SkinSensors};
+use protocol::parameters::{Events, Sensing as Mode};
+use protocol::time::{Micros, Span};
+use protocol::touch::{Touch, contact};
+
+use super::{Claim, Node, spread};
+
+/// Every so many heartbeats bring the acceleration too: it tells no touch, and is seldom wanted.
+const BEATS_PER_ACCELERATION: u8 = 4;
+
+/// Which pages are to be said.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+struct Pages {
+    skin: bool,
+    acceleration: bool,
+}
+
+impl Pages {
+    const NONE: Self = Self { skin: false, acceleration: false };
+    const SKIN: Self = Self { skin: true, acceleration: false };
+    const BOTH: Self = Self { skin: true, acceleration: true };
+}
+
+/// All that a cell feels.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Felt {
+    skin: SkinSensors,
+    acceleration: [Q3_12; 3],
+}
+
+/// What was said, and when the next is due.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Sensing {
+    mode: Mode,
+    /// When the next one is due; in continuous mode only.
+    due: Option<Micros>,
+    /// What was sent last, whoever asked for it.
+    sent: Felt,
+    /// When page 0 was said last without being asked for.
+    said: Option<Micros>,
+    contact: Touch,
+    proximity: Touch,
+    /// Heartbeats since the acceleration went with one.
+    beats: u8,
+}
+
+impl Sensing {
+    /// When the next frame is due by itself.
+    pub(super) const fn due(&self) -> Option<Micros> {
+        self.due
+    }
+
+    /// A page goes out.
+    pub(super) const fn sends(&mut self, page: &SensorPage) {
+        match *page {
+            SensorPage::Skin(skin) => self.sent.skin = skin,
+            SensorPage::Acceleration(acceleration) => self.sent.acceleration = acceleration,
+        }
+    }
+
+    /// Something may have been latched, measured or switched.
+    fn look(&mut self, now: Micros, mode: Mode, events: &Events, cell: Option<CellId>, felt: &Felt) -> Pages {
+        if mode != self.mode {
+            return self.switch(now, mode, events, cell, felt);
+        }
+        if mode != Mode::Event {
+            return Pages::NONE;
+        }
+        let Felt { skin, acceleration } = felt;
+        let turned = self.follow(skin, events);
+        let pages = Pages {
+            skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
+            acceleration: (acceleration.iter().zip(self.sent.acceleration))
+                .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.acceleration.to_bits())),
+        };
+        self.says(now, pages)
+    }
+
+    /// Another mode, which begins with what is felt now.
+    fn switch(
+        &mut self,
+        now: Micros,
+        mode: Mode,
+        events: &Events,
+        cell: Option<CellId>,
+        felt: &Felt,
+    ) -> Pages {
+        *self = Self { mode, sent: self.sent, ..Self::default() };
+        match mode {
+            Mode::Off => return Pages::NONE,
+            Mode::Continuous { period_ms } => {
+                let period = Span::from_millis(period_ms.into());
+                self.due = Some(now + period + cell.map_or(Span(0), |cell| spread(period, cell)));
+            }
+            Mode::Event => {
+                self.follow(&felt.skin, events);
+            }
+        }
+        self.says(now, Pages::BOTH)
+    }
+
+    /// Follows contact and proximity; whether that is to be said: a touch, a release, and the zero after one.
+    fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
+        let contact = self.contact.next(contact(skin), events.contact.to_bits(), events.hysteresis);
+        let proximity = i32::from(skin.proximity.to_bits());
+        let proximity = self.proximity.next(proximity, events.proximity.to_bits(), events.hysteresis);
+        let before = (self.contact, self.proximity);
+        (self.contact, self.proximity) = (contact, proximity);
+        before != (contact, proximity)
+    }
+
+    /// A regular heartbeat goes out. What was said at this very moment is not said again.
+    fn beat(&mut self, now: Micros) -> Pages {
+        if self.mode == Mode::Off {
+            return Pages::NONE;
+        }
+        self.beats = (self.beats + 1) % BEATS_PER_ACCELERATION;
+        let skin = self.mode == Mode::Event && self.said != Some(now);
+        self.says(now, Pages { skin, acceleration: self.beats == 0 })
+    }
+
+    /// Time has passed: what is due before `until` is said, and what was missed is skipped; the phase is kept.
+    fn pass(&mut self, now: Micros, until: Micros) -> Pages {
+        let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
+        if due >= until {
+            return Pages::NONE;
+        }
+        let period = Span::from_millis(period_ms.into());
+        let missed = now.since(due).0.checked_div(period.0).unwrap_or(0);
+        self.due = Some(due + Span((missed + 1) * period.0));
+        self.says(now, Pages::SKIN)
+    }
+
+    const fn says(&mut self, now: Micros, pages: Pages) -> Pages {
+        if pages.skin {
+            self.said = Some(now);
+        }
+        pages
+    }
+}
+
+fn has_moved(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
+    let contact = (now.contact.iter().zip(sent.contact))
+        .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.contact.to_bits()));
+    let temperature = (now.temperature.iter().zip(sent.temperature))
+        .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.temperature.to_bits()));
+    contact
+        || temperature
+        || is_far(now.proximity.to_bits(), sent.proximity.to_bits(), events.proximity.to_bits())
+}
+
+/// By a threshold or more; a threshold of 0 means every change.
+fn is_far(now: i16, sent: i16, threshold: i16) -> bool {
+    i32::from(now).abs_diff(sent.into()) >= u32::from(threshold.unsigned_abs().max(1))
+}
+
+impl Node {
+    /// Says what has to be said after something was latched, measured or switched.
+    pub(super) fn sense(&mut self, now: Micros) {
+        // Whose number is in doubt says nothing; what is felt is compared with what was sent, so that
+        // nothing is forgotten.
+        if self.claim != Claim::Settled {
+            return;
+        }
+        let felt = Felt { skin: *self.stimuli.skin(), acceleration: self.stimuli.acceleration() };
+        let (mode, events, cell) = (self.switches.sensing, self.switches.events, self.identity.cell);
+        let pages = self.sensing.look(now, mode, &events, cell, &felt);
+        self.say_felt(pages);
+    }
+
+    /// Says what goes with a regular heartbeat.
+    pub(super) fn sense_with_heartbeat(&mut self, now: Micros) {
+        let pages = self.sensing.beat(now);
+        self.say_felt(pages);
+    }
+
+    /// Says what is due.
+    pub(super) fn sense_in_time(&mut self, now: Micros) {
+        if self.claim != Claim::Settled {
+            return;
+        }
+        let pages = self.sensing.pass(now, now + Span(1));
+        self.say_felt(pages);
+    }
+
+    /// What is due before the next joints is said now, while the cell is awake. Not where it would be said
+    /// once for each joints or more often: all cells would say it at once, each time.
+    pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
+        let Some(in_use) = self.configuration.in_use() else { return };
+        let joints = Span(in_use.parameters.period_us.into());
+        if let Mode::Continuous { period_ms } = self.switches.sensing
+            && Span::from_millis(period_ms.into()) > joints
+        {
+            let pages = self.sensing.pass(now, now + joints);
+            self.say_felt(pages);
+        }
+    }
+
+    fn say_felt(&mut self, pages: Pages) {
+        if pages.skin {
+            self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
+        }
+        if pages.acceleration {
+            self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,397 @@
+use protocol::can::Format;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use protocol::id::{CellId, Node as Address};
+use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::{Contact, Events, Parameter, Parameters, Pose, Sensing as Mode};
+use protocol::time::{Micros, Span};
+
+use crate::node::{Flash, HEARTBEAT, Identity, Node};
+
+const NODE: u8 = 51;
+/// Node 51 speaks a fifth into a period.
+const PERIOD: Span = Span::from_millis(10);
+const JOINTS: Span = Span::from_millis(16);
+
+/// A cell in a time of its own.
+struct Cell {
+    node: Node,
+    format: Format,
+    now: Micros,
+    epoch: Epoch,
+}
+
+impl Cell {
+    /// A settled one, in this mode.
+    fn new(mode: Mode) -> Self {
+        Self::of(Format::Fd, mode)
+    }
+
+    fn of(format: Format, mode: Mode) -> Self {
+        let parameters = Parameters {
+            joint: 1,
+            joints: 1,
+            pose: Pose {
+                position: [Q1_14::ZERO; 3],
+                normal: [Q1_14::nearest(1.0), Q1_14::ZERO, Q1_14::ZERO],
+            },
+            contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
+            period_us: 16_000,
+            ..Parameters::default()
+        };
+        let identity = Identity { cell: Some(CellId::new(NODE.into()).unwrap()), serial: 0 };
+        let node = Node::new(identity, format, &Flash::Sound(parameters), true, Micros(0));
+        let mut cell = Self { node, format, now: Micros(0), epoch: Epoch(0) };
+        cell.waits();
+        cell.waits();
+        cell.switches(mode);
+        cell
+    }
+
+    /// What it sends of what it feels.
+    fn sends(&mut self) -> Vec<SensorPage> {
+        let packets = core::iter::from_fn(|| self.node.poll_transmit());
+        let pages = packets.filter_map(|packet| match Message::decode(&packet).unwrap() {
+            Message::Sensors { page, .. } => Some(page),
+            _ => None,
+        });
+        pages.collect()
+    }
+
+    fn hears(&mut self, message: &Message, age: Span) -> Vec<SensorPage> {
+        for frame in message.encode().frames(self.format) {
+            self.node.handle_frame(self.now, age, &frame);
+        }
+        self.sends()
+    }
+
+    fn write(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Vec<SensorPage> {
+        let request = Request::Write { number: parameter.number(), words };
+        self.hears(&Message::Configure { to: Address::Everyone, tag: 0, request }, Span(0))
+    }
+
+    fn switches(&mut self, mode: Mode) -> Vec<SensorPage> {
+        self.write(Parameter::Sensing, mode.words())
+    }
+
+    /// The next joints come, at this very moment; nothing but joints and stimuli moves a cell.
+    fn joints(&mut self) -> Vec<SensorPage> {
+        self.joints_aged(Span(0))
+    }
+
+    fn joints_aged(&mut self, age: Span) -> Vec<SensorPage> {
+        self.epoch = self.epoch.next();
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+        self.hears(&Message::Joints { epoch: self.epoch, joints }, age)
+    }
+
+    /// It feels this from the next joints on, which come.
+    fn feels(&mut self, page: SensorPage) -> Vec<SensorPage> {
+        let to = Address::Everyone;
+        assert_eq!(self.hears(&Message::Stimulus { to, from: From::Next, page }, Span(0)), []);
+        self.joints()
+    }
+
+    /// One contact word feels so many steps; whether it says so, and nothing else.
+    fn says(&mut self, bits: i16) -> bool {
+        let page = pressed(bits);
+        match self.feels(page).as_slice() {
+            [] => false,
+            [said] if *said == page => true,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    /// Time passes until it wants to be woken.
+    fn waits(&mut self) -> (Micros, Vec<SensorPage>) {
+        self.now = self.node.poll_timeout();
+        self.node.handle_timeout(self.now);
+        (self.now, self.sends())
+    }
+
+    /// The times at which it says page 0 by itself.
+    fn times(&mut self, count: usize) -> Vec<u64> {
+        let mut times = Vec::new();
+        while times.len() < count {
+            let (at, pages) = self.waits();
+            times.extend(pages.iter().filter(|page| matches!(page, SensorPage::Skin(_))).map(|_| at.0));
+        }
+        times
+    }
+}
+
+fn pressed(bits: i16) -> SensorPage {
+    let contact = [Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO];
+    SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() })
+}
+
+const NOTHING: SensorPage = SensorPage::Acceleration([Q3_12::ZERO; 3]);
+
+/// A threshold of 100 steps everywhere, and a release below 50.
+fn events() -> Events {
+    Events {
+        contact: Q5_10::from_bits(100),
+        proximity: Q1_14::from_bits(100),
+        temperature: Q9_6::from_bits(100),
+        acceleration: Q3_12::from_bits(100),
+        hysteresis: Q1_14::nearest(0.5),
+    }
+}
+
+fn eventful() -> Cell {
+    let mut cell = Cell::new(Mode::Off);
+    assert_eq!(cell.write(Parameter::Events, events().words()), [], "no mode, no frame");
+    assert_eq!(cell.switches(Mode::Event), [pressed(0), NOTHING], "the present state, at once");
+    cell
+}
+
+#[test]
+fn off_says_nothing_whatever_is_felt() {
+    let mut cell = Cell::new(Mode::Off);
+    assert!(!cell.says(2_000) && !cell.says(0));
+    for _ in 0..8 {
+        assert_eq!(cell.waits().1, [], "nor with a heartbeat");
+    }
+}
+
+#[test]
+fn touch_and_release_have_two_thresholds() {
+    let mut cell = eventful();
+    let course = [99, 100, 150, 60, 50, 49, 20, 99, 100, 51, 52, 0, 0];
+    let said = course.map(|bits| cell.says(bits));
+    //               99     touch  150    60     50     release fading 99     touch  51     52     zero  zero
+    let expected = [false, true, false, false, false, true, false, false, true, false, false, true, false];
+    assert_eq!(said, expected, "{course:?}");
+}
+
+#[test]
+fn noise_below_the_threshold_says_nothing() {
+    let mut cell = eventful();
+    for bits in [10, 0, 99, 3, 0, 98, 0, 99, 0] {
+        assert!(!cell.says(bits), "{bits}");
+    }
+}
+
+#[test]
+fn a_release_is_said_however_softly_it_comes_and_so_is_the_zero_after_it() {
+    let mut cell = eventful();
+    assert!(cell.says(100));
+    let said: Vec<_> = (0..100).rev().filter(|&bits| cell.says(bits)).collect();
+    assert_eq!(said, [49, 0], "neither moved by a threshold from what was sent");
+}
+
+#[test]
+fn a_slow_drift_is_seen_because_it_is_measured_from_what_was_sent() {
+    let mut cell = eventful();
+    let said: Vec<_> = (1..=450).filter(|&bits| cell.says(bits)).collect();
+    assert_eq!(said, [100, 200, 300, 400]);
+    let said: Vec<_> = (150..450).rev().filter(|&bits| cell.says(bits)).collect();
+    assert_eq!(said, [300, 200]);
+}
+
+#[test]
+fn a_touch_is_the_sum_of_the_three_contact_words() {
+    let mut cell = eventful();
+    let of = |bits: [i16; 3]| {
+        SensorPage::Skin(SkinSensors { contact: bits.map(Q5_10::from_bits), ..SkinSensors::default() })
+    };
+    assert_eq!(cell.feels(of([33, 33, 33])), []);
+    assert_eq!(cell.feels(of([33, 33, 34])), [of([33, 33, 34])], "no word has moved by the threshold");
+    assert_eq!(cell.feels(of([16, 16, 17])), [of([16, 16, 17])]);
+}
+
+#[test]
+fn every_sensor_has_its_threshold() {
+    let mut cell = eventful();
+    let none = SkinSensors::default();
+    let near = |bits| SensorPage::Skin(SkinSensors { proximity: Q1_14::from_bits(bits), ..none });
+    let warm =
+        |bits| SensorPage::Skin(SkinSensors { temperature: [Q9_6::ZERO, Q9_6::from_bits(bits)], ..none });
+    let tilted = |bits| SensorPage::Acceleration([Q3_12::ZERO, Q3_12::from_bits(bits), Q3_12::ZERO]);
+    for of in [&near as &dyn Fn(i16) -> SensorPage, &warm, &tilted] {
+        assert_eq!(cell.feels(of(99)), []);
+        assert_eq!(cell.feels(of(100)), [of(100)]);
+        assert_eq!(cell.feels(of(101)), [], "said already");
+        assert_eq!(cell.feels(of(0)), [of(0)]);
+    }
+    assert_eq!(cell.feels(near(100)), [near(100)]);
+    assert_eq!(cell.feels(near(50)), []);
+    assert_eq!(cell.feels(near(49)), [near(49)], "a release of what came near");
+}
+
+#[test]
+fn a_heartbeat_in_event_mode_brings_the_present_state_and_every_fourth_the_acceleration() {
+    let mut cell = eventful();
+    assert!(!cell.says(60));
+    let beats: Vec<_> = (0..8).map(|_| cell.waits()).collect();
+    for (beat, (_, pages)) in beats.iter().enumerate() {
+        let both = [pressed(60), NOTHING];
+        assert_eq!(pages.as_slice(), &both[..if beat % 4 == 3 { 2 } else { 1 }], "{beat}");
+    }
+    assert!(beats.windows(2).all(|pair| pair[1].0.since(pair[0].0) == HEARTBEAT));
+    // What was sent is known, whatever it was sent for.
+    assert!(!cell.says(60) && cell.says(160));
+}
+
+#[test]
+fn a_heartbeat_with_an_event_does_not_say_it_twice() {
+    let mut cell = eventful();
+    cell.now = cell.node.poll_timeout() - Span(1_000);
+    let to = Address::Everyone;
+    cell.hears(&Message::Stimulus { to, from: From::Next, page: pressed(500) }, Span(0));
+    cell.epoch = cell.epoch.next();
+    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+    for frame in (Message::Joints { epoch: cell.epoch, joints }).encode().frames(Format::Fd) {
+        cell.node.handle_frame(cell.now, Span(0), &frame);
+    }
+    let said: Vec<_> = core::iter::from_fn(|| cell.node.poll_transmit())
+        .map(|packet| match Message::decode(&packet).unwrap() {
+            Message::Torque { .. } => "torque",
+            Message::Sensors { .. } => "sensors",
+            Message::Network { page: NetworkPage::Heartbeat(_), .. } => "heartbeat",
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(said, ["torque", "sensors", "heartbeat"], "the torque first");
+}
+
+#[test]
+fn continuous_keeps_its_period_and_the_phase_of_its_number() {
+    let mut cell = Cell::new(Mode::Off);
+    let switched = cell.now;
+    let said = cell.switches(Mode::Continuous { period_ms: 10 });
+    assert_eq!(said, [pressed(0), NOTHING], "the present state, at once");
+    // 51/255 of a period after the period.
+    let first = switched.0 + PERIOD.0 + PERIOD.0 / 5;
+    let expected: Vec<_> = (0..60).map(|n| first + n * PERIOD.0).collect();
+    assert_eq!(cell.times(60), expected, "heartbeats shift none of them");
+    // Early is harmless, and says nothing.
+    cell.node.handle_timeout(cell.node.poll_timeout() - Span(1));
+    assert_eq!(cell.sends(), []);
+}
+
+#[test]
+fn a_hang_skips_what_was_missed_and_keeps_the_phase() {
+    let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
+    let last = cell.times(3)[2];
+    cell.now = Micros(last + 95_000);
+    cell.node.handle_timeout(cell.now);
+    let skins = cell.sends().into_iter().filter(|page| matches!(page, SensorPage::Skin(_))).count();
+    assert_eq!(skins, 1, "one for all that it missed");
+    assert_eq!(cell.times(2), [last + 100_000, last + 110_000]);
+}
+
+#[test]
+fn what_is_felt_during_a_hang_is_told_with_the_next_joints() {
+    let mut cell = eventful();
+    let to = Address::Everyone;
+    for bits in [500, 700, 900] {
+        cell.hears(&Message::Stimulus { to, from: From::Next, page: pressed(bits) }, Span(0));
+        assert_eq!(cell.joints_aged(Span(16_001)), [], "too old");
+    }
+    assert_eq!(cell.joints(), [pressed(900)]);
+}
+
+#[test]
+fn a_long_period_comes_with_the_answer_before_it_and_a_short_one_keeps_its_own_time() {
+    let mut cell = Cell::new(Mode::Continuous { period_ms: 100 });
+    let due = cell.times(1)[0] + 100_000;
+    let joints_at = |cell: &mut Cell, at: u64| {
+        cell.now = Micros(at);
+        cell.joints().into_iter().filter(|page| matches!(page, SensorPage::Skin(_))).count()
+    };
+    assert_eq!(joints_at(&mut cell, due - JOINTS.0), 0, "the next joints come in time for it");
+    assert_eq!(joints_at(&mut cell, due - JOINTS.0 + 1), 1);
+    assert_eq!(cell.times(1), [due + 100_000], "neither drifts nor comes twice");
+
+    let mut cell = Cell::new(Mode::Continuous { period_ms: 16 });
+    let due = cell.times(1)[0] + 16_000;
+    assert_eq!(joints_at(&mut cell, due - 1), 0, "or all would speak at once, each time");
+    assert_eq!(cell.times(1), [due]);
+}
+
+#[test]
+fn switching_begins_anew_and_the_same_again_changes_nothing() {
+    let mut cell = eventful();
+    assert!(cell.says(500));
+    assert_eq!(cell.switches(Mode::Event), [], "no other mode");
+    assert_eq!(cell.switches(Mode::Continuous { period_ms: 10 }), [pressed(500), NOTHING]);
+    assert!(!cell.says(900), "no event");
+    let times = cell.times(2);
+    assert_eq!(cell.switches(Mode::Continuous { period_ms: 10 }), []);
+    assert_eq!(cell.times(1), [times[1] + 10_000], "nor another phase");
+    assert_eq!(cell.switches(Mode::Continuous { period_ms: 20 }), [pressed(900), NOTHING]);
+    assert_eq!(cell.switches(Mode::Event), [pressed(900), NOTHING]);
+    // It knows that this is a touch.
+    let said: Vec<_> = (0..60).rev().filter(|&bits| cell.says(bits)).collect();
+    assert_eq!(said, [59, 49, 0], "a fall, a release, and nothing any more");
+    assert_eq!(cell.switches(Mode::Off), []);
+    assert!(!cell.says(900));
+}
+
+#[test]
+fn other_thresholds_hold_at_once() {
+    let mut cell = eventful();
+    assert!(!cell.says(60));
+    let finer = Events { contact: Q5_10::from_bits(50), ..events() };
+    assert_eq!(cell.write(Parameter::Events, finer.words()), [pressed(60)]);
+}
+
+#[test]
+fn who_leaves_test_mode_has_let_go() {
+    let mut cell = eventful();
+    assert!(cell.says(500));
+    assert_eq!(cell.write(Parameter::Mode, [0; WORDS]), [pressed(0)]);
+}
+
+#[test]
+fn a_halted_cell_goes_on_to_say_what_it_feels() {
+    let mut cell = eventful();
+    assert_eq!(cell.hears(&Message::Halt, Span(0)), []);
+    assert!(cell.says(500) && cell.says(0));
+}
+
+#[test]
+fn on_a_classic_bus_it_is_the_same() {
+    let course = [99, 100, 150, 250, 40, 0];
+    let said = [Format::Fd, Format::Classic].map(|format| {
+        let mut cell = Cell::of(format, Mode::Off);
+        cell.write(Parameter::Events, events().words());
+        assert_eq!(cell.switches(Mode::Event), [pressed(0), NOTHING]);
+        course.map(|bits| cell.says(bits))
+    });
+    assert_eq!(said[0], [false, true, false, true, true, true]);
+    assert_eq!(said[0], said[1]);
+}
+
+#[test]
+fn the_same_inputs_make_the_same_frames() {
+    use proptest::prelude::*;
+    let steps = proptest::collection::vec((0_u8..4, any::<i16>(), 0_u64..60_000), 0..60);
+    proptest!(|(steps in steps)| {
+        let run = || {
+            let mut cell = eventful();
+            let mut said = Vec::new();
+            for &(what, bits, later) in &steps {
+                // Never later than it wants to be woken, as a shell does it.
+                let until = cell.now + Span(later);
+                while cell.node.poll_timeout() <= until {
+                    said.push(cell.waits());
+                }
+                cell.now = until;
+                let pages = match what {
+                    0 | 1 => cell.feels(pressed(bits)),
+                    2 => cell.feels(SensorPage::Acceleration([Q3_12::from_bits(bits); 3])),
+                    _ => cell.switches(match bits % 3 {
+                        0 => Mode::Off,
+                        1 => Mode::Continuous { period_ms: bits.unsigned_abs() % 200 + 1 },
+                        _ => Mode::Event,
+                    }),
+                };
+                said.push((cell.now, pages));
+            }
+            said
+        };
+        prop_assert_eq!(run(), run());
+    });
+}
