@@ -242,7 +242,7 @@ impl Node {
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let sums = self.sums.poll_timeout().unwrap_or(Micros(u64::MAX));
-        let sensing = self.sensing.due().unwrap_or(Micros(u64::MAX));
+        let sensing = self.sensing_due().unwrap_or(Micros(u64::MAX));
         self.next_heartbeat.min(self.network.poll_timeout()).min(sums).min(sensing)
     }
 

@@ -59,11 +59,6 @@ pub(super) struct Sensing {
 }
 
 impl Sensing {
-    /// When the next frame is due by itself.
-    pub(super) const fn due(&self) -> Option<Micros> {
-        self.due
-    }
-
     /// A page goes out.
     pub(super) const fn sends(&mut self, page: &SensorPage) {
         match *page {
@@ -188,9 +183,14 @@ impl Node {
         self.say_felt(pages);
     }
 
+    /// When it has something to say by itself; not while its number is in doubt.
+    pub(super) fn sensing_due(&self) -> Option<Micros> {
+        self.sensing.due.filter(|_| self.claim == Claim::Settled)
+    }
+
     /// Says what is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
-        if self.claim != Claim::Settled {
+        if self.sensing_due().is_none() {
             return;
         }
         let pages = self.sensing.pass(now, now + Span(1));
