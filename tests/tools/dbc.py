@@ -54,8 +54,50 @@ def state(fields):
     return bits | {"state_joint": int(fields["joint"]), "state_version": int(fields["version"])}
 
 
+def bits(text):
+    return {int(bit) for bit in text.split("+") if bit != "none"}
+
+
+def tree(fields):
+    said = {key: int(fields[key]) for key in ("up", "depth", "round")}
+    said |= {f"sums_{key}": int(fields[key]) for key in ("sent", "taken", "dropped")}
+    said["parent"] = 255 if fields["parent"] == "none" else int(fields["parent"])
+    said |= {f"child_at_{port}": int(port in bits(fields["children"])) for port in range(4)}
+    return said | {f"port_{port}_works": int(port in bits(fields["works"])) for port in range(5)}
+
+
+def ports(fields):
+    said = {"parent_changes": int(fields["changes"])}
+    for port in range(4):
+        number, there, flags = fields[f"port{port}"].split("/")
+        names = {"hears": "hears", "works": "both_ways", "other-version": "other_version"}
+        said |= {f"port_{port}_leads_to": int(number), f"port_{port}_leads_to_port": int(there)}
+        said |= {f"port_{port}_{name}": int(flag in flags.split("+")) for flag, name in names.items()}
+    return said
+
+
+def switch(fields):
+    """What is written of parameters 6 to 9."""
+    if "reply" in fields:
+        said = {"reply": int(fields["reply"] == "sum")}
+        keys = {"slot_us": "reply_slot", "deepest": "reply_deepest", "carry": "reply_carry"}
+    elif "sensing" in fields:
+        said = {"sensing": ["off", "continuous", "event"].index(fields["sensing"])}
+        keys = {"period_ms": "sensing_period"}
+    elif "deaf" in fields:
+        return {f"cut_port_{port}": int(port in bits(fields["deaf"])) for port in range(5)}
+    elif "hysteresis" in fields:
+        said = {}
+        keys = {key: f"events_{key}" for key in ("contact", "proximity", "temperature", "acceleration", "hysteresis")}
+    else:
+        return {}
+    return said | {name: float(fields[key]) for key, name in keys.items() if key in fields}
+
+
 def parameter(fields):
     number = int(fields["parameter"])
+    if 6 <= number <= 9:
+        return {"parameter": number, "tag": int(fields["tag"])} | switch(fields)
     said = {"parameter": number, "tag": int(fields["tag"])}
     for key, text in fields.items():
         if key == "position":
@@ -98,6 +140,10 @@ def meaning(kind, fields):
             counters = {key: int(text) for key, text in fields.items() if key not in ("from", "epoch")}
             counters = {f"{kind}_{HEARD.get(key, key)}": count for key, count in counters.items()}
             return f"network_{who}", epoch | counters | {"page": 1 if kind == "heard" else 2}
+        case "tree":
+            return f"network_{who}", epoch | tree(fields) | {"page": 3}
+        case "ports":
+            return f"network_{who}", epoch | ports(fields) | {"page": 4}
         case "read" | "write":
             return f"configure_{who}", parameter(fields) | {"write": int(kind == "write")}
         case "value" if "words" in fields:

@@ -46,7 +46,7 @@ pub(crate) struct Dump {
     #[arg(value_name = "BUS|FILE")]
     source: PathBuf,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, and foreign
+    /// joints, sync, resume, report alone, wire, and foreign
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Wanted>,
     /// Only packets from or to these: a cell's number, gateway, everyone

@@ -52,7 +52,7 @@ pub(crate) struct Replay {
     #[arg(long, value_enum)]
     only: Option<Only>,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, and foreign
+    /// joints, sync, resume, report alone, wire, and foreign
     #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
     kind: Vec<Wanted>,
     /// Only packets from or to these: a cell's number, gateway, everyone

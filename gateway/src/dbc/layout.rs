@@ -52,8 +52,42 @@ pub(super) fn network() -> Vec<Signal> {
     signals.extend((0..).zip(heard).map(|(index, name)| Signal::word(format!("heard_{name}"), index).on(1)));
     signals
         .extend((0..).zip(refused).map(|(index, name)| Signal::word(format!("refused_{name}"), index).on(2)));
-    let page = Signal::page_number("page", 8).naming([(0, "heartbeat"), (1, "heard"), (2, "refused")]);
-    ended(signals, [Signal::epoch(), page.within(0.0, 2.0)])
+    signals.extend(tree().into_iter().map(|signal| signal.on(3)));
+    signals.extend(ports().into_iter().map(|signal| signal.on(4)));
+    let names = [(0, "heartbeat"), (1, "heard"), (2, "refused"), (3, "tree"), (4, "ports")];
+    let page = Signal::page_number("page", 8).naming(names);
+    ended(signals, [Signal::epoch(), page.within(0.0, 4.0)])
+}
+
+/// A cell's place in the tree, and what became of sums.
+fn tree() -> Vec<Signal> {
+    let mut signals = vec![
+        Signal::bits("parent", 0, 8).naming([(0, "gateway"), (255, "no way up")]),
+        Signal::bits("up", 8, 8).within(0.0, 4.0).naming([(4, "uplink")]),
+        Signal::bits("depth", 16, 8),
+        Signal::bits("round", 24, 8),
+    ];
+    signals.extend((0..4).map(|port| Signal::bits(format!("child_at_{port}"), 32 + port, 1)));
+    signals.extend((0..5).map(|port| Signal::bits(format!("port_{port}_works"), 40 + port, 1)));
+    let counters = ["sums_sent", "sums_taken", "sums_dropped"];
+    signals.extend((3..).zip(counters).map(|(index, name)| Signal::word(name, index)));
+    signals
+}
+
+/// What a cell's ports lead to.
+fn ports() -> Vec<Signal> {
+    let port = |port: u8| {
+        let name = |of: &str| format!("port_{port}_{of}");
+        let at = port * 16;
+        [
+            Signal::bits(name("leads_to"), at, 8).naming([(0, "nobody with a number")]),
+            Signal::bits(name("leads_to_port"), at + 8, 3),
+            Signal::bits(name("hears"), at + 12, 1),
+            Signal::bits(name("both_ways"), at + 13, 1),
+            Signal::bits(name("other_version"), at + 14, 1),
+        ]
+    };
+    (0..4).flat_map(port).chain([Signal::word("parent_changes", 4)]).collect()
 }
 
 pub(super) fn configure() -> Vec<Signal> {
@@ -65,7 +99,8 @@ pub(super) fn configured() -> Vec<Signal> {
     let mut signals = parameters();
     signals
         .push(Signal::word("refused_parameter", 0).within(0.0, 127.0).on(REFUSAL).naming(parameter_names()));
-    let reasons = [1, 2, 3, 4, 5, 6, Answer::WRONG_HASH, Answer::FLASH_FAILED, Answer::UNKNOWN];
+    let reasons =
+        [1, 2, 3, 4, 5, 6, Answer::WRONG_HASH, Answer::FLASH_FAILED, Answer::UNKNOWN, Answer::CANNOT_BE];
     let reasons = reasons.map(|number| (i64::from(number), reason(number)));
     signals.push(Signal::fixed::<0>("refused_reason", 1, "").on(REFUSAL).naming(reasons));
     let mut names = parameter_names();
@@ -157,7 +192,28 @@ fn words(parameter: Parameter) -> Vec<Signal> {
         Parameter::Mode => {
             vec![Signal::fixed::<0>("mode", 0, "").naming([(0, "measure"), (1, "obey stimuli")])]
         }
-        Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => vec![],
+        Parameter::Reply => vec![
+            Signal::fixed::<0>("reply", 0, "").within(0.0, 1.0).naming([(0, "torque"), (1, "sum")]),
+            Signal::word("reply_slot", 1).in_unit("us"),
+            Signal::fixed::<0>("reply_deepest", 2, "").within(0.0, 253.0),
+            Signal::fixed::<0>("reply_carry", 3, "").within(0.0, 1.0),
+        ],
+        Parameter::Sensing => vec![
+            Signal::fixed::<0>("sensing", 0, "").within(0.0, 2.0).naming([
+                (0, "off"),
+                (1, "continuous"),
+                (2, "event"),
+            ]),
+            Signal::word("sensing_period", 1).in_unit("ms"),
+        ],
+        Parameter::Events => vec![
+            Signal::fixed::<10>("events_contact", 0, "N").not_negative(),
+            Signal::fixed::<14>("events_proximity", 1, "").not_negative(),
+            Signal::fixed::<6>("events_temperature", 2, "degC").not_negative(),
+            Signal::fixed::<12>("events_acceleration", 3, "g").not_negative(),
+            Signal::fixed::<14>("events_hysteresis", 4, "").within(0.0, 1.0),
+        ],
+        Parameter::Cuts => (0..5).map(|port| Signal::bits(format!("cut_port_{port}"), port, 1)).collect(),
         Parameter::Row(row) => {
             let name = |field: &str| format!("row{}_{field}", row + 1);
             vec![

@@ -8,6 +8,9 @@
 //! where byte 13 says what the words are, it multiplexes them. Angles are in rad, whose step is pi / 2^15: exact to the
 //! last bit of a double.
 //!
+//! What cells say over simulated wires is not in it: these frames are on no real bus, and their identifiers number
+//! wires and not cells. `gateway dump` shows them.
+//!
 //! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in two frames
 //! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.
 
@@ -136,7 +139,8 @@ fn from_or_to(kind: Kind, node: Node, period: Rhythm) -> Message {
             up,
             Rhythm::Seldom,
             layout::sum(),
-            "Reserved for sums along a tree of cells; no cell sends it yet. count is the cells in it.",
+            "The cell's torques and those of the cells below it in the tree, answering the joints of this epoch, where \
+             a bus replies with sums. count is the cells in it; of two for one epoch the one with more cells counts.",
         ),
         Kind::Torque => (
             up,
@@ -150,8 +154,9 @@ fn from_or_to(kind: Kind, node: Node, period: Rhythm) -> Message {
             up,
             Rhythm::Every(HEARTBEAT_MS),
             layout::network(),
-            "Page 0: heartbeat, four times a second and after each sync. Pages 1 and 2: counters modulo 65536, on \
-             report. epoch is that of the last joints taken.",
+            "Page 0: heartbeat, four times a second and after each sync. Pages 1 to 4: counters modulo 65536, the \
+             place in the tree, the ports; on report, and page 3 when the parent changes. epoch is that of the last \
+             joints taken.",
         ),
         Kind::Configure => (
             down,

@@ -124,7 +124,28 @@ impl Said {
             }
             Some(Parameter::Timing) => self.put("period", unsigned[0]),
             Some(Parameter::Mode) => self.put("mode", words[0]),
-            Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {}
+            Some(Parameter::Reply) => {
+                self.put("reply", words[0]);
+                self.put("reply_slot", unsigned[1]);
+                self.put("reply_deepest", words[2]);
+                self.put("reply_carry", words[3]);
+            }
+            Some(Parameter::Sensing) => {
+                self.put("sensing", words[0]);
+                self.put("sensing_period", unsigned[1]);
+            }
+            Some(Parameter::Events) => {
+                self.put("events_contact", newtons(0));
+                self.put("events_proximity", q14(1).to_f64());
+                self.put("events_temperature", Q::<6>::from_bits(words[2]).to_f64());
+                self.put("events_acceleration", Q::<12>::from_bits(words[3]).to_f64());
+                self.put("events_hysteresis", q14(4).to_f64());
+            }
+            Some(Parameter::Cuts) => {
+                for port in 0..5 {
+                    self.put(format!("cut_port_{port}"), words[0] >> port & 1);
+                }
+            }
             Some(Parameter::Row(row)) => {
                 let row = row + 1;
                 self.put(format!("row{row}_a"), q14(0).to_f64());
@@ -204,7 +225,33 @@ fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, 
                     said.put("refused_incomplete", refused.incomplete);
                     said.put("refused_stimuli", refused.stimuli);
                 }
-                NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
+                NetworkPage::Tree(tree) => {
+                    said.put("page", 3);
+                    said.put("parent", tree.parent.unwrap_or(255));
+                    said.put("up", tree.up);
+                    said.put("depth", tree.depth);
+                    said.put("round", tree.round);
+                    for port in 0..4 {
+                        said.put(format!("child_at_{port}"), tree.children >> port & 1);
+                    }
+                    for port in 0..5 {
+                        said.put(format!("port_{port}_works"), tree.works >> port & 1);
+                    }
+                    said.put("sums_sent", tree.sent);
+                    said.put("sums_taken", tree.taken);
+                    said.put("sums_dropped", tree.dropped);
+                }
+                NetworkPage::Ports(ports) => {
+                    said.put("page", 4);
+                    for (index, port) in ports.ports.into_iter().enumerate() {
+                        said.put(format!("port_{index}_leads_to"), port.number);
+                        said.put(format!("port_{index}_leads_to_port"), port.port);
+                        said.put(format!("port_{index}_hears"), u8::from(port.hears));
+                        said.put(format!("port_{index}_both_ways"), u8::from(port.works));
+                        said.put(format!("port_{index}_other_version"), u8::from(port.other_version));
+                    }
+                    said.put("parent_changes", ports.changes);
+                }
             }
             format!("network_{from}")
         }
@@ -260,8 +307,8 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
     let dbc = parsed(&full(), 0);
     let messages = by_id(&dbc);
     let mut met: BTreeSet<(u16, String)> = BTreeSet::new();
-    let counts = [0, 1, 2, 3, 4, 5, 6, 16, 17, 18, 19, 20, 21, 99, 126, 127];
-    let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]).chain([7, 200, 255]);
+    let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 17, 18, 19, 20, 21, 99, 126, 127];
+    let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]).chain([10, 200, 255]);
     let cases = (
         0_u16..0x800,
         any::<[i16; WORDS]>(),
@@ -380,7 +427,9 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x301, "temperature_2"), ("-512 to 511.984375 degC".to_owned(), vec![]));
     assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
     assert_eq!(signal(0x701, "from_next").1, [(0, "from this epoch on"), (1, "from the next joints on")]);
-    assert_eq!(signal(0x501, "parameter").1.len(), 13);
+    assert_eq!(signal(0x501, "parameter").1.len(), 17);
+    assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "no way up")]));
+    assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
     let refusal = signal(0x601, "parameter").1;
     assert_eq!(refusal.last(), Some(&(126, "refusal")));
     assert_eq!(signal(0x601, "refused_reason").1[6], (16, "the hash is not that of the staged copy"));

@@ -7,14 +7,16 @@ use protocol::candump::{Direction, Record};
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
 use protocol::id::{Id, Kind};
 use protocol::message::{
-    Answer, From, Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Request, SensorPage, State, Tree,
+    Answer, From, Heard, Heartbeat, Message, NetworkPage, PortState, Ports, Refused, Request, SensorPage,
+    State, Tree,
 };
 use protocol::packet::{BYTES, PacketError, WORDS};
-use protocol::parameters::Parameter;
+use protocol::parameters::{Cuts, Events, Parameter, Reply, Sensing, Slots};
+use protocol::wire::{Hello, Label, Lane, PortMessage, Walk};
 use serde::Serialize;
 
 use super::parameter::{Name, reason};
-use super::{Decoded, Foreign};
+use super::{Decoded, Foreign, wires};
 
 /// A frame and what it says.
 #[derive(Serialize)]
@@ -99,20 +101,25 @@ enum Values {
     Tree {
         page: &'static str,
         parent: Option<u8>,
-        up: u8,
-        depth: u8,
+        up: Option<u8>,
+        depth: Option<u8>,
         round: u8,
-        children: u8,
-        works: u8,
+        children: Vec<u8>,
+        works: Vec<u8>,
         sent: u16,
         taken: u16,
         dropped: u16,
     },
     Ports {
         page: &'static str,
-        ports: [[u8; 2]; 4],
-        works: [bool; 4],
+        ports: [End; 4],
         changes: u16,
+    },
+    Wire {
+        wire: u16,
+        back: bool,
+        #[serde(flatten)]
+        says: Says,
     },
     Read {
         parameter: String,
@@ -143,6 +150,45 @@ enum Values {
 enum Felt {
     Skin { page: &'static str, force_n: f64, contact_n: [f64; 3], proximity: f64, temperature_c: [f64; 2] },
     Acceleration { page: &'static str, acceleration_g: [f64; 3] },
+}
+
+/// What is at the other end of a wire.
+#[derive(Serialize)]
+struct End {
+    node: u8,
+    port: u8,
+    hears: bool,
+    works: bool,
+    other_version: bool,
+}
+
+/// What is said over a wire; what a message does not have is not there.
+#[derive(Default, Serialize)]
+struct Says {
+    says: &'static str,
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    hello: Option<Greeting>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    round: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    depth: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    walk: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    first: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    last: Option<u8>,
+}
+
+/// What only a hello has.
+#[derive(Serialize)]
+struct Greeting {
+    version: u8,
+    number: u8,
+    port: u8,
+    hears: bool,
+    up: bool,
+    unnumbered: bool,
 }
 
 /// A state word.
@@ -185,6 +231,26 @@ enum Value {
     Mode {
         mode: i16,
     },
+    Reply {
+        reply: &'static str,
+        #[serde(flatten)]
+        slots: Option<SlotsValue>,
+    },
+    Sensing {
+        sensing: &'static str,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        period_ms: Option<u16>,
+    },
+    Events {
+        contact_n: f64,
+        proximity: f64,
+        temperature_c: f64,
+        acceleration_g: f64,
+        hysteresis: f64,
+    },
+    Cuts {
+        deaf_ports: Vec<u8>,
+    },
     Row {
         a_m: f64,
         d_m: f64,
@@ -197,6 +263,14 @@ enum Value {
     Unknown {
         words: [i16; WORDS],
     },
+}
+
+/// When sums are said.
+#[derive(Serialize)]
+struct SlotsValue {
+    slot_us: u16,
+    deepest: u8,
+    carry: bool,
 }
 
 /// Writes one frame and the end of its line.
@@ -233,6 +307,11 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
                 Foreign::Remote => "remote frame".to_owned(),
                 Foreign::Error => "error frame of the driver".to_owned(),
             });
+        }
+        Decoded::Wire(lane, message) => {
+            line.kind = Some("wire");
+            line.crc = Some(word(last_word(record)));
+            line.say_over(lane, message);
         }
         Decoded::Half { id, incomplete } => {
             line.about(id);
@@ -283,6 +362,35 @@ impl Line<'_> {
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
+    }
+
+    fn say_over(&mut self, Lane { wire, back }: Lane, message: PortMessage) {
+        let mut says = Says { says: wires::name(message), ..Says::default() };
+        let label = match message {
+            PortMessage::Hello(Hello { version, number, port, hears, up, unnumbered, label }) => {
+                says.hello = Some(Greeting { version, number, port, hears, up, unnumbered });
+                label
+            }
+            PortMessage::Grant(label) => Some(label),
+            PortMessage::State(epoch) | PortMessage::Missed(epoch) => {
+                self.epoch = Some(epoch.0);
+                None
+            }
+            PortMessage::Seek(round) => {
+                says.round = Some(round);
+                None
+            }
+            PortMessage::Number(Walk { walk, first, last })
+            | PortMessage::Return(Walk { walk, first, last }) => {
+                (says.walk, says.first, says.last) = (Some(walk), Some(first), Some(last));
+                None
+            }
+            PortMessage::Join | PortMessage::Refuse | PortMessage::Leave | PortMessage::Left => None,
+        };
+        if let Some(Label { round, depth }) = label {
+            (says.round, says.depth) = (Some(round), Some(depth));
+        }
+        self.values = Some(Values::Wire { wire, back, says });
     }
 
     fn say(&mut self, message: &Message) {
@@ -393,14 +501,21 @@ fn network(page: NetworkPage) -> Values {
             Values::Refused { page: "refused", length, crc, foreign, meaning, incomplete, stimuli }
         }
         NetworkPage::Tree(Tree { parent, up, depth, round, children, works, sent, taken, dropped }) => {
+            let ports = |bits| wires::Bits(bits).ports().collect();
+            let (up, depth) = (parent.map(|_| up), parent.map(|_| depth));
+            let (children, works) = (ports(children), ports(works));
             Values::Tree { page: "tree", parent, up, depth, round, children, works, sent, taken, dropped }
         }
-        NetworkPage::Ports(Ports { ports, changes }) => Values::Ports {
-            page: "ports",
-            ports: ports.map(|port| [port.number, port.port]),
-            works: ports.map(|port| port.works),
-            changes,
-        },
+        NetworkPage::Ports(Ports { ports, changes }) => {
+            let ports = ports.map(|PortState { number: node, port, hears, works, other_version }| End {
+                node,
+                port,
+                hears,
+                works,
+                other_version,
+            });
+            Values::Ports { page: "ports", ports, changes }
+        }
     }
 }
 
@@ -437,14 +552,55 @@ fn value(number: u8, words: [i16; WORDS]) -> Value {
         },
         Some(Parameter::Timing) => Value::Timing { period_us: a.cast_unsigned() },
         Some(Parameter::Mode) => Value::Mode { mode: a },
-        Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {
-            Value::Unknown { words }
+        Some(switch @ (Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts)) => {
+            switched(switch, words).unwrap_or(Value::Unknown { words })
         }
         Some(Parameter::Row(_)) => {
             Value::Row { a_m: meters(a), d_m: meters(b), alpha_rad: radians(c), theta_offset_rad: radians(d) }
         }
         Some(Parameter::Commit) => Value::Commit { hash: word(a.cast_unsigned()) },
         None => Value::Unknown { words },
+    }
+}
+
+/// The words of a switch, if they can be.
+fn switched(parameter: Parameter, words: [i16; WORDS]) -> Option<Value> {
+    match parameter {
+        Parameter::Reply => Some(match Reply::from_words(words)? {
+            Reply::Torque => Value::Reply { reply: "torque", slots: None },
+            Reply::Sum(Slots { slot_us, deepest, carry }) => {
+                Value::Reply { reply: "sum", slots: Some(SlotsValue { slot_us, deepest, carry }) }
+            }
+        }),
+        Parameter::Sensing => Some(match Sensing::from_words(words)? {
+            Sensing::Off => Value::Sensing { sensing: "off", period_ms: None },
+            Sensing::Continuous { period_ms } => {
+                Value::Sensing { sensing: "continuous", period_ms: Some(period_ms) }
+            }
+            Sensing::Event => Value::Sensing { sensing: "event", period_ms: None },
+        }),
+        Parameter::Events => {
+            let Events { contact, proximity, temperature, acceleration, hysteresis } =
+                Events::from_words(words)?;
+            Some(Value::Events {
+                contact_n: contact.to_f64(),
+                proximity: proximity.to_f64(),
+                temperature_c: temperature.to_f64(),
+                acceleration_g: acceleration.to_f64(),
+                hysteresis: hysteresis.to_f64(),
+            })
+        }
+        Parameter::Cuts => {
+            Some(Value::Cuts { deaf_ports: wires::Bits(Cuts::from_words(words).deaf).ports().collect() })
+        }
+        Parameter::Identity
+        | Parameter::Mount
+        | Parameter::Pose
+        | Parameter::Contact
+        | Parameter::Timing
+        | Parameter::Mode
+        | Parameter::Row(_)
+        | Parameter::Commit => None,
     }
 }
 
@@ -459,6 +615,7 @@ mod tests {
     const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
     const CLASSIC: &str = include_str!("../../../protocol/tests/golden/classic.log");
     const BAD: &str = include_str!("../../../protocol/tests/golden/bad.log");
+    const WIRE: &str = include_str!("../../../protocol/tests/golden/wire.log");
 
     /// Each frame's comment in the log, and its object.
     fn objects(log: &str) -> Vec<(String, Value)> {
@@ -538,6 +695,49 @@ mod tests {
         let write = values("write to=254 tag=0 parameter=99 words=1,-1,32767,-32768,0,256");
         let words = [1, -1, 32_767, -32_768, 0, 256];
         assert_eq!(write, json!({ "parameter": "parameter 99", "write": true, "words": words }));
+    }
+
+    #[test]
+    fn the_tree_the_ports_and_the_switches_have_theirs() {
+        let values = |comment| object(FD, comment)["values"].clone();
+        let expected = json!({
+            "page": "tree", "parent": 3, "up": 1, "depth": 4, "round": 2, "children": [0, 2], "works": [0, 1, 2],
+            "sent": 1000, "taken": 200, "dropped": 3,
+        });
+        assert_eq!(values("tree from=12 epoch=7 parent=3"), expected);
+        let alone = values("tree from=9 epoch=200 parent=none");
+        assert_eq!(
+            (&alone["parent"], &alone["up"], &alone["depth"]),
+            (&Value::Null, &Value::Null, &Value::Null)
+        );
+        let ports = values("ports from=12 epoch=7");
+        let third = json!({ "node": 254, "port": 3, "hears": true, "works": false, "other_version": false });
+        assert_eq!((&ports["ports"][2], &ports["changes"]), (&third, &json!(2)));
+        let reply = values("write to=everyone tag=20 parameter=6 reply=sum");
+        let sum = json!({
+            "parameter": "reply", "write": true, "reply": "sum", "slot_us": 1500, "deepest": 6, "carry": true,
+        });
+        assert_eq!(reply, sum);
+        let sensing = values("write to=12 tag=26 parameter=7 sensing=off");
+        assert_eq!(sensing, json!({ "parameter": "sensing", "write": true, "sensing": "off" }));
+        assert_eq!(values("write to=12 tag=28 parameter=8")["hysteresis"], json!(1.0));
+        let cuts = json!({ "parameter": "cuts", "write": true, "deaf_ports": [0, 2] });
+        assert_eq!(values("write to=12 tag=29 parameter=9"), cuts);
+    }
+
+    #[test]
+    fn wires_have_their_number_and_what_is_said_over_them() {
+        let hello = object(WIRE, "hello wire=12 back=0 version=1 number=7 port=2 flags=hears+up label=3/1");
+        assert_eq!((&hello["kind"], &hello["verdict"]), (&json!("wire"), &json!("ok")));
+        assert_eq!((hello.get("node"), hello.get("epoch")), (None, None));
+        let expected = json!({
+            "wire": 12, "back": false, "says": "hello", "version": 1, "number": 7, "port": 2, "hears": true,
+            "up": true, "unnumbered": false, "round": 3, "depth": 1,
+        });
+        assert_eq!(hello["values"], expected);
+        let missed = object(WIRE, "missed wire=12 back=1 epoch=9");
+        assert_eq!(missed["epoch"], json!(9));
+        assert_eq!(missed["values"], json!({ "wire": 12, "back": true, "says": "missed" }));
     }
 
     #[test]

@@ -12,7 +12,9 @@ pub mod json;
 pub mod parameter;
 pub mod pick;
 pub mod stats;
+mod switch;
 mod text;
+mod wires;
 
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q;
@@ -20,6 +22,7 @@ use protocol::id::Id;
 use protocol::message::{Message, MessageError, NetworkPage, SensorPage, State};
 use protocol::packet::{Half, Packet, PacketError, Paired, WORDS, data_id};
 use protocol::time::Micros;
+use protocol::wire::{self, PortMessage};
 
 /// Classic buses whose halves are paired at the same time; beyond them the oldest is forgotten.
 const LANES: usize = 64;
@@ -31,6 +34,8 @@ const IDS: usize = 0x800;
 pub enum Decoded {
     /// No frame of this protocol.
     Foreign(Foreign),
+    /// What a cell, or the gateway's side, says over a simulated wire. It is on no real bus.
+    Wire(wire::Lane, PortMessage),
     /// The first half of a packet in two classic frames.
     Half {
         /// Its identifier.
@@ -84,7 +89,7 @@ impl Decoded {
     #[must_use]
     pub const fn verdict(&self) -> &'static str {
         match self {
-            Self::Message(_) => "ok",
+            Self::Message(_) | Self::Wire(..) => "ok",
             Self::Half { .. } => "half",
             Self::Foreign(_) | Self::Refused { error: PacketError::Foreign, .. } => "foreign",
             Self::Refused { error: PacketError::Length { .. }, .. } => "length",
@@ -102,6 +107,7 @@ impl Decoded {
             Self::Message(Message::Sum { torque, .. }) => torque.iter().copied().any(Q::is_saturated),
             Self::Message(_)
             | Self::Foreign(_)
+            | Self::Wire(..)
             | Self::Half { .. }
             | Self::Refused { .. }
             | Self::Meaningless { .. } => false,
@@ -150,9 +156,21 @@ impl Decoded {
                 | Message::Configure { .. }
                 | Message::Configured { .. } => false,
             },
-            Self::Foreign(_) | Self::Half { .. } | Self::Refused { .. } | Self::Meaningless { .. } => false,
+            Self::Foreign(_)
+            | Self::Wire(..)
+            | Self::Half { .. }
+            | Self::Refused { .. }
+            | Self::Meaningless { .. } => false,
         }
     }
+}
+
+/// What a frame says over a simulated wire. One whose identifier or CRC says otherwise is anybody's: 29 bits are
+/// common on other buses.
+#[must_use]
+pub fn wired(frame: &Frame) -> Option<(wire::Lane, PortMessage)> {
+    let lane = wire::Lane::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
+    Some((lane, lane.read(frame)?))
 }
 
 impl Decoder {
@@ -164,7 +182,12 @@ impl Decoder {
 
     /// Takes the next frame. Bounded memory, whatever comes. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
-        let Ok(id) = data_id(frame) else { return Decoded::Foreign(Foreign::of(frame)) };
+        let Ok(id) = data_id(frame) else {
+            return wired(frame).map_or_else(
+                || Decoded::Foreign(Foreign::of(frame)),
+                |(lane, message)| Decoded::Wire(lane, message),
+            );
+        };
         let packet = match self.format.unwrap_or_else(|| frame.format()) {
             Format::Fd => Packet::from_fd(frame),
             Format::Classic => match self.pair(at, bus, id, frame) {

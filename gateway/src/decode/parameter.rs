@@ -8,16 +8,21 @@ use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use thiserror::Error;
 
+use super::switch;
 use super::text::{Bits, radians};
 
 /// Every parameter and its name.
-const NAMES: [(Parameter, &str); 13] = [
+const NAMES: [(Parameter, &str); 17] = [
     (Parameter::Identity, "identity"),
     (Parameter::Mount, "mount"),
     (Parameter::Pose, "pose"),
     (Parameter::Contact, "contact"),
     (Parameter::Timing, "timing"),
     (Parameter::Mode, "mode"),
+    (Parameter::Reply, "reply"),
+    (Parameter::Sensing, "sensing"),
+    (Parameter::Events, "events"),
+    (Parameter::Cuts, "cuts"),
     (Parameter::Row(0), "row1"),
     (Parameter::Row(1), "row2"),
     (Parameter::Row(2), "row3"),
@@ -36,15 +41,18 @@ const GREATEST: u8 = 127;
 pub enum ParameterTextError {
     /// No such name.
     #[error(
-        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, row1 to row6 and commit are, and \
-         every number from 0 to {GREATEST}"
+        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to \
+         row6 and commit are, and every number from 0 to {GREATEST}"
     )]
     Unknown {
         /// What was given instead.
         got: String,
     },
     /// It cannot be written.
-    #[error("identity is read only: write mount, pose, contact, timing, mode, row1 to row6 or commit")]
+    #[error(
+        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to row6 \
+         or commit"
+    )]
     ReadOnly,
     /// More or fewer values than it has.
     #[error("{name} is written with {} ({fields}), not with {got}", values(*.wanted))]
@@ -127,8 +135,8 @@ impl Display for Words {
             Some(Parameter::Mode) => {
                 write!(f, "{a}, {}", if a == 1 { "obey stimuli" } else { "measure" })
             }
-            Some(Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts) => {
-                write!(f, "{a} {b} {c} {d} {e}")
+            Some(switch @ (Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts)) => {
+                switch::tell(f, switch, words)
             }
             Some(Parameter::Row(_)) => {
                 write!(f, "a {:.4} m, d {:.4} m, ", meters(a), meters(b))?;
@@ -153,6 +161,7 @@ pub const fn reason(reason: i16) -> &'static str {
         Answer::WRONG_HASH => "the hash is not that of the staged copy",
         Answer::FLASH_FAILED => "flash could not be written",
         Answer::UNKNOWN => "there is no such parameter",
+        Answer::CANNOT_BE => "it cannot be that, or ports are cut outside test mode",
         _ => "for a reason that this version does not know",
     }
 }
@@ -183,7 +192,7 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
         }
         return Ok((number, words));
     };
-    let fields = fields(parameter);
+    let fields = fields(parameter, values.first().map(String::as_str));
     if fields.is_empty() {
         return Err(ParameterTextError::ReadOnly);
     }
@@ -204,9 +213,12 @@ fn value(field: &'static str, text: &str, allowed: String) -> ParameterTextError
 
 /// Makes a word of text; the error says what is allowed.
 type Read = fn(&str) -> Result<i16, String>;
+/// A value by its name.
+pub(super) type Field = (&'static str, Read);
 
-/// The values of a parameter in the order of its words; none of one that is read only.
-const fn fields(parameter: Parameter) -> &'static [(&'static str, Read)] {
+/// The values of a parameter in the order of its words, of which the first may say what follows; none of one that is
+/// read only.
+fn fields(parameter: Parameter, first: Option<&str>) -> &'static [Field] {
     match parameter {
         Parameter::Identity => &[],
         Parameter::Mount => &[("joint", joint), ("joints", joint)],
@@ -227,7 +239,10 @@ const fn fields(parameter: Parameter) -> &'static [(&'static str, Read)] {
         ],
         Parameter::Timing => &[("period_us", period)],
         Parameter::Mode => &[("mode", mode)],
-        Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts => &[],
+        Parameter::Reply => switch::reply_fields(first),
+        Parameter::Sensing => switch::sensing_fields(first),
+        Parameter::Events => switch::EVENTS,
+        Parameter::Cuts => switch::CUTS,
         Parameter::Row(_) => &[
             ("a_m", nearest::<14>),
             ("d_m", nearest::<14>),
@@ -308,6 +323,7 @@ fn hash(text: &str) -> Result<i16, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::parameters::Events;
 
     fn says(parameter: &str, values: &[&str]) -> String {
         let values: Vec<_> = values.iter().map(|&value| value.to_owned()).collect();
@@ -328,8 +344,8 @@ mod tests {
     fn what_cannot_be_written_says_what_can() {
         assert_eq!(
             says("poes", &["1"]),
-            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, row1 to row6 and commit are, \
-             and every number from 0 to 127"
+            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, cuts, \
+             row1 to row6 and commit are, and every number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(
@@ -346,10 +362,71 @@ mod tests {
         assert_eq!(says("commit", &["12345"]), "hash = 12345: a hash has up to 4 hexadecimal digits");
         assert_eq!(
             says("identity", &["1"]),
-            "identity is read only: write mount, pose, contact, timing, mode, row1 to row6 or commit"
+            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to \
+             row6 or commit"
         );
         assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
         assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: at most 6");
+    }
+
+    #[test]
+    fn switches_are_written_by_the_names_of_what_they_do() {
+        let words = |parameter: &str, values: &str| {
+            let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
+            write(parameter, &values).unwrap()
+        };
+        assert_eq!(words("reply", "torque"), (6, [0; WORDS]));
+        assert_eq!(words("reply", "sum 1500 6 1"), (6, [1, 1500, 6, 1, 0, 0]));
+        assert_eq!(words("sensing", "off"), (7, [0; WORDS]));
+        assert_eq!(words("sensing", "continuous 16"), (7, [1, 16, 0, 0, 0, 0]));
+        assert_eq!(words("sensing", "event"), (7, [2, 0, 0, 0, 0, 0]));
+        assert_eq!(words("events", "0.1 0.05 0.5 0.1 0.5").1, Events::default().words());
+        assert_eq!(words("cuts", "0+2"), (9, [5, 0, 0, 0, 0, 0]));
+        assert_eq!(words("cuts", "3,uplink"), (9, [24, 0, 0, 0, 0, 0]));
+        assert_eq!(words("cuts", "none"), (9, [0; WORDS]));
+        assert_eq!(says("reply", &["sums"]), "reply = sums: torque is, and sum SLOT_US DEEPEST CARRY");
+        assert_eq!(
+            says("reply", &["sum", "1500"]),
+            "reply is written with 4 values (reply slot_us deepest carry), not with 2"
+        );
+        assert_eq!(says("reply", &["sum", "0", "6", "1"]), "slot_us = 0: it is 1 to 65535");
+        assert_eq!(says("reply", &["sum", "9", "254", "1"]), "deepest = 254: a depth is 0, a root's, to 253");
+        assert_eq!(
+            says("sensing", &["event", "16"]),
+            "sensing is written with one value (sensing), not with 2"
+        );
+        assert_eq!(
+            says("events", &["-1", "0", "0", "0", "0"]),
+            "contact_n = -1: it must be in [0, 31.9990234375]"
+        );
+        assert_eq!(
+            says("events", &["1", "0", "0", "0", "1.5"]),
+            "hysteresis = 1.5: a part of the threshold is 0 to 1"
+        );
+        assert_eq!(
+            says("cuts", &["4"]),
+            "deaf_ports = 4: none is, or ports 0 to 3 and uplink with a plus between them: 0+2"
+        );
+    }
+
+    #[test]
+    fn what_is_written_of_a_switch_is_told_again() {
+        for (parameter, values, text) in [
+            ("reply", "torque", "torque"),
+            ("reply", "sum 65535 253 0", "sum, slot 65535 us, deepest 253, no carry"),
+            ("sensing", "continuous 65535", "continuous, every 65535 ms"),
+            (
+                "events",
+                "0.1 0.05 0.5 0.1 1",
+                "contact 0.100 N, proximity 0.0500, temperature 0.50 °C, acceleration 0.1001 g, hysteresis 1.0000",
+            ),
+            ("cuts", "0+3+uplink", "deaf ports 0+3+4"),
+        ] {
+            let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
+            let (number, words) = write(parameter, &values).unwrap();
+            assert_eq!(Words(number, words).to_string(), text);
+        }
+        assert_eq!(Words(6, [2, 1, 1, 1, 0, 0]).to_string(), "words 2 1 1 1 0 0");
     }
 
     #[test]

@@ -7,6 +7,8 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::packet::data_id;
 use thiserror::Error;
 
+use super::wired;
+
 /// A kind of frame that is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Wanted {
@@ -14,6 +16,8 @@ pub enum Wanted {
     Kind(Kind),
     /// One command.
     Command(Command),
+    /// What cells say over simulated wires.
+    Wire,
     /// What is not of this protocol.
     Foreign,
 }
@@ -22,7 +26,7 @@ pub enum Wanted {
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "{got:?} is no kind: command, sum, torque, sensors, network, configure, configured, stimulus are; also halt, \
-     joints, sync, resume, report alone, and foreign"
+     joints, sync, resume, report alone, wire, and foreign"
 )]
 pub struct UnknownWanted {
     /// The word.
@@ -35,8 +39,12 @@ impl FromStr for Wanted {
     fn from_str(word: &str) -> Result<Self, UnknownWanted> {
         let kind = Kind::ALL.into_iter().find(|kind| kind.name() == word).map(Self::Kind);
         let command = || Command::ALL.into_iter().find(|command| command.name() == word).map(Self::Command);
-        let foreign = || (word == "foreign").then_some(Self::Foreign);
-        kind.or_else(command).or_else(foreign).ok_or_else(|| UnknownWanted { got: word.to_owned() })
+        let other = || match word {
+            "wire" => Some(Self::Wire),
+            "foreign" => Some(Self::Foreign),
+            _ => None,
+        };
+        kind.or_else(command).or_else(other).ok_or_else(|| UnknownWanted { got: word.to_owned() })
     }
 }
 
@@ -73,7 +81,7 @@ impl Pick {
     #[must_use]
     pub fn takes(&self, first: u64, nanos: u64, frame: &Frame) -> bool {
         let id = data_id(frame).ok();
-        self.takes_time(first, nanos) && self.takes_kind(id) && self.takes_node(id)
+        self.takes_time(first, nanos) && self.takes_kind(id, frame) && self.takes_node(id)
     }
 
     fn takes_time(&self, first: u64, nanos: u64) -> bool {
@@ -82,13 +90,16 @@ impl Pick {
         after_from && before_to
     }
 
-    fn takes_kind(&self, id: Option<Id>) -> bool {
+    fn takes_kind(&self, id: Option<Id>, frame: &Frame) -> bool {
         self.kinds.is_empty()
             || self.kinds.iter().any(|wanted| match (wanted, id) {
                 (Wanted::Kind(kind), Some(id)) => id.kind == *kind,
                 (Wanted::Command(command), Some(id)) => id == Id::command(*command),
-                (Wanted::Foreign, id) => id.is_none(),
-                (Wanted::Kind(_) | Wanted::Command(_), None) => false,
+                (Wanted::Foreign, None) => wired(frame).is_none(),
+                (Wanted::Wire, None) => wired(frame).is_some(),
+                (Wanted::Foreign | Wanted::Wire, Some(_)) | (Wanted::Kind(_) | Wanted::Command(_), None) => {
+                    false
+                }
             })
     }
 
@@ -111,6 +122,7 @@ impl Pick {
 mod tests {
     use super::*;
     use protocol::can::EXTENDED;
+    use protocol::wire;
 
     fn frame(id: u32) -> Frame {
         Frame::classic(id, &[]).unwrap()
@@ -133,6 +145,13 @@ mod tests {
         assert_eq!(taken(&[], &["12"]), [0x20C, 0x50C]);
         assert_eq!(taken(&["configure"], &["12", "everyone"]), [0x50C, 0x5FF]);
         assert_eq!(taken(&[], &["gateway"]), [0x000, 0x001, 0x400]);
+        let wire = wire::Lane { wire: 3, back: true }.frame(wire::PortMessage::Join);
+        let takes = |kind: &str| {
+            let kinds = vec![kind.parse().unwrap()];
+            Pick { kinds, ..Pick::default() }.takes(0, 0, &wire)
+        };
+        assert_eq!(["wire", "foreign", "command"].map(takes), [true, false, false]);
+        assert!(Pick::default().takes(0, 0, &wire));
     }
 
     #[test]

@@ -10,7 +10,7 @@
 use protocol::candump::Record;
 use protocol::fixed::Q;
 use protocol::id::CellId;
-use protocol::message::{Heartbeat, Message, NetworkPage, State};
+use protocol::message::{Heartbeat, Message, NetworkPage, State, Tree};
 use protocol::packet::{Epoch, PacketError};
 use serde::Serialize;
 
@@ -41,6 +41,7 @@ struct Lane {
     bus: String,
     frames: u64,
     kinds: [Count; NAMES.len()],
+    wires: Count,
     refused: RefusedFrames,
     dropped: u64,
     joints: Option<Joints>,
@@ -109,6 +110,11 @@ impl Joints {
 struct Cell {
     packets: u64,
     torques: u64,
+    sums: u64,
+    resent: u64,
+    /// The epoch of the last sum.
+    summed: Option<Epoch>,
+    tree: Option<Tree>,
     /// Time and epoch of the first torque and of the last.
     torque_span: Option<[(u64, Epoch); 2]>,
     /// The number of the joints that the last torque answers, while the contact lasts.
@@ -147,10 +153,14 @@ pub struct Report {
 pub struct BusReport {
     /// Its name.
     pub bus: String,
-    /// All frames.
+    /// All frames but those of simulated wires, which no real bus has.
     pub frames: u64,
     /// The same by second, over the whole capture.
     pub frames_per_s: Option<f64>,
+    /// Frames of simulated wires.
+    pub wires: u64,
+    /// The same by second, from the first to the last.
+    pub wires_per_s: Option<f64>,
     /// Packets by kind, those that there are.
     pub kinds: Vec<KindReport>,
     /// What the joints say of themselves.
@@ -236,6 +246,14 @@ pub struct CellReport {
     pub torques: u64,
     /// Torques a second, from the first to the last.
     pub torques_per_s: Option<f64>,
+    /// Sums of its own and its children's torques.
+    pub sums: u64,
+    /// Of these, sums of the epoch of the one before: with more cells in it.
+    pub resent: u64,
+    /// Where its sums go, by its last word on that: a cell's number, 0 for the gateway's side.
+    pub parent: Option<u8>,
+    /// Wires to the root of its tree, by the same word.
+    pub depth: Option<u8>,
     /// The epoch that its first torque answers.
     pub first_epoch: Option<u8>,
     /// The epoch that its last torque answers.
@@ -244,7 +262,7 @@ pub struct CellReport {
     pub missed: u64,
     /// Torques of the epoch of the one before.
     pub repeated: u64,
-    /// Torques with a saturated word.
+    /// Torques and sums with a saturated word.
     pub saturated: u64,
     /// Heartbeats.
     pub heartbeats: u64,
@@ -324,6 +342,7 @@ impl Lane {
             bus: bus.to_owned(),
             frames: 0,
             kinds: [Count::default(); NAMES.len()],
+            wires: Count::default(),
             refused: RefusedFrames::default(),
             dropped: 0,
             joints: None,
@@ -333,9 +352,14 @@ impl Lane {
     }
 
     fn take(&mut self, nanos: u64, decoded: &Decoded) {
+        if let Decoded::Wire(..) = decoded {
+            self.wires.take(nanos);
+            return;
+        }
         self.frames += 1;
         let refused = &mut self.refused;
         match decoded {
+            Decoded::Wire(..) => {}
             Decoded::Message(message) => self.message(nanos, message),
             Decoded::Half { incomplete, .. } => refused.incomplete += u64::from(*incomplete),
             Decoded::Meaningless { .. } => refused.meaning += 1,
@@ -393,6 +417,8 @@ impl Lane {
             bus: self.bus.clone(),
             frames: self.frames,
             frames_per_s: rate(self.frames, nanos),
+            wires: self.wires.packets,
+            wires_per_s: self.wires.per_s(),
             kinds: kinds.collect(),
             epochs: self.epochs,
             refused: self.refused,
@@ -418,8 +444,14 @@ impl Cell {
                     self.touching = None;
                 }
             }
+            Message::Sum { epoch, torque, .. } => {
+                self.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
+                self.sums += 1;
+                self.resent += u64::from(self.summed == Some(*epoch));
+                self.summed = Some(*epoch);
+            }
+            Message::Network { page: NetworkPage::Tree(tree), .. } => self.tree = Some(*tree),
             Message::Network { .. }
-            | Message::Sum { .. }
             | Message::Sensors { .. }
             | Message::Configured { .. }
             | Message::Halt
@@ -475,6 +507,10 @@ impl Cell {
             packets: self.packets,
             torques: self.torques,
             torques_per_s: rate(self.torques.saturating_sub(1), time),
+            sums: self.sums,
+            resent: self.resent,
+            parent: self.tree.and_then(|tree| tree.parent),
+            depth: self.tree.filter(|tree| tree.parent.is_some()).map(|tree| tree.depth),
             first_epoch: span.map(|[first, _]| first.1.0),
             last_epoch: span.map(|[_, last]| last.1.0),
             missed: self.missed,
@@ -495,10 +531,11 @@ mod tests {
     use crate::decode::Decoder;
     use protocol::can::{Format, Frame};
     use protocol::candump::Timestamp;
-    use protocol::fixed::Q3_12;
+    use protocol::fixed::{Q3_12, Q7_8};
     use protocol::id::Node;
     use protocol::message;
     use protocol::time::Micros;
+    use protocol::wire;
 
     /// A capture that is being written.
     #[derive(Default)]
@@ -657,6 +694,45 @@ mod tests {
         }
         let dropped: Vec<_> = report.buses.iter().map(|bus| (bus.bus.as_str(), bus.dropped)).collect();
         assert_eq!((dropped, report.dropped), (vec![("can0", 0), ("can1", 5)], 7));
+    }
+
+    #[test]
+    fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
+        let mut tape = Tape::default();
+        let lane = wire::Lane { wire: 3, back: false };
+        tape.joints(0);
+        tape.frame("vcan0", lane.frame(wire::PortMessage::Join));
+        tape.frame("vcan0", lane.frame(wire::PortMessage::Leave));
+        tape.joints(1);
+        let bus = tape.bus();
+        assert_eq!((bus.frames, bus.wires, bus.wires_per_s), (2, 2, Some(1_000.0)));
+        assert_eq!(
+            (bus.refused, bus.kinds.len(), tape.stats.report().frames),
+            (RefusedFrames::default(), 1, 4)
+        );
+    }
+
+    #[test]
+    fn sums_said_again_and_the_place_in_the_tree_are_told() {
+        let mut tape = Tape::default();
+        let sum = |epoch, word, count| {
+            let torque = [Q7_8::from_bits(word); 6];
+            Message::Sum { from: cell(), epoch: Epoch(epoch), torque, count }
+        };
+        for message in [sum(1, 5, 1), sum(1, 6, 2), sum(2, i16::MAX, 2)] {
+            tape.say(&message);
+        }
+        assert_eq!((tape.cell().parent, tape.cell().depth), (None, None));
+        let tree = |parent, depth| {
+            let page = NetworkPage::Tree(Tree { parent, depth, ..Tree::default() });
+            Message::Network { from: Node::Cell(cell()), epoch: Epoch(2), page }
+        };
+        tape.say(&tree(Some(7), 3));
+        let cell = tape.cell();
+        assert_eq!((cell.sums, cell.resent, cell.saturated), (3, 1, 1));
+        assert_eq!((cell.parent, cell.depth), (Some(7), Some(3)));
+        tape.say(&tree(None, 3));
+        assert_eq!((tape.cell().parent, tape.cell().depth), (None, None));
     }
 
     #[test]

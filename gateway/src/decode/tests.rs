@@ -8,6 +8,7 @@ use protocol::candump::{self, Line};
 const DOCUMENT: &str = include_str!("../../../protocol/tests/golden/document.log");
 const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
 const BAD: &str = include_str!("../../../protocol/tests/golden/bad.log");
+const WIRE: &str = include_str!("../../../protocol/tests/golden/wire.log");
 const CLASSIC: &str = include_str!("../../../protocol/tests/golden/classic.log");
 
 /// Each frame's comment in the log and its text here.
@@ -135,6 +136,44 @@ fn every_other_kind_has_its_text() {
                 "ok      network 12 epoch 7 refused: length 1, CRC 20, foreign 300, meaning 4000, incomplete 50000, \
                  stimuli 6",
             ),
+            (
+                "tree from=12 epoch=7 parent=3 up=1 depth=4 round=2 children=0+2 works=0+1+2 sent=1000 taken=200 \
+                 dropped=3",
+                "ok      network 12 epoch 7 tree: child of 3 by port 1, depth 4 of round 2, children at ports 0+2, \
+                 working ports 0+1+2, sums sent 1000, taken 200, not taken 3",
+            ),
+            (
+                "tree from=1 epoch=0 parent=0 up=4 depth=0 round=255 children=0+1+2+3 works=0+1+2+3+4 sent=65535 \
+                 taken=32768 dropped=1",
+                "ok      network 1 epoch 0 tree: root by uplink, depth 0 of round 255, children at ports 0+1+2+3, \
+                 working ports 0+1+2+3+4, sums sent 65535, taken 32768, not taken 1",
+            ),
+            (
+                "tree from=9 epoch=200 parent=none up=0 depth=0 round=7 children=none works=1 sent=5 taken=6 \
+                 dropped=7",
+                "ok      network 9 epoch 200 tree: no way up (last round 7), children at ports none, working ports 1, \
+                 sums sent 5, taken 6, not taken 7",
+            ),
+            (
+                "ports from=12 epoch=7 port0=3/2/hears+works port1=0/0/none port2=254/3/hears \
+                 port3=7/0/hears+other-version changes=2",
+                "ok      network 12 epoch 7 ports: 0 leads to port 2 of 3, 1 silent, 2 leads to port 3 of 254 (one \
+                 way), 3 leads to port 0 of 7 (other version); parent changed 2 times",
+            ),
+            (
+                "ports from=1 epoch=0 port0=0/4/hears+works port1=0/0/none port2=0/0/none port3=0/0/none changes=0",
+                "ok      network 1 epoch 0 ports: 0 leads to uplink of somebody without a number, 1 silent, 2 silent, \
+                 3 silent; parent changed 0 times",
+            ),
+            (
+                "write to=everyone tag=20 parameter=6 reply=sum slot_us=1500 deepest=6 carry=1",
+                "ok      configure everyone tag 20: write reply: sum, slot 1500 us, deepest 6, carry",
+            ),
+            (
+                "refusal from=12 tag=200 parameter=1 reason=19",
+                "ok      configured 12 tag 200: refuses mount: it cannot be that, or ports are cut outside test mode \
+                 (reason 19)",
+            ),
             ("read to=12 tag=2 parameter=2", "ok      configure 12 tag 2: read pose"),
             ("read to=254 tag=0 parameter=99", "ok      configure 254 tag 0: read parameter 99"),
             ("write to=12 tag=9 parameter=5 on=0", "ok      configure 12 tag 9: write mode: 0, measure"),
@@ -240,6 +279,35 @@ fn on_a_bus_of_one_format_the_other_is_refused() {
     let text = |format, frame| Decoder::new(Some(format)).decode(Micros(0), "vcan0", frame).to_string();
     assert_eq!(text(Format::Fd, &classic), "length  torque 12: 8 data bytes, not 16");
     assert_eq!(text(Format::Classic, &fd), "length  torque 12: 16 data bytes, not 8");
+}
+
+#[test]
+fn what_is_said_over_wires_has_its_text() {
+    let expected = [
+        "wire 12 ->: hello, no number, port 2, somebody has no number, no way up",
+        "wire 12 <-: hello, no number, uplink, hears, round 3 depth 0",
+        "wire 12 ->: join",
+        "wire 12 <-: grant, round 3 depth 0",
+        "wire 12 ->: state, sums from epoch 255 on",
+        "wire 12 ->: hello, number 7, port 2, hears, sums go here, round 3 depth 1",
+        "wire 12 <-: missed, the sum of epoch 9",
+        "wire 12 ->: seek, a round later than 3",
+        "wire 12 <-: number, walk 5, 1 to 254",
+        "wire 12 ->: return, walk 5, none left",
+        "wire 12 ->: leave",
+        "wire 12 <-: left",
+        "wire 12 <-: refuse",
+        "wire 0 ->: hello, version 0, no number, port 0, no way up",
+    ];
+    let all = decoded(WIRE, Some(Format::Fd));
+    for ((comment, text), expected) in all.iter().zip(expected) {
+        assert_eq!(text, &format!("ok      {expected}"), "{comment}");
+    }
+    // 29 bits are common on other buses: what does not prove to be a wire's is nobody's.
+    for (comment, text) in all.iter().filter(|(comment, _)| comment.starts_with("bad ")) {
+        assert!(text.starts_with("foreign "), "{comment}: {text}");
+    }
+    assert_eq!(all, decoded(WIRE, Some(Format::Classic)), "wires are classic on every bus");
 }
 
 #[test]

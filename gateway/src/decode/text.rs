@@ -9,6 +9,7 @@ use protocol::message::{
 };
 
 use super::parameter::{self, Words};
+use super::wires::{Around, Place, Said};
 use super::{Decoded, Foreign};
 
 impl Display for Decoded {
@@ -19,6 +20,7 @@ impl Display for Decoded {
             Self::Foreign(Foreign::Extended) => f.write_str("29-bit identifier"),
             Self::Foreign(Foreign::Remote) => f.write_str("remote frame"),
             Self::Foreign(Foreign::Error) => f.write_str("error frame of the driver"),
+            Self::Wire(lane, message) => write!(f, "{}", Said(lane, message)),
             Self::Half { id, incomplete: false } => write!(f, "{}", Subject(id)),
             Self::Half { id, incomplete: true } => {
                 write!(f, "{}, the half before it dropped: incomplete", Subject(id))
@@ -150,8 +152,8 @@ impl Display for Page {
                 write!(f, "refused: length {length}, CRC {crc}, foreign {foreign}, meaning {meaning}, ")?;
                 write!(f, "incomplete {incomplete}, stimuli {stimuli}")
             }
-            NetworkPage::Tree(tree) => write!(f, "tree: {tree:?}"),
-            NetworkPage::Ports(ports) => write!(f, "ports: {ports:?}"),
+            NetworkPage::Tree(tree) => write!(f, "{}", Place(tree)),
+            NetworkPage::Ports(ports) => write!(f, "{}", Around(ports)),
         }
     }
 }

@@ -293,6 +293,7 @@ impl<'a> Reel<'a> {
             Decoded::Half { id, .. } if is_joints(id) => Role::HalfOfJoints,
             Decoded::Half { .. }
             | Decoded::Foreign(_)
+            | Decoded::Wire(..)
             | Decoded::Refused { .. }
             | Decoded::Meaningless { .. } => Role::Plain,
         }

@@ -133,6 +133,7 @@ impl Survey {
                 bus.take(&message, nanos, nanos < begins, (begins..ends).contains(&nanos));
             }
             Decoded::Foreign(_)
+            | Decoded::Wire(..)
             | Decoded::Half { .. }
             | Decoded::Refused { .. }
             | Decoded::Meaningless { .. } => {}

@@ -126,7 +126,7 @@ impl<W: Write> Show<W> {
 /// The colour of what a frame says.
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
-        Decoded::Foreign(_) | Decoded::Half { .. } => DIM,
+        Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Half { .. } => DIM,
         Decoded::Refused { .. } | Decoded::Meaningless { .. } => RED,
         Decoded::Message(_) if decoded.is_saturated() => YELLOW,
         Decoded::Message(message) => match message {

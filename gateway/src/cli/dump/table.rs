@@ -47,6 +47,9 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
         let odd = odd.map(|(count, what)| format!("{count} {what}")).join(", ");
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
+    if bus.wires > 0 {
+        rows.row("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s)));
+    }
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons: Vec<_> = refused.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
     let total: u64 = refused.iter().map(|(_, count)| count).sum();
@@ -80,7 +83,7 @@ fn cells(bus: &BusReport) -> Table {
     fn some(count: u64) -> String {
         if count == 0 { String::new() } else { count.to_string() }
     }
-    let columns: [Column; 11] = [
+    let columns: [Column; 15] = [
         ("torques", |cell| cell.torques.to_string()),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default()),
         ("epochs", |cell| match (cell.first_epoch, cell.last_epoch) {
@@ -89,6 +92,14 @@ fn cells(bus: &BusReport) -> Table {
         }),
         ("missed", |cell| some(cell.missed)),
         ("twice", |cell| some(cell.repeated)),
+        ("sums", |cell| some(cell.sums)),
+        ("again", |cell| some(cell.resent)),
+        ("parent", |cell| match cell.parent {
+            None => String::new(),
+            Some(0) => "gateway".to_owned(),
+            Some(parent) => parent.to_string(),
+        }),
+        ("depth", |cell| cell.depth.map(|depth| depth.to_string()).unwrap_or_default()),
         ("satur.", |cell| some(cell.saturated)),
         ("beats", |cell| cell.heartbeats.to_string()),
         ("refused", |cell| cell.refused.map(|refused| some(refused.into())).unwrap_or_default()),
