@@ -1,19 +1,17 @@
 //! One skin cell as a process, or several in one.
 
-use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use cell_node::flash::Kept;
-use cell_node::io::{Cells, FlashFile, Stopped};
+use cell_node::io::{Cells, FlashFile, Lanes, Line, Stopped};
 use cell_node::node::{Flash, Identity};
 use clap::Parser;
-use protocol::bus::{Bus, Choice, Filter, Options};
-use protocol::can::Format;
-use protocol::id::{CellId, Id};
-use protocol::skin::Skin;
+use protocol::bus::{Bus, Choice};
+use protocol::id::CellId;
+use protocol::skin::{Reply, Skin};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// A tactile skin cell: hears joint positions, answers with its joint torques.
@@ -22,13 +20,14 @@ use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
     version,
     after_help = "Examples:
   cell-node --bus vcan0 --node 12 --skin gateway/examples/ur5-253.toml
-  cell-node --bus vcan0 --nodes 1-64 --skin gateway/examples/ur5-253.toml --flash /tmp/flash"
+  cell-node --bus vcan0 --nodes 1-64 --skin gateway/examples/ur5-253.toml --flash /tmp/flash
+  cell-node --bus vcan0 --node 12 --skin skin.toml --fresh --flash /tmp/flash"
 )]
 struct Arguments {
     /// The bus, one of the skin's
     #[arg(long, value_name = "NAME")]
     bus: String,
-    /// The cell's number on the bus, 1 to 254
+    /// Which of the bus' cells it is, by its number there, 1 to 254
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
     /// Several cells in one process over one socket: the first and the last number
@@ -40,6 +39,13 @@ struct Arguments {
     /// Keep parameters in files of this directory; without it a cell forgets them when it ends
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
+    /// As from the factory: without parameters, and on a bus with sums without a number, which the network and
+    /// `gateway commission` give it; what flash holds it has
+    #[arg(long)]
+    fresh: bool,
+    /// Open the bus again when it is gone, and wait for it at the start, instead of ending
+    #[arg(long)]
+    reconnect: bool,
     /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
@@ -76,8 +82,8 @@ fn main() -> ExitCode {
         }
     };
     match prepare(&arguments) {
-        Ok((mut cells, bus)) => {
-            let Err(stopped) = cells.run(&bus);
+        Ok((mut cells, bus, line)) => {
+            let Err(stopped) = cells.run(bus, &line);
             // Whoever started hundreds of cells says once that their bus is gone.
             if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
                 say(stopped);
@@ -91,7 +97,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
+fn prepare(arguments: &Arguments) -> Result<(Cells, Bus, Line)> {
     if let Some(parent) = arguments.with_parent {
         // Not TERM, which a stopped process would not take before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
@@ -100,54 +106,66 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus)> {
             bail!("process {parent} is not the parent of this one");
         }
     }
+    if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
+        bail!("--flash {}: there is no such directory; make it first", flash.display());
+    }
     let skin = Skin::read(&arguments.skin)?;
     let file = arguments.skin.display();
     let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
         format!("bus {} is not in {file}, which has {names}", arguments.bus)
     })?;
-    let format = skin.buses.get(bus_index).context("the bus that was found")?.format;
+    let bus = skin.buses.get(bus_index).context("the bus that was found")?;
+    let wires = match bus.reply {
+        Reply::Torque => None,
+        Reply::Sum { .. } => Some(skin.wires(bus_index)),
+    };
     let (first, last) = match (arguments.node, arguments.nodes) {
         (Some(node), _) => (node, node),
         (None, Some(nodes)) => nodes,
         (None, None) => bail!("--node or --nodes is needed"),
     };
-    let mut cells = Cells::new(format);
-    let mut heard = BTreeSet::new();
+    let mut cells = Cells::new(bus.format);
     for number in first..=last {
         let cell = CellId::new(i64::from(number))?;
         let described = skin.cells_of(bus_index).find(|described| described.node == cell);
         let described =
             described.with_context(|| format!("cell {cell} is not on {} in {file}", arguments.bus))?;
-        let identity = Identity { cell: Some(cell), serial: described.serial };
-        heard.extend(identity.hears().into_iter().flatten());
+        // Nobody gives a number to a cell without wires.
+        let is_nameless = arguments.fresh && wires.is_some();
+        let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
         let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
-        let (_, mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
+        let (number, mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
         if let Some(damage) = damage {
             let name = flash_file.name();
             say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
         }
-        if flash == Flash::Empty {
+        identity.cell = identity.cell.or(number);
+        if flash == Flash::Empty && !arguments.fresh {
             let parameters = skin.parameters(described);
             let kept = Kept { number: Some(cell), parameters: Some(parameters) };
             flash_file.store(&kept).with_context(|| flash_file.name())?;
             flash = Flash::Sound(parameters);
         }
-        cells.start(identity, &flash, flash_file);
+        let lanes = wires.as_ref().map_or_else(Lanes::default, |wires| wires.of_cell(cell));
+        cells.start(identity, &flash, flash_file, lanes);
     }
-    let fd = format == Format::Fd;
-    let options = Options { filters: filters(&heard), fd, ..Options::default() };
-    let bus = Bus::open(&arguments.bus, arguments.bus_kind, &options)?;
-    Ok((cells, bus))
-}
-
-/// One exact filter for each identifier; for more than a socket takes, one for each kind that is heard.
-fn filters(heard: &BTreeSet<Id>) -> Vec<Filter> {
-    if heard.len() <= Filter::MAX {
-        return heard.iter().copied().map(Filter::exact).collect();
-    }
-    let kinds: BTreeSet<_> = heard.iter().map(|id| id.kind).collect();
-    let of_kind =
-        |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
-    kinds.into_iter().map(of_kind).collect()
+    let line = Line {
+        name: arguments.bus.clone(),
+        choice: arguments.bus_kind,
+        wires: wires.is_some(),
+        reconnect: arguments.reconnect,
+    };
+    let options = cells.options();
+    let bus = match line.open(&options) {
+        Err(Stopped::Bus(error)) if line.reconnect && error.may_open_later() => {
+            // Whoever started hundreds of cells knows it.
+            if arguments.with_parent.is_none() {
+                say(format_args!("{error}; waiting for it"));
+            }
+            line.open_again(&options)?
+        }
+        opened => opened?,
+    };
+    Ok((cells, bus, line))
 }

@@ -45,6 +45,7 @@ mod inbox;
 #[expect(unsafe_code, reason = "recvmmsg, sendmmsg and two ioctls have no safe wrapper")]
 mod io;
 mod kernel;
+mod link;
 
 pub use error::{BusError, SendError};
 pub use filter::Filter;
@@ -223,6 +224,19 @@ impl Bus {
     #[must_use]
     pub const fn kind(&self) -> BusKind {
         self.kind
+    }
+
+    /// Whether nothing real hangs on this bus: the embedded one, a vcan or a vxcan.
+    ///
+    /// # Errors
+    /// When the kernel does not say.
+    pub fn is_virtual(&self) -> Result<bool, BusError> {
+        match self.kind {
+            BusKind::Embedded => Ok(true),
+            BusKind::SocketCan => {
+                link::is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
+            }
+        }
     }
 
     /// How many bytes may wait unread, as the kernel granted and counts them (twice what was asked for when

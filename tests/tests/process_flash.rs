@@ -145,7 +145,7 @@ fn a_directory_that_is_not_there_is_named() {
     assert_eq!(place.bench(1.0, "--flash flash").end().refusal(2), said);
     let cell =
         place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 1 --skin skin.toml --flash flash");
-    let said = "cell-node: flash of cell 1 (flash/vcan0-1.flash): No such file or directory (os error 2)";
+    let said = "cell-node: --flash flash: there is no such directory; make it first";
     assert_eq!(cell.end().refusal(2), said);
     assert_eq!(place.files(), ["scenario.toml", "skin.toml"]);
     place.is_left_clean();

@@ -160,6 +160,22 @@ impl BusError {
         matches!(self, Self::Down { .. } | Self::Full { .. })
     }
 
+    /// Whether to open the bus again later may succeed without anybody doing something about this process.
+    #[must_use]
+    pub const fn may_open_later(&self) -> bool {
+        matches!(
+            self,
+            Self::NotServed { .. }
+                | Self::NoAnswer { .. }
+                | Self::NoInterface { .. }
+                | Self::ClassicOnly { .. }
+                | Self::Down { .. }
+                | Self::Gone { .. }
+                | Self::Closed { .. }
+                | Self::Io { .. }
+        )
+    }
+
     /// Whether the bus has ended and has to be opened again.
     #[must_use]
     pub const fn is_closed(&self) -> bool {

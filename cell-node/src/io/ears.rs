@@ -1,0 +1,121 @@
+//! Which cell of a process hears what.
+
+use std::collections::{BTreeSet, HashMap};
+
+use protocol::bus::Filter;
+use protocol::can::{EXTENDED, EXTENDED_MASK, REMOTE};
+use protocol::id::Id;
+use protocol::wire::{FLAG, Lane};
+
+/// The frames of all simulated wires of a bus.
+const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
+
+/// By identifier and by lane, who hears it: cells by their place in the process.
+#[derive(Debug, Default)]
+pub(super) struct Ears {
+    by_id: HashMap<Id, Vec<usize>>,
+    by_lane: HashMap<Lane, (usize, usize)>,
+}
+
+impl Ears {
+    /// The port of a cell hears this lane, for good.
+    pub(super) fn wire(&mut self, lane: Lane, cell: usize, port: usize) {
+        self.by_lane.insert(lane, (cell, port));
+    }
+
+    /// Forgets who hears which identifiers, and takes these in place of it.
+    pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id)>) {
+        self.by_id.clear();
+        for (cell, id) in hears {
+            self.by_id.entry(id).or_default().push(cell);
+        }
+    }
+
+    /// The cells that hear an identifier.
+    pub(super) fn of_id(&self, id: Id) -> &[usize] {
+        self.by_id.get(&id).map_or(&[], Vec::as_slice)
+    }
+
+    /// The cell, and its port, that hears a lane.
+    pub(super) fn of_lane(&self, lane: Lane) -> Option<(usize, usize)> {
+        self.by_lane.get(&lane).copied()
+    }
+
+    /// One exact filter for each identifier and each lane; for more than a socket takes, one for each kind that is
+    /// heard, and one for all wires.
+    pub(super) fn filters(&self) -> Vec<Filter> {
+        let ids: BTreeSet<_> = self.by_id.keys().copied().collect();
+        let lanes: BTreeSet<_> = self.by_lane.keys().copied().collect();
+        if ids.len() + lanes.len() <= Filter::MAX {
+            let lane = |lane: Lane| Filter { id: lane.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE };
+            return ids.into_iter().map(Filter::exact).chain(lanes.into_iter().map(lane)).collect();
+        }
+        let kinds: BTreeSet<_> = ids.into_iter().map(|id| id.kind).collect();
+        let of_kind =
+            |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
+        let wires = (!lanes.is_empty()).then_some(ALL_WIRES);
+        kinds.into_iter().map(of_kind).chain(wires).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::id::{CellId, Kind, Node};
+
+    fn passes(filters: &[Filter], raw_id: u32) -> bool {
+        filters.iter().any(|filter| raw_id & filter.mask == filter.id & filter.mask)
+    }
+
+    fn ears(cells: usize) -> Ears {
+        let mut ears = Ears::default();
+        let id = |kind, cell| Id::new(kind, Node::Cell(cell));
+        let cells = || CellId::all().take(cells).enumerate();
+        let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell)));
+        ears.listen(cells().flat_map(hears));
+        for (at, cell) in cells() {
+            ears.wire(Lane { wire: cell.get().into(), back: true }, at, 2);
+        }
+        ears
+    }
+
+    #[test]
+    fn each_identifier_and_lane_has_an_exact_filter_as_long_as_they_fit() {
+        let lane = |wire, back| Lane { wire, back }.raw_id();
+        let filters = ears(100).filters();
+        assert_eq!(filters.len(), 300);
+        for id in [0x401, 0x464, 0x101, lane(1, true), lane(100, true)] {
+            assert!(passes(&filters, id), "{id:X}");
+        }
+        for id in
+            [0x465, 0x201, 0x165, lane(1, false), lane(101, true), lane(1, true) | REMOTE, 0x401 | EXTENDED]
+        {
+            assert!(!passes(&filters, id), "{id:X}");
+        }
+    }
+
+    #[test]
+    fn too_many_become_kinds_and_all_wires() {
+        let lane = |wire, back| Lane { wire, back }.raw_id();
+        let filters = ears(254).filters();
+        assert_eq!(filters.len(), 3);
+        for id in [0x401, 0x4FE, 0x101, lane(1, false), lane(65_535, true)] {
+            assert!(passes(&filters, id), "{id:X}");
+        }
+        for id in [0x201, 0x001, lane(1, true) | REMOTE, 0x401 | EXTENDED, FLAG | 0x101 | REMOTE] {
+            assert!(!passes(&filters, id), "{id:X}");
+        }
+    }
+
+    #[test]
+    fn who_hears_an_identifier_changes_and_who_hears_a_lane_does_not() {
+        let mut ears = ears(3);
+        let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
+        assert_eq!(ears.of_id(id(Kind::Sum, 2)), [1]);
+        ears.listen([(0, id(Kind::Sum, 2)), (2, id(Kind::Sum, 2))].into_iter());
+        assert_eq!(ears.of_id(id(Kind::Sum, 2)), [0, 2]);
+        assert_eq!(ears.of_id(id(Kind::Sum, 1)), [0; 0]);
+        assert_eq!(ears.of_lane(Lane { wire: 2, back: true }), Some((1, 2)));
+        assert_eq!(ears.of_lane(Lane { wire: 2, back: false }), None);
+    }
+}
