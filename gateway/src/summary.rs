@@ -10,7 +10,7 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 pub use crate::record::account::{Recording, Written};
-use crate::table::{Accuracy, Errors, Event, Replies, Status, Table, Uplink};
+use crate::table::{Accuracy, Contributions, Errors, Event, Replies, Status, SumCounts, Table, Uplink};
 
 /// A whole run.
 #[derive(Clone, Debug, Serialize)]
@@ -144,14 +144,25 @@ pub struct AccuracySummary {
     pub unquantised: ErrorsSummary,
     /// The whole skin's torque, in epochs that all answered in time.
     pub whole: ErrorsSummary,
+    /// A whole bus' torque that came as sums, over loaded joints, in epochs whose sums were complete in time.
+    pub sums: ErrorsSummary,
+    /// The same, averaged over 32 epochs in a row in which every cell felt the same.
+    pub sums_averaged: ErrorsSummary,
     /// Words left out because they were saturated.
     pub saturated: u64,
 }
 
 impl From<Accuracy> for AccuracySummary {
     fn from(accuracy: Accuracy) -> Self {
-        let Accuracy { single, unquantised, whole, saturated } = accuracy;
-        Self { single: single.into(), unquantised: unquantised.into(), whole: whole.into(), saturated }
+        let Accuracy { single, unquantised, whole, sums, sums_averaged, saturated } = accuracy;
+        Self {
+            single: single.into(),
+            unquantised: unquantised.into(),
+            whole: whole.into(),
+            sums: sums.into(),
+            sums_averaged: sums_averaged.into(),
+            saturated,
+        }
     }
 }
 
@@ -166,7 +177,7 @@ pub struct Processor {
     pub buses: f64,
 }
 
-/// Packets from the cells: sent = delivered + rejected + lost, and lost = dropped + backlog + unknown.
+/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + unknown.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct UplinkSummary {
     /// Sent, by the cells' own count, as of their last heartbeats.
@@ -175,6 +186,8 @@ pub struct UplinkSummary {
     pub delivered: u64,
     /// Arrived and refused.
     pub rejected: u64,
+    /// Sums for another cell, which this gateway did not take.
+    pub unheard: u64,
     /// Sent and not arrived, because the bus dropped frames that we did not take in time.
     pub dropped: u64,
     /// Sent and not arrived, as far as drops of the kernel's backlog explain it.
@@ -227,6 +240,40 @@ pub struct RepliesSummary {
     pub unasked: u64,
 }
 
+/// Sums along the cells' tree: received = first + resent + overheard + stale.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct SumsSummary {
+    /// Cells that are wired to the gateway's side.
+    pub roots: usize,
+    /// Sums that came.
+    pub received: u64,
+    /// A root's first one for an epoch.
+    pub first: u64,
+    /// A root's further ones for an epoch.
+    pub resent: u64,
+    /// Of cells that are no roots.
+    pub overheard: u64,
+    /// Of epochs that had passed.
+    pub stale: u64,
+    /// Cells that were to be in sums, and were: due = in time + late + missing.
+    pub contributions: ContributionsSummary,
+}
+
+/// Cells in sums: due = in time + late + missing.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct ContributionsSummary {
+    /// That were to be in an epoch's sums.
+    pub due: u64,
+    /// In them before the next joints.
+    pub in_time: u64,
+    /// In them after that.
+    pub late: u64,
+    /// Not in them.
+    pub missing: u64,
+    /// In them and not due.
+    pub unasked: u64,
+}
+
 /// One bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusSummary {
@@ -242,8 +289,10 @@ pub struct BusSummary {
     pub silent_cells: Vec<u8>,
     /// Packets from the cells.
     pub uplink: UplinkSummary,
-    /// Replies.
+    /// Replies of cells that answer themselves.
     pub replies: RepliesSummary,
+    /// Sums, where cells answer with them.
+    pub sums: Option<SumsSummary>,
     /// Epochs that somebody had to answer, and those that everybody answered in time.
     pub epochs_due: u64,
     /// See above.
@@ -296,6 +345,7 @@ impl BusSummary {
             silent_cells,
             uplink: uplink(table, dropped),
             replies: replies(table),
+            sums: sums(table),
             epochs_due: counters.epochs_due,
             epochs_complete: counters.epochs_complete,
             received: kinds(&|kind| counters.received(kind)),
@@ -314,6 +364,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         sent: total.sent,
         delivered: total.delivered,
         rejected: total.rejected,
+        unheard: total.unheard,
         dropped,
         backlog: 0,
         unknown: total.lost - dropped,
@@ -322,6 +373,21 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         unsettled: total.unsettled(),
         restarts: total.restarts,
     }
+}
+
+fn sums(table: &Table) -> Option<SumsSummary> {
+    let (counts, contributions) = table.sums()?;
+    let SumCounts { received, first, resent, overheard, stale } = counts;
+    let Contributions { due, in_time, late, missing, unasked } = contributions;
+    Some(SumsSummary {
+        roots: table.cells().iter().filter(|cell| cell.root).count(),
+        received,
+        first,
+        resent,
+        overheard,
+        stale,
+        contributions: ContributionsSummary { due, in_time, late, missing, unasked },
+    })
 }
 
 /// Finds for each cell's missing replies what is known to have become of them.

@@ -392,7 +392,7 @@ impl Bench<'_> {
 }
 
 fn accuracy(received: &[Option<Left>]) -> AccuracySummary {
-    let all = received.iter().flatten().map(|received| *received.table.accuracy());
+    let all = received.iter().flatten().map(|received| received.table.accuracy());
     all.fold(Accuracy::default(), Accuracy::with).into()
 }
 

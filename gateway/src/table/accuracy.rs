@@ -3,6 +3,10 @@
 use protocol::packet::WORDS;
 
 use super::cell::{Expected, word_to_nm};
+use super::trunk;
+
+/// Epochs over which errors of sums are averaged.
+const AVERAGED: u32 = 32;
 
 /// Mean and greatest of some absolute errors, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -54,6 +58,11 @@ pub struct Accuracy {
     pub unquantised: Errors,
     /// The whole skin's torque in epochs that everybody answered in time, all joints.
     pub whole: Errors,
+    /// The whole bus' torque as sums along a tree brought it, in epochs whose sums were complete in time, over
+    /// the joints that some cell in them loads.
+    pub sums: Errors,
+    /// The same, each error averaged over 32 such epochs in a row in which every cell felt the same.
+    pub sums_averaged: Errors,
     /// Words that were left out because they were saturated.
     pub saturated: u64,
 }
@@ -93,7 +102,52 @@ impl Accuracy {
             single: self.single.with(other.single),
             unquantised: self.unquantised.with(other.unquantised),
             whole: self.whole.with(other.whole),
+            sums: self.sums.with(other.sums),
+            sums_averaged: self.sums_averaged.with(other.sums_averaged),
             saturated: self.saturated + other.saturated,
         }
+    }
+}
+
+/// Errors of sums, epoch after epoch.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct SumError {
+    pub(super) each: Errors,
+    pub(super) averaged: Errors,
+    /// Words that were left out because they were saturated.
+    pub(super) saturated: u64,
+    /// Epochs in a row, and their errors together.
+    epochs: u32,
+    sum: [f64; WORDS],
+}
+
+impl SumError {
+    /// Compares the sum of a complete epoch, in steps of Q7.8.
+    pub(super) fn take(&mut self, words: &[i32; WORDS], saturated: bool, expected: &trunk::Expected) {
+        if !expected.constant {
+            self.interrupt();
+        }
+        if saturated {
+            self.saturated += expected.joints as u64;
+            return self.interrupt();
+        }
+        let errors = words.iter().zip(expected.torque).map(|(&word, torque)| f64::from(word) / 256.0 - torque);
+        for (sum, error) in self.sum.iter_mut().zip(errors).take(expected.joints) {
+            self.each.add(error);
+            *sum += error;
+        }
+        self.epochs += 1;
+        if self.epochs == AVERAGED {
+            let sums = self.sum;
+            for sum in sums.iter().take(expected.joints) {
+                self.averaged.add(sum / f64::from(AVERAGED));
+            }
+            self.interrupt();
+        }
+    }
+
+    /// The next epoch does not go on with what was.
+    pub(super) const fn interrupt(&mut self) {
+        (self.epochs, self.sum) = (0, [0.0; WORDS]);
     }
 }

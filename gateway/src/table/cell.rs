@@ -1,7 +1,7 @@
 //! One cell, as the gateway sees it.
 
 use protocol::id::CellId;
-use protocol::message::{Heard, Heartbeat, Refused, SkinSensors, State};
+use protocol::message::{Heard, Heartbeat, Ports, Refused, SkinSensors, State, Tree};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameters;
 use protocol::skin::{self, Safety};
@@ -10,6 +10,7 @@ use protocol::time::Micros;
 use super::DEAD_AFTER;
 use super::felt::Felt;
 use super::ledger::{Replies, Uplink};
+use super::trunk::Sum;
 
 /// A torque may answer the newest epoch, or one of so many before it.
 pub(super) const LATEST: usize = 3;
@@ -88,6 +89,10 @@ const OVERTAKES: u16 = 128;
 pub struct Cell {
     /// Its number.
     pub node: CellId,
+    /// Its serial number, as described.
+    pub serial: u32,
+    /// Whether it is wired to the gateway's side.
+    pub root: bool,
     /// The joint that moves it, from 1.
     pub(super) joint: usize,
     /// The hash that its configuration must have.
@@ -100,6 +105,10 @@ pub struct Cell {
     pub heard: Option<(Heard, Heard)>,
     /// The last page of what it refused.
     pub refused: Option<Refused>,
+    /// The last page of its place in the tree since it started, and when it came.
+    pub tree: Option<(Tree, Micros)>,
+    /// The last page of what its ports lead to since it started.
+    pub ports: Option<Ports>,
     /// Packets sent and arrived.
     pub uplink: Uplink,
     /// Replies due and come.
@@ -119,6 +128,14 @@ pub struct Cell {
     held: Option<[i32; WORDS]>,
     /// What of it is in the running sum.
     contribution: [i32; WORDS],
+    /// Cells that what is held is of: of a root, those in its sum.
+    cells: u8,
+    /// Of those, the ones that are counted in the running sum.
+    contributing: u8,
+    /// Its torque comes in sums, its own if it is a root.
+    pub(super) summed: bool,
+    /// What it has said as a root for the newest epochs.
+    pub(super) sums: [Option<Sum>; LATEST + 1],
     /// Broadcasts since the first of the two pages in `heard`.
     told: u64,
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
@@ -127,15 +144,19 @@ pub struct Cell {
 }
 
 impl Cell {
-    pub(super) fn new(described: &skin::Cell, parameters: &Parameters) -> Self {
+    pub(super) fn new(described: &skin::Cell, parameters: &Parameters, summed: bool) -> Self {
         Self {
             node: described.node,
+            serial: described.serial,
+            root: described.root,
             joint: described.joint.into(),
             configuration: parameters.hash(),
             last_joints: Epoch(0),
             heartbeat: None,
             heard: None,
             refused: None,
+            tree: None,
+            ports: None,
             uplink: Uplink::default(),
             replies: Replies::default(),
             said: Said::default(),
@@ -147,6 +168,10 @@ impl Cell {
             answered: None,
             held: None,
             contribution: [0; WORDS],
+            cells: 1,
+            contributing: 0,
+            summed,
+            sums: [None; LATEST + 1],
             told: 0,
             due: 0,
             expected: [None; LATEST + 1],
@@ -205,12 +230,14 @@ impl Cell {
         if speaker == Speaker::Anew || is_first(heartbeat) {
             self.felt.restart();
             self.doubt();
+            (self.tree, self.ports) = (None, None);
             // It counts from zero; what we did not hear from the beginning we compare from the next page on.
             self.heard = is_first(heartbeat).then(Default::default);
             self.told = 0;
-            return self.let_go();
+            return if self.summed { Change::default() } else { self.let_go() };
         }
-        if heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
+        // Of a sum it says nothing: what is in it others may feel.
+        if self.summed || heartbeat.state.has(State::ACTIVE) { Change::default() } else { self.let_go() }
     }
 
     /// What it has said since it was asked.
@@ -278,6 +305,30 @@ impl Cell {
         let due = in_contact && self.is_ready();
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
         self.replies.due += u64::from(due);
+        self.grow_old(number, safety)
+    }
+
+    /// A new broadcast, to be answered by sums. Returns as above, and whether it is to be in its sum: it feels
+    /// something, or did in the epoch before.
+    pub(super) fn open_epoch_of_sums(
+        &mut self,
+        number: u64,
+        in_contact: bool,
+        safety: &Safety,
+    ) -> (Change, u32, bool) {
+        self.told += 1;
+        let (felt, feels) = (self.is_due(), in_contact && self.is_ready());
+        self.due = u8::from(feels);
+        self.sums.rotate_right(1);
+        if let Some(newest) = self.sums.first_mut() {
+            *newest = None;
+        }
+        let (change, missed) = self.grow_old(number, safety);
+        (change, missed, feels || (felt && self.is_ready()))
+    }
+
+    /// What is held grows old.
+    fn grow_old(&mut self, number: u64, safety: &Safety) -> (Change, u32) {
         let Some(held) = self.held else { return (Change::default(), 0) };
         let answered = self.answered.unwrap_or(number);
         let missed = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
@@ -302,6 +353,12 @@ impl Cell {
         self.contribution != [0; WORDS]
     }
 
+    /// Whether it is in contact, as it says itself where nobody else knows.
+    fn feels_something(&self) -> bool {
+        let says = |heartbeat: Heartbeat| heartbeat.state.has(State::ACTIVE);
+        self.is_due() || (self.feeling().is_none() && self.heartbeat.is_some_and(says))
+    }
+
     pub(super) const fn is_due(&self) -> bool {
         self.due & 1 != 0
     }
@@ -318,6 +375,22 @@ impl Cell {
             (false, _) => self.replies.unasked += 1,
         }
         was_due
+    }
+
+    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one; zeros end all
+    /// contacts. One of an older broadcast than what is held changes nothing.
+    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; WORDS]) -> Change {
+        if self.answered.is_some_and(|last| number < last) {
+            return Change::default();
+        }
+        self.answered = Some(number);
+        self.cells = count;
+        self.hold(words)
+    }
+
+    /// Cells that what is held is of.
+    pub(super) const fn held_cells(&self) -> u32 {
+        if self.held.is_some() { self.cells as u32 } else { 0 }
     }
 
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
@@ -344,13 +417,14 @@ impl Cell {
     }
 
     fn contribute(&mut self, words: [i32; WORDS]) -> Change {
-        let counts = |words: &[i32; WORDS]| i32::from(*words != [0; WORDS]);
+        let counts = if words == [0; WORDS] { 0 } else { self.cells };
+        let counted = core::mem::replace(&mut self.contributing, counts);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;
         for (torque, before) in torque.iter_mut().zip(before) {
             *torque -= before;
         }
-        Change { torque, contributing: counts(&words) - counts(&before) }
+        Change { torque, contributing: i32::from(counts) - i32::from(counted) }
     }
 
     pub(super) fn expect(&mut self, number: u64, quantised: [f64; WORDS], unquantised: [f64; WORDS]) {
@@ -381,13 +455,21 @@ impl Cell {
 
     /// Nothing more will come: what is still due is missing.
     pub(super) fn settle(&mut self) {
-        self.miss(self.due.count_ones());
+        self.uplink.finish();
+        if !self.summed {
+            self.miss(self.due.count_ones());
+        }
         self.due = 0;
     }
 
     /// It started anew: what it still owed, it will never send; and why it owed what is missing, its
     /// counters can no longer say.
     fn doubt(&mut self) {
+        if self.summed {
+            // What it owed is missing in a sum, and what its own sum held grows old.
+            self.due = 0;
+            return;
+        }
         self.replies.missing += u64::from(self.due.count_ones());
         self.due = 0;
         self.replies.in_doubt = self.replies.missing.saturating_sub(self.replies.too_late);
@@ -407,6 +489,7 @@ impl Cell {
             return Status::Dead;
         }
         match (self.held, self.answered, newest) {
+            (None, _, _) if self.summed && self.feels_something() => Status::Active,
             (None, _, _) => Status::Quiet,
             (Some(_), Some(answered), Some(newest)) if answered + 1 < newest => Status::Stale,
             (Some(_), _, _) => Status::Active,
@@ -438,7 +521,7 @@ mod tests {
     fn a_heartbeat_that_was_said_before_a_halt_does_not_end_it() {
         let skin = crate::testing::skin();
         let described = skin.cells.first().unwrap();
-        let mut cell = Cell::new(described, &skin.parameters(described));
+        let mut cell = Cell::new(described, &skin.parameters(described), false);
         let says = |cell: &mut Cell, sent, state: State| {
             cell.hear(Micros(0));
             cell.take_heartbeat(Speaker::Known, &Heartbeat { sent, state, ..Heartbeat::default() });

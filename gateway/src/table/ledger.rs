@@ -1,7 +1,7 @@
 //! Accounts that must add up: what cells sent against what arrived, and replies due against replies
 //! that came.
 
-/// Packets of one cell: sent by its own count = delivered + rejected + lost, as of its last heartbeat.
+/// Packets of one cell: sent by its own count = delivered + rejected + unheard + lost, as of its last heartbeat.
 ///
 /// A heartbeat says how many packets the cell sent before it. A bus keeps each sender's order, so what
 /// has not arrived by then never will.
@@ -22,9 +22,26 @@ pub struct Uplink {
     pub in_doubt: u64,
     /// Times that the cell started anew.
     pub restarts: u32,
+    /// Of those that never arrived, sums for another cell, which the gateway did not listen to.
+    pub unheard: u64,
     said: Option<u16>,
     arrived_since: u64,
     rejected_since: u64,
+    sums: Option<Sums>,
+}
+
+/// Sums that a cell sends to another one and the gateway does not take, by the cell's own count.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+struct Sums {
+    /// By its last page, modulo 2^16.
+    said: Option<u16>,
+    /// Since the account began.
+    count: u64,
+    /// Of these, found missing.
+    found: u64,
+    /// The joints of its last page, and of its last heartbeat: what it has said in between nobody has counted.
+    page_at: Option<u64>,
+    heartbeat_at: Option<u64>,
 }
 
 impl Uplink {
@@ -38,6 +55,43 @@ impl Uplink {
         self.rejected_since += 1;
     }
 
+    /// The gateway does not take this cell's sums.
+    pub(super) fn without_sums(&mut self) {
+        self.sums.get_or_insert_default();
+    }
+
+    /// The cell says how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
+    pub(super) fn sums_sent(&mut self, said: u16, joints: Option<u64>) {
+        let Some(sums) = &mut self.sums else { return };
+        let before = sums.said.replace(said).unwrap_or(said);
+        sums.count += u64::from(said.wrapping_sub(before));
+        sums.page_at = joints;
+    }
+
+    /// Its heartbeat was said after the joints of this number; the account is settled already.
+    pub(super) const fn heartbeat_at(&mut self, joints: Option<u64>) {
+        if let Some(sums) = &mut self.sums {
+            sums.heartbeat_at = joints;
+        }
+    }
+
+    /// What is missing and was a sum that the gateway does not take.
+    fn explain_sums(&mut self) {
+        let Some(sums) = &mut self.sums else { return };
+        // With joints between its page and its heartbeat, it may have said more of them than the page counts.
+        let at_most = if sums.page_at == sums.heartbeat_at { sums.count - sums.found } else { u64::MAX };
+        let found = self.lost.min(at_most);
+        self.lost -= found;
+        self.unheard += found;
+        sums.found += found;
+        sums.count = sums.count.max(sums.found);
+    }
+
+    /// No more comes.
+    pub(super) fn finish(&mut self) {
+        self.explain_sums();
+    }
+
     /// A heartbeat, which has arrived, says that the cell had sent `said` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, said: u16, restarted: bool) {
         let said = said.wrapping_add(1);
@@ -47,6 +101,13 @@ impl Uplink {
         }
         let (arrived, rejected) = (self.arrived_since, self.rejected_since);
         (self.arrived_since, self.rejected_since) = (0, 0);
+        if restarted {
+            self.explain_sums();
+            if let Some(sums) = &mut self.sums {
+                // It counts from zero.
+                *sums = Sums { said: Some(0), ..Sums::default() };
+            }
+        }
         let Some(before) = before.filter(|_| !restarted) else {
             // The account begins with this heartbeat.
             self.sent += 1;
@@ -79,9 +140,11 @@ impl Uplink {
             surplus: sum.surplus + one.surplus,
             in_doubt: sum.in_doubt + one.in_doubt,
             restarts: sum.restarts + one.restarts,
+            unheard: sum.unheard + one.unheard,
             said: None,
             arrived_since: sum.arrived_since + one.arrived_since,
             rejected_since: sum.rejected_since + one.rejected_since,
+            sums: None,
         })
     }
 }

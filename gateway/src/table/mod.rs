@@ -14,8 +14,9 @@ mod cell;
 mod counters;
 mod felt;
 mod ledger;
+mod trunk;
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 
 use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
@@ -23,17 +24,19 @@ use protocol::fixed::{Q, Q1_14};
 use protocol::id::{CellId, Id, Node};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
-use protocol::skin::{Safety, Skin};
+use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::{Micros, Span};
 
 use crate::central::Central;
 use crate::summary::histogram;
 use cell::Speaker;
+use trunk::{Expected, Sum, Taken, Trunk};
 
 pub use accuracy::{Accuracy, Errors};
 pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
 pub use ledger::{Replies, Uplink};
+pub use trunk::{Contributions, SumCounts};
 
 /// A cell that has said nothing for so long is dead: two heartbeats, and the jitter of a busy machine,
 /// so that one lost frame kills nobody.
@@ -138,6 +141,10 @@ pub struct Table {
     places: [Option<usize>; CellId::COUNT],
     halves: Vec<Half>,
     broadcast: Option<Broadcast>,
+    /// Sums along the tree, where cells answer with them.
+    trunk: Option<Trunk>,
+    /// Nodes that the skin does not have, each with its last heartbeat.
+    strangers: BTreeMap<CellId, Heartbeat>,
     /// Twice, four times ... a torque is a whole number of these, so that the sum never drifts.
     sum: [i64; WORDS],
     snapshot: Snapshot,
@@ -154,11 +161,12 @@ impl Table {
         let part = skin.part_on(bus);
         let mut places = [None; CellId::COUNT];
         let mut cells = Vec::with_capacity(part.cells.len());
+        let summed = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
         for described in &part.cells {
             if let Some(place) = places.get_mut(described.node.index()) {
                 *place = Some(cells.len());
             }
-            cells.push(Cell::new(described, &part.parameters(described)));
+            cells.push(Cell::new(described, &part.parameters(described), summed));
         }
         let snapshot = Snapshot { sums: Sums::default(), felt: vec![SkinSensors::default(); cells.len()] };
         Self {
@@ -171,6 +179,8 @@ impl Table {
             places,
             halves: vec![Half::NONE; 1 << 11],
             broadcast: None,
+            trunk: summed.then(Trunk::default),
+            strangers: BTreeMap::new(),
             sum: [0; WORDS],
             snapshot,
             counters: Counters::default(),
@@ -178,6 +188,11 @@ impl Table {
             last_reply: histogram(),
             notices: VecDeque::new(),
         }
+    }
+
+    /// Only the sums of roots are taken from the bus: others' packets then cannot be counted one by one.
+    pub fn hear_sums_of_roots_only(&mut self) {
+        self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.uplink.without_sums());
     }
 
     /// Whether distributed torques are compared with central ones from the next epoch on.
@@ -205,8 +220,26 @@ impl Table {
 
     /// Distributed against central torques.
     #[must_use]
-    pub const fn accuracy(&self) -> &Accuracy {
-        &self.accuracy
+    pub fn accuracy(&self) -> Accuracy {
+        let Some(trunk) = &self.trunk else { return self.accuracy };
+        let error = &trunk.error;
+        Accuracy {
+            sums: error.each,
+            sums_averaged: error.averaged,
+            saturated: error.saturated,
+            ..self.accuracy
+        }
+    }
+
+    /// What became of sums, and of the cells that were to be in them; `None` where cells answer themselves.
+    #[must_use]
+    pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
+        self.trunk.as_ref().map(|trunk| (trunk.counts, trunk.contributions))
+    }
+
+    /// Nodes that speak and that the skin does not have, each with its last heartbeat.
+    pub fn strangers(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
+        self.strangers.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
 
     /// From a broadcast to its last reply in time, in µs, for each epoch with a reply.
@@ -330,8 +363,15 @@ impl Table {
         }
         let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
             self.counters.count(Event::Stranger);
+            if let Message::Network {
+                from: Node::Cell(node), page: NetworkPage::Heartbeat(heartbeat), ..
+            } = *message
+            {
+                self.strangers.insert(node, heartbeat);
+            }
             return;
         };
+        let joints = self.broadcast.map(|broadcast| broadcast.number);
         let Some(cell) = self.cells.get_mut(place) else { return };
         if cell.hear(at) {
             self.snapshot.sums.dead -= 1;
@@ -341,17 +381,23 @@ impl Table {
         match *message {
             Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 cell.last_joints = epoch;
-                self.take_heartbeat(place, &heartbeat)
+                self.take_heartbeat(place, &heartbeat, joints)
             }
             Message::Network { epoch, page: NetworkPage::Heard(heard), .. } => {
                 let passed = self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch));
                 cell.report(heard, passed);
             }
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refuses(refused),
-            Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. } => {}
+            Message::Network { page: NetworkPage::Tree(tree), .. } => {
+                cell.tree = Some((tree, at));
+                cell.uplink.sums_sent(tree.sent, joints);
+            }
+            Message::Network { page: NetworkPage::Ports(ports), .. } => cell.ports = Some(ports),
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
-            Message::Sum { .. } => self.counters.count(Event::Stranger),
+            Message::Sum { epoch, count, torque, .. } => {
+                self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) })
+            }
             Message::Sensors { .. }
             | Message::Configured { .. }
             | Message::Halt
@@ -364,7 +410,7 @@ impl Table {
         }
     }
 
-    fn take_heartbeat(&mut self, place: usize, heartbeat: &Heartbeat) {
+    fn take_heartbeat(&mut self, place: usize, heartbeat: &Heartbeat, joints: Option<u64>) {
         let Some(cell) = self.cells.get_mut(place) else { return };
         if heartbeat.state.has(State::DUPLICATE) {
             self.counters.count(Event::Duplicate);
@@ -375,6 +421,7 @@ impl Table {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
         let released = cell.take_heartbeat(speaker, heartbeat);
+        cell.uplink.heartbeat_at(joints);
         self.apply(released);
     }
 
@@ -416,6 +463,38 @@ impl Table {
         self.apply(change);
     }
 
+    fn take_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
+        let (Some(trunk), Some(cell)) = (&mut self.trunk, self.cells.get_mut(place)) else {
+            return self.counters.count(Event::Stranger);
+        };
+        trunk.counts.received += 1;
+        if !cell.root {
+            trunk.counts.overheard += 1;
+            return;
+        }
+        let found = self.broadcast.as_mut().and_then(|broadcast| {
+            let lag = broadcast.recent.iter().position(|&recent| recent == Some(epoch))?;
+            Some((lag, cell.sums.get_mut(lag)?, broadcast))
+        });
+        let Some((lag, said, broadcast)) = found else {
+            trunk.counts.stale += 1;
+            return;
+        };
+        if trunk.take(lag, said, sum) == Taken::Resent {
+            return;
+        }
+        if lag == 0 {
+            broadcast.last_reply = Some(at);
+        }
+        let number = broadcast.number - lag as u64;
+        if sum.is_saturated() {
+            self.counters.count(Event::Saturated);
+        }
+        // Q7.8 in steps of Q3.12, of which the running sum is made.
+        let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
+        self.apply(change);
+    }
+
     /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
     fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
         if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
@@ -434,11 +513,29 @@ impl Table {
             self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians)))
         });
         let (mut due, mut stale, mut age) = (0, 0, 0);
+        let mut whole = frames.as_ref().map(|_| Expected { constant: true, ..Expected::default() });
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let f_z = cell.latch(epoch).map(|skin| (self.central.force(place, &skin), skin));
-            let (change, missed) =
-                cell.open_epoch(number, f_z.is_some_and(|(force, _)| force > 0.0), &self.safety);
+            let in_contact = f_z.is_some_and(|(force, _)| force > 0.0);
+            if self.trunk.is_some() {
+                let (change, missed, is_due) = cell.open_epoch_of_sums(number, in_contact, &self.safety);
+                due += u32::from(is_due);
+                if missed > 0 {
+                    stale += cell.held_cells();
+                    age = age.max(if cell.contributes() { missed } else { 0 });
+                }
+                if let (Some(whole), Some(frames), Some((f_z, skin))) = (&mut whole, &frames, f_z) {
+                    let torque = if cell.is_due() { self.central.torque(place, frames, f_z) } else { [0.0; WORDS] };
+                    whole.add(torque, if is_due { cell.joint } else { 0 });
+                    if let Some(felt) = self.snapshot.felt.get_mut(place) {
+                        whole.constant &= core::mem::replace(felt, skin) == skin;
+                    }
+                }
+                self.apply(change);
+                continue;
+            }
+            let (change, missed) = cell.open_epoch(number, in_contact, &self.safety);
             due += u32::from(cell.is_due());
             stale += u32::from(missed > 0);
             if let (Some(frames), Some(exact), Some((f_z, skin))) = (&frames, &exact, f_z) {
@@ -454,6 +551,9 @@ impl Table {
             }
             self.apply(change);
         }
+        if let Some(trunk) = &mut self.trunk {
+            trunk.open(due, whole);
+        }
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
         let error = [0.0; WORDS];
@@ -466,6 +566,10 @@ impl Table {
         if let Some(last) = before.last_reply {
             // The histogram grows by itself; it cannot refuse.
             let _ = self.last_reply.record(last.since(before.at).0);
+        }
+        if let Some(trunk) = &mut self.trunk {
+            let (due, complete) = trunk.close();
+            return self.counters.epoch(due, complete);
         }
         self.counters.epoch(before.due > 0, before.in_time == before.due);
         if self.comparing && before.due > 0 && before.in_time == before.due {
@@ -490,6 +594,9 @@ impl Table {
     pub fn finish(&mut self) {
         self.close_epoch();
         self.broadcast = None;
+        if let Some(trunk) = &mut self.trunk {
+            trunk.finish();
+        }
         for cell in &mut self.cells {
             cell.settle();
         }

@@ -1,0 +1,210 @@
+//! Sums along the cells' tree: what the roots say in each epoch, and what should come of it.
+
+use protocol::packet::WORDS;
+
+use super::accuracy::SumError;
+use super::cell::LATEST;
+
+/// What became of sums.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct SumCounts {
+    /// Sums that came, of all cells.
+    pub received: u64,
+    /// Of these, a root's first one for an epoch.
+    pub first: u64,
+    /// A root's further ones for an epoch: the one with the most cells in it is used.
+    pub resent: u64,
+    /// Of cells that are no roots: they are in their parents' sums.
+    pub overheard: u64,
+    /// Of an epoch that has passed.
+    pub stale: u64,
+}
+
+impl SumCounts {
+    /// Both together.
+    #[must_use]
+    pub const fn with(self, other: Self) -> Self {
+        Self {
+            received: self.received + other.received,
+            first: self.first + other.first,
+            resent: self.resent + other.resent,
+            overheard: self.overheard + other.overheard,
+            stale: self.stale + other.stale,
+        }
+    }
+}
+
+/// Cells that are to be in an epoch's sums: due = in time + late + missing.
+///
+/// Due are the cells that feel a force by Algorithm 1, or felt one in the epoch before, and can be expected to
+/// answer. A cell that only passes on what others feel is not.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Contributions {
+    /// Cells that were to be in it, all epochs together.
+    pub due: u64,
+    /// Of these, in it before the next joints.
+    pub in_time: u64,
+    /// In it after them.
+    pub late: u64,
+    /// Never in it.
+    pub missing: u64,
+    /// In it and not due: cells whose sensors nobody knows.
+    pub unasked: u64,
+}
+
+/// A root's sum for one epoch.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) struct Sum {
+    /// Cells in it.
+    pub(super) count: u8,
+    /// In steps of Q7.8.
+    pub(super) words: [i32; WORDS],
+}
+
+impl Sum {
+    pub(super) fn is_saturated(&self) -> bool {
+        self.words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN))
+    }
+}
+
+/// An epoch that may still be answered.
+#[derive(Clone, Copy, Debug)]
+struct Open {
+    due: u32,
+    came: u32,
+    /// What had come before the next joints.
+    in_time: Option<u32>,
+    /// Steps of Q7.8.
+    sum: [i32; WORDS],
+    saturated: bool,
+    expected: Option<Expected>,
+}
+
+/// What should come, in Nm, by the central computation.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Expected {
+    /// The whole bus' torque.
+    pub(super) torque: [f64; WORDS],
+    /// Joints that some cell of it loads, from the first.
+    pub(super) joints: usize,
+    /// Every cell feels what it felt in the epoch before.
+    pub(super) constant: bool,
+}
+
+impl Expected {
+    /// Adds what a cell on this joint makes.
+    pub(super) fn add(&mut self, torque: [f64; WORDS], joint: usize) {
+        for (sum, torque) in self.torque.iter_mut().zip(torque) {
+            *sum += torque;
+        }
+        self.joints = self.joints.max(joint);
+    }
+}
+
+/// The sums of a bus.
+#[derive(Debug, Default)]
+pub(super) struct Trunk {
+    /// Newest first.
+    epochs: [Option<Open>; LATEST + 1],
+    pub(super) counts: SumCounts,
+    pub(super) contributions: Contributions,
+    pub(super) error: SumError,
+}
+
+/// What became of one sum.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Taken {
+    /// It is the root's best for its epoch.
+    Best,
+    /// One with as many cells came before.
+    Resent,
+}
+
+impl Trunk {
+    /// Takes a root's sum for the epoch `lag` before the newest; `said` is what it has said for it so far.
+    pub(super) fn take(&mut self, lag: usize, said: &mut Option<Sum>, sum: Sum) -> Taken {
+        let before = *said;
+        match before {
+            Some(_) => self.counts.resent += 1,
+            None => self.counts.first += 1,
+        }
+        if before.is_some_and(|before| sum.count <= before.count) {
+            return Taken::Resent;
+        }
+        *said = Some(sum);
+        if let Some(Some(open)) = self.epochs.get_mut(lag) {
+            let (count, words) = before.map_or((0, [0; WORDS]), |before| (before.count, before.words));
+            open.came += u32::from(sum.count) - u32::from(count);
+            for ((total, word), before) in open.sum.iter_mut().zip(sum.words).zip(words) {
+                *total += word - before;
+            }
+            open.saturated |= sum.is_saturated();
+        }
+        Taken::Best
+    }
+
+    /// New joints: `due` cells are to be in their sum. What was open for longest is settled.
+    pub(super) fn open(&mut self, due: u32, expected: Option<Expected>) {
+        self.epochs.rotate_right(1);
+        if let Some(oldest) = self.epochs.first_mut() {
+            let settled = oldest.replace(Open {
+                due,
+                came: 0,
+                in_time: None,
+                sum: [0; WORDS],
+                saturated: false,
+                expected,
+            });
+            self.contributions.settle(settled);
+        }
+    }
+
+    /// The next joints are on the bus, or none follow: how many were due in the newest epoch, and whether all
+    /// of them came in time.
+    pub(super) fn close(&mut self) -> (bool, bool) {
+        let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
+        open.in_time = Some(open.came);
+        let complete = open.came >= open.due;
+        if open.due > 0
+            && open.came == open.due
+            && let Some(expected) = &open.expected
+        {
+            self.error.take(&open.sum, open.saturated, expected);
+        } else {
+            self.error.interrupt();
+        }
+        (open.due > 0, complete)
+    }
+
+    /// No more sums follow.
+    pub(super) fn finish(&mut self) {
+        for open in &mut self.epochs {
+            self.contributions.settle(open.take());
+        }
+    }
+}
+
+impl Contributions {
+    fn settle(&mut self, open: Option<Open>) {
+        let Some(Open { due, came, in_time, .. }) = open else { return };
+        let in_time = in_time.unwrap_or(came).min(due);
+        let all = came.min(due);
+        self.due += u64::from(due);
+        self.in_time += u64::from(in_time);
+        self.late += u64::from(all - in_time);
+        self.missing += u64::from(due - all);
+        self.unasked += u64::from(came - all);
+    }
+
+    /// Both together.
+    #[must_use]
+    pub const fn with(self, other: Self) -> Self {
+        Self {
+            due: self.due + other.due,
+            in_time: self.in_time + other.in_time,
+            late: self.late + other.late,
+            missing: self.missing + other.missing,
+            unasked: self.unasked + other.unasked,
+        }
+    }
+}
