@@ -24,7 +24,7 @@ const SHORTENED: u32 = 30 - 8;
 pub struct Words {
     /// Nm.
     pub torque: [Q7_8; WORDS],
-    /// Cells in it.
+    /// Cells in it that feel something.
     pub count: u8,
 }
 
@@ -56,8 +56,10 @@ pub struct Sum {
     began: Micros,
     period: Span,
     depth: u8,
-    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
+    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum; zeros to end what was said before.
     own: Option<[i32; WORDS]>,
+    /// Whether this cell feels something, and so is counted.
+    feels: bool,
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
@@ -128,6 +130,7 @@ impl Sum {
         self.began = begin.at;
         self.depth = begin.depth.unwrap_or(slots.deepest);
         self.speaks = begin.speaks && begin.depth.is_some();
+        self.feels = own.is_some();
         self.own = match own {
             Some(exact) => Some(self.round(exact, slots.carry)),
             None => {
@@ -239,7 +242,7 @@ impl Sum {
 
     fn words(&self) -> Words {
         let mut sum = self.own.map_or([0; WORDS], |own| own.map(i64::from));
-        let mut count = u32::from(self.own.is_some());
+        let mut count = u32::from(self.feels);
         let mut saturated = [false; WORDS];
         for words in self.children.iter().filter_map(|child| child.taken) {
             count += u32::from(words.count);

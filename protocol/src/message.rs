@@ -346,7 +346,7 @@ pub enum Message {
         epoch: Epoch,
         /// Nm.
         torque: [Q7_8; WORDS],
-        /// Cells in it.
+        /// Cells in it; 0 ends what was said before.
         count: u8,
     },
     /// One cell's torque.
@@ -473,8 +473,8 @@ impl Message {
                     return Err(MessageError::Count { kind, got: count, allowed: "1 to 6" });
                 }
             },
-            Kind::Sum if count == 0 => {
-                return Err(MessageError::Count { kind, got: count, allowed: "1 to 255" });
+            Kind::Sum if count == 0 && words != [0; WORDS] => {
+                return Err(MessageError::Count { kind, got: count, allowed: "1 to 255, or 0 with zeros" });
             }
             Kind::Sum => Self::Sum { from: sender()?, epoch, torque: words.map(Q7_8::from_bits), count },
             Kind::Torque if count != 1 => {

@@ -429,7 +429,7 @@ impl<'a> Meaning<'a> {
                 allowed: match meaning.take("allowed") {
                     "1" => "1",
                     "1-to-6" => "1 to 6",
-                    "1-to-255" => "1 to 255",
+                    "1-to-255-or-0-with-zeros" => "1 to 255, or 0 with zeros",
                     other => panic!("{text}: {other}"),
                 },
             }),

@@ -8,6 +8,8 @@ use protocol::usage::{Failure, print};
 
 /// The paper's mean absolute error of single torques, in Nm.
 const PAPER_SINGLE_NM: f64 = 0.0054;
+/// The paper's mean absolute error of sums in Q7.8, in Nm.
+const PAPER_SUMS_NM: f64 = 0.0356;
 
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 110;
@@ -61,14 +63,22 @@ fn table(summary: &Summary) -> Table {
 
 fn accuracy(rows: &mut Rows, summary: &Summary) {
     let accuracy = &summary.accuracy;
-    if accuracy.single.mean_nm.is_none() {
+    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean_nm.is_some());
+    if !single && !sums {
         return;
     }
-    let paper = format!("paper {PAPER_SINGLE_NM}");
     rows.section("accuracy", "mean (greatest) error, Nm", "distributed against central");
-    rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
-    rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
-    rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
+    if single {
+        let paper = format!("paper {PAPER_SINGLE_NM}");
+        rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
+        rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
+        rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
+    }
+    if sums {
+        let paper = format!("paper {PAPER_SUMS_NM}");
+        rows.row("sums, loaded joints", errors(&accuracy.sums), paper);
+        rows.row("  averaged over 32 epochs", errors(&accuracy.sums_averaged), "");
+    }
     if accuracy.saturated > 0 {
         rows.row("saturated words, left out", accuracy.saturated, "above 8 Nm");
     }
@@ -124,6 +134,15 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         rows.row("silent cells", names.join(" "), "");
     }
     let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
+    if let Some(sums) = &bus.sums {
+        let parts = sums.contributions;
+        rows.row("cells due in sums", parts.due, complete);
+        rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
+        let more = format!("{} resent, {} overheard, {} stale", sums.resent, sums.overheard, sums.stale);
+        rows.row(format!("sums from {} roots", sums.roots), sums.first, more);
+        rows.row("last sum after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+        return;
+    }
     rows.row("replies due", replies.due, complete);
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
@@ -149,6 +168,9 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     let lost = up.dropped + up.backlog + up.unknown;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
+    if up.unheard > 0 {
+        rows.row("  for other cells", up.unheard, "sums that the gateway does not take");
+    }
     let reasons = [(up.dropped, "dropped by the bus"), (up.backlog, "by the kernel's backlog")];
     rows.row("  lost", lost, explained(&reasons, up.unknown));
     for (name, count) in

@@ -131,7 +131,8 @@ impl SumError {
             self.saturated += expected.joints as u64;
             return self.interrupt();
         }
-        let errors = words.iter().zip(expected.torque).map(|(&word, torque)| f64::from(word) / 256.0 - torque);
+        let errors =
+            words.iter().zip(expected.torque).map(|(&word, torque)| f64::from(word) / 256.0 - torque);
         for (sum, error) in self.sum.iter_mut().zip(errors).take(expected.joints) {
             self.each.add(error);
             *sum += error;

@@ -308,23 +308,20 @@ impl Cell {
         self.grow_old(number, safety)
     }
 
-    /// A new broadcast, to be answered by sums. Returns as above, and whether it is to be in its sum: it feels
-    /// something, or did in the epoch before.
+    /// A new broadcast, to be answered by sums. Returns the same.
     pub(super) fn open_epoch_of_sums(
         &mut self,
         number: u64,
         in_contact: bool,
         safety: &Safety,
-    ) -> (Change, u32, bool) {
+    ) -> (Change, u32) {
         self.told += 1;
-        let (felt, feels) = (self.is_due(), in_contact && self.is_ready());
-        self.due = u8::from(feels);
+        self.due = u8::from(in_contact && self.is_ready());
         self.sums.rotate_right(1);
         if let Some(newest) = self.sums.first_mut() {
             *newest = None;
         }
-        let (change, missed) = self.grow_old(number, safety);
-        (change, missed, feels || (felt && self.is_ready()))
+        self.grow_old(number, safety)
     }
 
     /// What is held grows old.
@@ -335,12 +332,14 @@ impl Cell {
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(missed);
         if left == 0 && missed > 0 {
             // Nothing of it counts any more; yet the cell has not said that its contact is over.
-            return (self.contribute([0; WORDS]), missed);
+            return (self.contribute([0; WORDS], 0), missed);
         }
         let decay = safety.decay_epochs.max(1);
         let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
         let whole = i32::try_from(decay).unwrap_or(i32::MAX);
-        (self.contribute(held.map(|word| word * keep / whole)), missed)
+        let rest = held.map(|word| word * keep / whole);
+        let counts = self.summed || rest != [0; WORDS];
+        (self.contribute(rest, if counts { self.cells } else { 0 }), missed)
     }
 
     /// The last broadcast came again: the cell hears and drops it, and owes nothing for it.
@@ -350,7 +349,7 @@ impl Cell {
 
     /// Whether something of its torque is in the running sum.
     pub(super) fn contributes(&self) -> bool {
-        self.contribution != [0; WORDS]
+        self.contributing > 0
     }
 
     /// Whether it is in contact, as it says itself where nobody else knows.
@@ -377,15 +376,16 @@ impl Cell {
         was_due
     }
 
-    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one; zeros end all
-    /// contacts. One of an older broadcast than what is held changes nothing.
+    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one; one of no cell ends
+    /// all contacts. One of an older broadcast than what is held changes nothing.
     pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; WORDS]) -> Change {
         if self.answered.is_some_and(|last| number < last) {
             return Change::default();
         }
-        self.answered = Some(number);
-        self.cells = count;
-        self.hold(words)
+        (self.answered, self.cells) = (Some(number), count);
+        // Of what some cells feel, all words may be rounded to 0.
+        self.held = (count > 0).then_some(words);
+        self.contribute(words, count)
     }
 
     /// Cells that what is held is of.
@@ -396,13 +396,13 @@ impl Cell {
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
     pub(super) fn hold(&mut self, words: [i32; WORDS]) -> Change {
         self.held = (words != [0; WORDS]).then_some(words);
-        self.contribute(words)
+        self.contribute(words, u8::from(self.held.is_some()))
     }
 
     /// Lets go of a held torque.
     pub(super) fn let_go(&mut self) -> Change {
         self.held = None;
-        self.contribute([0; WORDS])
+        self.contribute([0; WORDS], 0)
     }
 
     /// The bus carried a halt: it stops answering.
@@ -416,15 +416,14 @@ impl Cell {
         (self.halted, self.commanded) = (false, true);
     }
 
-    fn contribute(&mut self, words: [i32; WORDS]) -> Change {
-        let counts = if words == [0; WORDS] { 0 } else { self.cells };
-        let counted = core::mem::replace(&mut self.contributing, counts);
+    fn contribute(&mut self, words: [i32; WORDS], cells: u8) -> Change {
+        let counted = core::mem::replace(&mut self.contributing, cells);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;
         for (torque, before) in torque.iter_mut().zip(before) {
             *torque -= before;
         }
-        Change { torque, contributing: i32::from(counts) - i32::from(counted) }
+        Change { torque, contributing: i32::from(cells) - i32::from(counted) }
     }
 
     pub(super) fn expect(&mut self, number: u64, quantised: [f64; WORDS], unquantised: [f64; WORDS]) {

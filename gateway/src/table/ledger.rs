@@ -209,14 +209,18 @@ mod tests {
 
     proptest! {
         #[test]
-        fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, any::<bool>()), 0..20)) {
+        fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, any::<bool>(), any::<Option<(u16, Option<u64>)>>()), 0..20), takes_sums: bool) {
             let mut uplink = Uplink::default();
-            for (said, arrived, rejected, restarted) in said {
+            if !takes_sums { uplink.without_sums(); }
+            for (said, arrived, rejected, restarted, sums) in said {
                 for _ in 0..arrived { uplink.arrive(); }
                 for _ in 0..rejected { uplink.reject(); }
                 uplink.settle(said, restarted);
+                if let Some((sums, at)) = sums { uplink.sums_sent(sums, at); }
             }
-            prop_assert_eq!(uplink.sent + uplink.surplus, uplink.delivered + uplink.rejected + uplink.lost);
+            uplink.finish();
+            let there = uplink.delivered + uplink.rejected + uplink.unheard;
+            prop_assert_eq!(uplink.sent + uplink.surplus, there + uplink.lost);
         }
     }
 }

@@ -519,15 +519,16 @@ impl Table {
             let f_z = cell.latch(epoch).map(|skin| (self.central.force(place, &skin), skin));
             let in_contact = f_z.is_some_and(|(force, _)| force > 0.0);
             if self.trunk.is_some() {
-                let (change, missed, is_due) = cell.open_epoch_of_sums(number, in_contact, &self.safety);
-                due += u32::from(is_due);
+                let (change, missed) = cell.open_epoch_of_sums(number, in_contact, &self.safety);
+                due += u32::from(cell.is_due());
                 if missed > 0 {
                     stale += cell.held_cells();
                     age = age.max(if cell.contributes() { missed } else { 0 });
                 }
                 if let (Some(whole), Some(frames), Some((f_z, skin))) = (&mut whole, &frames, f_z) {
-                    let torque = if cell.is_due() { self.central.torque(place, frames, f_z) } else { [0.0; WORDS] };
-                    whole.add(torque, if is_due { cell.joint } else { 0 });
+                    if cell.is_due() {
+                        whole.add(self.central.torque(place, frames, f_z), cell.joint);
+                    }
                     if let Some(felt) = self.snapshot.felt.get_mut(place) {
                         whole.constant &= core::mem::replace(felt, skin) == skin;
                     }
@@ -652,6 +653,10 @@ impl Table {
 fn i32_of<const F: u32>(word: Q<F>) -> i32 {
     i32::from(word.to_bits())
 }
+
+#[cfg(test)]
+#[expect(clippy::cast_possible_truncation, reason = "a few steps")]
+mod tests_sums;
 
 #[cfg(test)]
 mod tests {

@@ -36,8 +36,8 @@ impl SumCounts {
 
 /// Cells that are to be in an epoch's sums: due = in time + late + missing.
 ///
-/// Due are the cells that feel a force by Algorithm 1, or felt one in the epoch before, and can be expected to
-/// answer. A cell that only passes on what others feel is not.
+/// Due are the cells that feel a force by Algorithm 1 and can be expected to answer. A cell that only passes on
+/// what others feel is not.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Contributions {
     /// Cells that were to be in it, all epochs together.

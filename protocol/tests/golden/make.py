@@ -537,6 +537,7 @@ def fd():
     log.put(
         total(1, 0, [256, -256, 1, -1, 0, 128], 1),
         total(254, 255, [MAX, MIN, MAX - 1, MIN + 1, 0, 0], 255),
+        total(12, 9, [0] * 6, 0),
         *(total(cell(), epoch(), words(), rng.randint(1, 255)) for _ in range(3)),
     )
 
@@ -731,7 +732,7 @@ def bad():
     log.title("counts that cannot be")
     for count in (0, 7, 255):
         meaningless(f"count kind=command got={count} allowed=1-to-6", 0, 1, count)
-    meaningless("count kind=sum got=0 allowed=1-to-255", 1, 12, 0)
+    meaningless("count kind=sum got=0 allowed=1-to-255-or-0-with-zeros", 1, 12, 0, (0, 256))
     for count in (0, 2, 255):
         meaningless(f"count kind=torque got={count} allowed=1", 2, 12, count)
     log.title("senders and addressees that cannot be")

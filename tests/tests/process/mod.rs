@@ -558,10 +558,16 @@ impl Summary {
                 ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
             let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
             assert_eq!(replies, of("/replies/due"), "{:#}", self.0);
-            let arrived = of("/uplink/delivered") + of("/uplink/rejected");
+            let arrived = of("/uplink/delivered") + of("/uplink/rejected") + of("/uplink/unheard");
             let lost = of("/uplink/dropped") + of("/uplink/backlog") + of("/uplink/unknown");
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);
+            if !self.0["buses"][bus]["sums"].is_null() {
+                let ways = ["first", "resent", "overheard", "stale"].map(|way| of(&format!("/sums/{way}")));
+                assert_eq!(ways.iter().sum::<u64>(), of("/sums/received"), "{:#}", self.0);
+                let of = |how| of(&format!("/sums/contributions/{how}"));
+                assert_eq!(of("due"), of("in_time") + of("late") + of("missing"), "{:#}", self.0);
+            }
         }
         self
     }

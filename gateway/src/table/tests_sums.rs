@@ -1,0 +1,238 @@
+//! A table of a bus whose cells answer with sums.
+
+use protocol::fixed::{Q5_10, Q7_8};
+use protocol::message::{From, Tree};
+
+use super::*;
+
+/// Four cells on one bus, 1 and 2 of them roots.
+fn skin() -> Skin {
+    let head = crate::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 1500");
+    let (head, cell) = head.split_at(head.find("[[cell]]").unwrap());
+    let cells = (1..=4).map(|node| {
+        let root = if node <= 2 { "root = true\n" } else { "" };
+        cell.replace("node = 1", &format!("node = {node}\n{root}neighbors = {}", NEIGHBORS[node - 1]))
+    });
+    Skin::parse("skin.toml", &format!("{head}{}", cells.collect::<String>())).unwrap()
+}
+
+/// 1 - 3 - 4, and 2 alone.
+const NEIGHBORS: [&str; 4] = ["[3, 0, 0, 0]", "[0, 0, 0, 0]", "[1, 4, 0, 0]", "[3, 0, 0, 0]"];
+
+struct Bench {
+    table: Table,
+    at: u64,
+}
+
+fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
+}
+
+impl Bench {
+    /// All cells ready, some of them pressed with 1 N in each contact word.
+    fn new(pressed: &[i64]) -> Self {
+        let mut bench = Self { table: Table::new(&skin(), 0), at: 0 };
+        bench.table.set_comparing(true);
+        for node in 1..=4 {
+            bench.heartbeat(node, 0, State::default());
+        }
+        for &node in pressed {
+            bench.press(node, 1.0);
+        }
+        bench
+    }
+
+    fn say(&mut self, own: bool, message: Message) {
+        self.at += 100;
+        for frame in message.encode().frames(Format::Fd) {
+            self.table.handle_frame(Micros(self.at), own, &frame, &mut |_| None);
+        }
+    }
+
+    fn heartbeat(&mut self, node: i64, sent: u16, more: State) {
+        let state = State::CONFIGURED.with(State::TEST_MODE, true).with(more, true);
+        let configuration = self.table.cells().first().unwrap().configuration;
+        let page = NetworkPage::Heartbeat(Heartbeat { serial: 1, configuration, sent, rejected: 0, state });
+        self.say(false, Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page });
+    }
+
+    fn press(&mut self, node: i64, newtons: f64) {
+        let contact = [Q5_10::nearest(newtons); 3];
+        let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+        self.say(true, Message::Stimulus { to: Node::Cell(cell(node)), from: From::Next, page });
+    }
+
+    fn joints(&mut self, epoch: u8) -> Sums {
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        self.say(true, Message::Joints { epoch: Epoch(epoch), joints });
+        self.table.snapshot().sums
+    }
+
+    /// A sum of `count` cells with so many steps in its first word.
+    fn sum(&mut self, node: i64, epoch: u8, count: u8, steps: i16) -> Sums {
+        let mut torque = [Q7_8::ZERO; WORDS];
+        torque[0] = Q7_8::from_bits(steps);
+        self.say(false, Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count });
+        self.table.snapshot().sums
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.table.sums().unwrap().0
+    }
+
+    fn contributions(&self) -> Contributions {
+        self.table.sums().unwrap().1
+    }
+}
+
+/// The first joint's torque in steps of Q7.8, and how many cells are in it.
+fn first(sums: &Sums) -> (f64, u32) {
+    (sums.torque[0] * 256.0, sums.contributing)
+}
+
+#[test]
+fn the_torque_is_what_the_roots_say_and_the_sum_with_the_most_cells_counts() {
+    let mut bench = Bench::new(&[1, 2, 3, 4]);
+    bench.joints(7);
+    assert_eq!(first(&bench.sum(1, 7, 1, 10)), (10.0, 1));
+    assert_eq!(first(&bench.sum(2, 7, 1, 5)), (15.0, 2));
+    assert_eq!(first(&bench.sum(1, 7, 3, 40)), (45.0, 4), "it came again with its children's");
+    assert_eq!(first(&bench.sum(1, 7, 3, 99)), (45.0, 4), "one with no more cells");
+    assert_eq!(first(&bench.sum(1, 7, 2, 99)), (45.0, 4), "one with fewer");
+    assert_eq!(first(&bench.sum(3, 7, 2, 30)), (45.0, 4), "no root: it is in its parent's");
+    assert_eq!(first(&bench.sum(1, 3, 3, 99)), (45.0, 4), "of an epoch that was not");
+    assert_eq!(bench.counts(), SumCounts { received: 7, first: 2, resent: 3, overheard: 1, stale: 1 });
+    bench.joints(8);
+    let counters = bench.table.counters();
+    assert_eq!((counters.epochs_due, counters.epochs_complete), (1, 1));
+}
+
+#[test]
+fn who_was_due_and_came_in_time_late_or_not_adds_up() {
+    let mut bench = Bench::new(&[1, 3, 4]);
+    bench.joints(0);
+    bench.sum(1, 0, 2, 20);
+    bench.joints(1);
+    bench.sum(1, 1, 3, 30);
+    assert_eq!(first(&bench.sum(1, 0, 3, 99)), (30.0, 3), "the third is late, and the newer sum stays");
+    bench.joints(2);
+    bench.sum(1, 2, 1, 10);
+    for epoch in 3..7 {
+        bench.joints(epoch);
+        bench.sum(1, epoch, 3, 30);
+    }
+    bench.table.finish();
+    let contributions = bench.contributions();
+    assert_eq!(contributions, Contributions { due: 21, in_time: 18, late: 1, missing: 2, unasked: 0 });
+    let counters = bench.table.counters();
+    assert_eq!((counters.epochs_due, counters.epochs_complete), (7, 5));
+    assert!(
+        bench.table.cells().iter().all(|cell| cell.replies == Replies::default()),
+        "no single torque is due"
+    );
+}
+
+#[test]
+fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_lets_go_of_it() {
+    let mut bench = Bench::new(&[3, 4]);
+    let Safety { hold_epochs, decay_epochs, .. } = skin().safety;
+    bench.joints(0);
+    bench.sum(1, 0, 2, 64);
+    bench.sum(2, 0, 1, 100);
+    bench.sum(2, 0, 0, 0);
+    assert_eq!(first(&bench.table.snapshot().sums), (164.0, 3), "no cell is no more than one");
+    bench.joints(1);
+    assert_eq!(first(&bench.sum(2, 1, 0, 0)), (64.0, 2), "a sum of nobody lets go");
+    for epoch in 2..=1 + hold_epochs {
+        // It feels nothing itself; its children may.
+        bench.heartbeat(1, u16::try_from(epoch).unwrap(), State::default());
+        let sums = bench.joints(u8::try_from(epoch).unwrap());
+        assert_eq!((first(&sums), sums.age, sums.stale), ((64.0, 2), epoch - 1, 2));
+    }
+    for gone in 1..decay_epochs {
+        let sums = bench.joints(u8::try_from(1 + hold_epochs + gone).unwrap());
+        let left = 64.0 * f64::from(decay_epochs - gone) / f64::from(decay_epochs);
+        assert!((first(&sums).0 - left).abs() < 1.0, "{sums:?} is not {left}");
+        assert_eq!(sums.contributing, 2);
+    }
+    let sums = bench.joints(u8::try_from(1 + hold_epochs + decay_epochs).unwrap());
+    assert_eq!(first(&sums), (0.0, 0));
+}
+
+#[test]
+fn a_root_that_starts_anew_does_not_take_its_childrens_torque_with_it() {
+    let mut bench = Bench::new(&[1, 3, 4]);
+    bench.joints(0);
+    bench.sum(1, 0, 3, 64);
+    bench.heartbeat(1, 0, State::CLAIMING);
+    assert_eq!(bench.table.notices().collect::<Vec<_>>(), [Notice::Restarted(cell(1))]);
+    assert_eq!(first(&bench.table.snapshot().sums), (64.0, 3));
+    let all = skin().safety;
+    let last =
+        (1..=1 + all.hold_epochs + all.decay_epochs).map(|epoch| bench.joints(u8::try_from(epoch).unwrap()));
+    assert_eq!(first(&last.last().unwrap()), (0.0, 0), "yet it grows old");
+    assert_eq!(first(&bench.sum(1, bench.table.newest().unwrap().1.0, 1, 9)), (9.0, 1));
+    // A root that has fallen silent is let go at once.
+    bench.table.handle_time(Micros(bench.at) + DEAD_AFTER + Span(1));
+    assert_eq!(first(&bench.table.snapshot().sums), (0.0, 0));
+}
+
+#[test]
+fn a_halt_lets_go_of_sums_and_nobody_is_due() {
+    let mut bench = Bench::new(&[1, 3, 4]);
+    bench.joints(0);
+    bench.sum(1, 0, 3, 64);
+    bench.say(true, Message::Halt);
+    assert_eq!(first(&bench.table.snapshot().sums), (0.0, 0));
+    bench.joints(1);
+    bench.joints(2);
+    bench.table.finish();
+    assert_eq!(bench.contributions().due, 3);
+}
+
+#[test]
+fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32() {
+    let mut bench = Bench::new(&[1, 3]);
+    let skin = skin();
+    let central = Central::new(&skin);
+    let page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
+    let frames = central.frames(&[Q1_14::ZERO; WORDS]);
+    let one = central.torque(0, &frames, central.force(0, &page));
+    // Alternately half a step too high and too low: the average is nearer than any of them.
+    let off =
+        |up| one.map(|nm| Q7_8::from_bits(((nm * 2.0 * 256.0) + if up { 0.6 } else { -0.4 }).floor() as i16));
+    for epoch in 0..33 {
+        bench.joints(epoch);
+        let count = if epoch == 0 { 1 } else { 2 };
+        bench.say(
+            false,
+            Message::Sum { from: cell(1), epoch: Epoch(epoch), torque: off(epoch % 2 == 0), count },
+        );
+    }
+    bench.joints(33);
+    let Accuracy { sums, sums_averaged, single, whole, .. } = bench.table.accuracy();
+    assert_eq!((sums.count(), sums_averaged.count()), (32 * 3, 3), "joints 1 to 3 are loaded");
+    assert!(sums.max() < 1.0 / 256.0 && sums_averaged.max() <= sums.max(), "{sums:?} {sums_averaged:?}");
+    assert_eq!((single.count(), whole.count()), (0, 0));
+}
+
+#[test]
+fn packets_that_the_gateway_does_not_take_are_explained_by_their_senders_own_count() {
+    let mut bench = Bench::new(&[3]);
+    bench.table.hear_sums_of_roots_only();
+    let tree = |sent| NetworkPage::Tree(Tree { sent, ..Tree::default() });
+    let page = |bench: &mut Bench, sent| {
+        let from = Node::Cell(cell(3));
+        bench.say(false, Message::Network { from, epoch: Epoch(0), page: tree(sent) });
+    };
+    page(&mut bench, 0);
+    bench.joints(0);
+    page(&mut bench, 5);
+    // Two pages, five sums, and one packet that is lost.
+    bench.heartbeat(3, 9, State::default());
+    bench.table.finish();
+    let uplink = bench.table.cells()[2].uplink;
+    assert_eq!((uplink.sent, uplink.delivered, uplink.unheard, uplink.lost), (10, 4, 5, 1), "{uplink:?}");
+    let total = Uplink::total(bench.table.cells().iter().map(|cell| cell.uplink));
+    assert_eq!((total.unheard, total.lost), (5, 1));
+}
