@@ -2,12 +2,13 @@
 
 use core::fmt::{self, Display, Formatter};
 
-use protocol::fixed::Q3_12;
+use protocol::fixed::{Q3_12, Q7_8};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{Answer, Message};
 use protocol::packet::{Epoch, Packet, WORDS};
 use serde::Serialize;
 
+use super::judge::Own;
 use crate::decode::Decoded;
 
 /// A reply to joints.
@@ -34,7 +35,7 @@ pub enum How {
 }
 
 /// What was said, as far as anything was.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Said {
     /// The words of a reply to joints.
     Words {
@@ -44,6 +45,13 @@ pub enum Said {
         recorded: Option<[i16; WORDS]>,
         /// Now.
         now: Option<[i16; WORDS]>,
+    },
+    /// Sums, and what is left of them without those of the children.
+    Sums {
+        /// In the recording.
+        recorded: Option<Own>,
+        /// Now.
+        now: Option<Own>,
     },
     /// Answers to `configure`, with their tags.
     Answers {
@@ -93,6 +101,24 @@ impl Difference {
         Message::decode(&packet).map_or_else(|error| error.to_string(), meaning)
     }
 
+    /// A sum, its children, and what the cell itself put into it.
+    fn summed(&self, own: &Own) -> String {
+        let epoch = Epoch(self.when.map_or(0, |when| when.epoch));
+        let sum = Message::Sum { from: self.cell, epoch, torque: own.sum, count: own.count };
+        let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
+        let less = match children.as_slice() {
+            [] => "no children".to_owned(),
+            [one] => format!("less its child {one}"),
+            several => format!("less its children {}", several.join(", ")),
+        };
+        let word = |step: &Option<i32>| match step {
+            Some(step) => format!(" {:.3}", f64::from(*step) * Q7_8::from_bits(1).to_f64()),
+            None => " saturated".to_owned(),
+        };
+        let words: String = own.steps.iter().map(word).collect();
+        format!("{}; {less}:{words} Nm", meaning(sum))
+    }
+
     fn answered(&self, (tag, answer): (u8, Answer)) -> String {
         meaning(Message::Configured { from: self.cell, tag, answer })
     }
@@ -115,11 +141,15 @@ impl Display for Difference {
         if let Some(When { joints, epoch, at_s }) = self.when {
             write!(f, ", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")?;
         }
-        let (recorded, now) = match self.said {
-            Said::Words { what, recorded, now } => {
+        let (recorded, now) = match &self.said {
+            &Said::Words { what, recorded, now } => {
                 (recorded.map(|words| self.told(words, what)), now.map(|words| self.told(words, what)))
             }
-            Said::Answers { recorded, now } => {
+            Said::Sums { recorded, now } => {
+                let told = |own: &Option<Own>| own.as_ref().map(|own| self.summed(own));
+                (told(recorded), told(now))
+            }
+            &Said::Answers { recorded, now } => {
                 (recorded.map(|answer| self.answered(answer)), now.map(|answer| self.answered(answer)))
             }
         };
@@ -127,26 +157,36 @@ impl Display for Difference {
         write!(f, "\n  recorded  {}", recorded.unwrap_or_else(nothing))?;
         write!(f, "\n  now       {}", now.unwrap_or_else(nothing))?;
         if let Said::Words { what: What::Torque, recorded: Some(recorded), now: Some(now) } = self.said {
-            write!(f, "\n  {}", Steps(recorded, now))?;
+            let steps = |words: [i16; WORDS]| words.map(|word| Some(i32::from(word)));
+            write!(f, "\n  {}", Steps(steps(recorded), steps(now), Q3_12::from_bits(1).to_f64()))?;
+        }
+        if let Said::Sums { recorded: Some(recorded), now: Some(now) } = &self.said {
+            write!(f, "\n  {}", Steps(recorded.steps, now.steps, Q7_8::from_bits(1).to_f64()))?;
         }
         Ok(())
     }
 }
 
 /// By how much torques differ: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
-struct Steps([i16; WORDS], [i16; WORDS]);
+struct Steps([Option<i32>; WORDS], [Option<i32>; WORDS], f64);
 
 impl Display for Steps {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let mut comma = "";
         for (joint, (&recorded, &now)) in (1..).zip(self.0.iter().zip(&self.1)) {
-            let steps = i32::from(now) - i32::from(recorded);
+            let steps = now.unwrap_or(0) - recorded.unwrap_or(0);
+            if now.is_none() != recorded.is_none() {
+                let when = if now.is_none() { "now" } else { "then" };
+                write!(f, "{comma}joint {joint}: saturated {when}")?;
+                comma = ", ";
+                continue;
+            }
             if steps == 0 {
                 continue;
             }
             let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
             let unit = if count == 1 { "step" } else { "steps" };
-            let nm = f64::from(count) * Q3_12::from_bits(1).to_f64();
+            let nm = f64::from(count) * self.2;
             write!(f, "{comma}joint {joint}: {count} {unit} {way} ({nm:.4} Nm)")?;
             comma = ", ";
         }

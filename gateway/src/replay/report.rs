@@ -118,8 +118,18 @@ impl Lacking {
     /// The reasons that there were, with their counts, for people.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
-        let Self { silent, untaken, unrecorded, ended, said_later, joints_unrecorded, measured, sums } =
-            *self;
+        let Self {
+            silent,
+            untaken,
+            unrecorded,
+            ended,
+            said_later,
+            joints_unrecorded,
+            measured,
+            parent_changing,
+            tree_unknown,
+            sums_not_taken,
+        } = *self;
         let all = [
             ("the cell was silent", silent),
             ("the cell had not taken the joints", untaken),
@@ -128,7 +138,9 @@ impl Lacking {
             ("the end of a contact was said later", said_later),
             ("the joints were not recorded", joints_unrecorded),
             ("the cell measured", measured),
-            ("sums, which are not compared", sums),
+            ("a cell was changing its parent", parent_changing),
+            ("a cell had not said where its sums go", tree_unknown),
+            ("a sum lacked one of its children's", sums_not_taken),
         ];
         all.into_iter().filter(|(_, count)| *count > 0).collect()
     }
@@ -152,7 +164,15 @@ impl Summary {
             ];
             let counts = counts.into_iter().filter(|(_, count)| *count > 0);
             let counts: Vec<_> = counts.map(|(what, count)| format!("{count} {what}")).collect();
-            wrong.push(format!("replies are not as they were recorded: {}", counts.join(", ")));
+            if !counts.is_empty() {
+                wrong.push(format!("replies are not as they were recorded: {}", counts.join(", ")));
+            }
+            if expect.tally.lacks_the_tree() {
+                wrong.push(
+                    "no sum could be compared: cells have not said where their sums go, then or now"
+                        .to_owned(),
+                );
+            }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
                     "cells came too late for joints {} times: --lockstep waits for them",

@@ -1,9 +1,10 @@
+use super::lane::Excuse;
 use super::*;
 use crate::replay::survey::{Part, Survey};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
-use protocol::fixed::Q3_12;
-use protocol::message::Joints;
+use protocol::fixed::{Q3_12, Q7_8};
+use protocol::message::{Heard, Heartbeat, Joints, Tree};
 use protocol::parameters::Parameter as P;
 
 const MS: u64 = 1_000_000;
@@ -26,6 +27,17 @@ fn heartbeat(number: i64, epoch: u8, sent: u16, state: Flags) -> Message {
 fn heard(number: i64, joints: u16) -> Message {
     let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
     Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(0), page }
+}
+
+fn sum(number: i64, epoch: u8, bits: i16, count: u8) -> Message {
+    let mut torque = [Q7_8::ZERO; WORDS];
+    torque[0] = Q7_8::from_bits(bits);
+    Message::Sum { from: cell(number), epoch: Epoch(epoch), torque, count }
+}
+
+fn tree(number: i64, epoch: u8, parent: Option<u8>) -> Message {
+    let page = NetworkPage::Tree(Tree { parent, ..Tree::default() });
+    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(epoch), page }
 }
 
 fn joints(epoch: u8) -> Message {
@@ -251,6 +263,123 @@ fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
         judge.announce(0, Some(number), epoch);
         assert!(judge.lanes[0].rounds.len() <= 102);
     }
+}
+
+/// Cells 1 to 3 in a row, of which the first and the last feel something.
+fn row() -> Vec<Message> {
+    let mut all = vec![
+        heartbeat(1, 0, 10, Flags::TEST_MODE),
+        heartbeat(2, 0, 10, Flags::TEST_MODE),
+        heartbeat(3, 0, 10, Flags::TEST_MODE),
+        tree(1, 0, Some(0)),
+        tree(2, 0, Some(1)),
+        tree(3, 0, Some(2)),
+    ];
+    for epoch in 0..6 {
+        all.extend([joints(epoch), sum(3, epoch, 30, 1), sum(2, epoch, 30, 1)]);
+        // The first time it did not wait for what came from below.
+        all.extend([sum(1, epoch, 10, 1), sum(1, epoch, 40, 2)]);
+    }
+    all
+}
+
+/// The same cells side by side: all are roots.
+fn beside(own: [i16; 2]) -> Vec<Message> {
+    let mut all = row();
+    all[4] = tree(2, 0, Some(0));
+    all[5] = tree(3, 0, Some(0));
+    all.truncate(6);
+    for epoch in 0..6 {
+        all.extend([joints(epoch), sum(1, epoch, own[0], 1), sum(3, epoch, own[1], 1)]);
+    }
+    all
+}
+
+#[test]
+fn sums_less_their_children_are_equal_in_another_tree() {
+    let judge = judged(&row(), &row());
+    assert_eq!((counts(&judge), judge.tally.sums), ([18, 0, 0, 0], 18), "all three spoke");
+    let judge = judged(&row(), &beside([10, 30]));
+    assert_eq!((counts(&judge), judge.tally.sums), ([12, 0, 0, 0], 12), "{:?}", judge.first());
+    assert!(judge.tally.is_good());
+    let judge = judged(&row(), &beside([11, 29]));
+    assert_eq!(counts(&judge), [12, 0, 0, 0], "one step is rounding");
+}
+
+#[test]
+fn a_sum_that_differs_is_shown_with_its_children() {
+    let judge = judged(&row(), &beside([16, 30]));
+    assert_eq!(counts(&judge), [6, 6, 0, 0]);
+    let text = judge.first().unwrap().to_string();
+    let expected = "the first difference: cell 1 on vcan0, joints 0 (epoch 0, 0.007 s into the recording)
+  recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; less its child 2: 0.039 0.000 0.000 \
+                    0.000 0.000 0.000 Nm
+  now       sum 1 epoch 0: 0.062 0.000 0.000 0.000 0.000 0.000 Nm, cells 1; no children: 0.062 0.000 0.000 0.000 \
+                    0.000 0.000 Nm
+  joint 1: 6 steps more (0.0234 Nm)";
+    assert_eq!(text, expected);
+}
+
+#[test]
+fn a_cell_that_adds_nothing_any_more_is_missing() {
+    let mut now = beside([10, 30]);
+    now.retain(
+        |message| !matches!(message, Message::Sum { from, epoch, .. } if from.get() == 3 && epoch.0 == 4),
+    );
+    let judge = judged(&row(), &now);
+    // The parent then may have taken it or not: nobody knows.
+    assert_eq!((counts(&judge), judge.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
+}
+
+#[test]
+fn who_changes_its_parent_is_left_out_in_that_epoch_and_counted() {
+    let mut now = row();
+    let at = now.iter().position(|message| *message == joints(3)).unwrap();
+    // After joints 2: from joints 3 on it is a root.
+    now.insert(at, tree(3, 2, Some(0)));
+    for message in &mut now[at..] {
+        match *message {
+            Message::Sum { from, epoch, .. } if from.get() == 1 => *message = sum(1, epoch.0, 10, 1),
+            Message::Sum { from, .. } if from.get() == 2 => *message = Message::Sync,
+            _ => {}
+        }
+    }
+    let judge = judged(&row(), &now);
+    // Cells 2 and 3 in the epoch before the change and in the one after it; later cell 2 has nothing to pass on.
+    assert_eq!((judge.tally.lacking.parent_changing, counts(&judge)), (4, [6 + 2 + 4, 0, 0, 0]));
+    assert!(judge.tally.is_good());
+}
+
+#[test]
+fn without_a_tree_nothing_is_compared_and_that_is_no_success() {
+    let mut lost = row();
+    lost.remove(5);
+    let judge = judged(&lost, &row());
+    assert_eq!((counts(&judge), judge.tally.lacking.tree_unknown), ([0, 0, 0, 0], 18));
+    assert!(!judge.tally.is_good());
+}
+
+#[test]
+fn joints_that_are_asked_again_have_the_sums_of_the_last_time() {
+    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    judge.mute(false);
+    for message in &row()[3..6] {
+        judge.record(0, message, true);
+        judge.hear(0, message);
+    }
+    judge.hear(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
+    judge.record_joints(0, 1, Epoch(7), true);
+    judge.record(0, &sum(1, 7, 40, 1), true);
+    judge.announce(0, Some(0), Epoch(7));
+    judge.hear(0, &sum(1, 7, 90, 2));
+    assert_eq!(judge.unanswered(0, 0), 0);
+    judge.announce(0, Some(0), Epoch(6));
+    assert_eq!(judge.unanswered(0, 0), 1);
+    judge.hear(0, &sum(1, 7, 90, 2));
+    judge.hear(0, &sum(1, 6, 40, 1));
+    assert_eq!(judge.unanswered(0, 0), 0);
+    judge.finish(true);
+    assert_eq!(counts(&judge), [1, 0, 0, 0]);
 }
 
 #[test]

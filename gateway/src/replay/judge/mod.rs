@@ -10,161 +10,28 @@
 //! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus each
 //! for itself. Rounds of joints are judged when 100 more have been sent, or at the end.
 
-use std::collections::{BTreeMap, VecDeque};
+mod lane;
+mod sums;
+mod tally;
+
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Heard, Heartbeat, Message, NetworkPage, SensorPage, State as Flags};
+use protocol::message::{Answer, Message, NetworkPage, SensorPage, State as Flags};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
-use serde::Serialize;
+
+pub use lane::Present;
+use lane::{Answers, Asked, Fate, Lane, NOW, Pair, RECORDED, Round, excuse_extra};
+pub use sums::Own;
+use sums::{Outcome, Side, Sum, Why, compare};
+pub use tally::{Lacking, Tally};
 
 use super::difference::{Difference, How, Said, What, When};
 use super::survey::Cell as Surveyed;
 
 /// A reply may come so many joints after those that it answers; far less than the 256 epochs.
 const WINDOW: u64 = 100;
-
-/// How replies and recorded ones compare.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Tally {
-    /// Replies that came back as they were recorded.
-    pub equal: u64,
-    /// Replies that came back with other words.
-    pub different: u64,
-    /// Recorded replies that did not come back.
-    pub missing: u64,
-    /// Replies that were not recorded, and nothing says why.
-    pub extra: u64,
-    /// Recorded replies to joints that a bus did not take from this replay.
-    pub not_asked: u64,
-    /// What the recording itself lacks.
-    pub lacking: Lacking,
-}
-
-/// Replies that were not recorded, or not with their joints, by what the recording says of why.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Lacking {
-    /// The cell was silent then: not there, killed, hung, or claiming its number.
-    pub silent: u64,
-    /// The cell did not take so many joints, by its own counters.
-    pub untaken: u64,
-    /// The cell sent more packets than were recorded, by its own counters.
-    pub unrecorded: u64,
-    /// The last joints of the recording: it ended before they were answered.
-    pub ended: u64,
-    /// The end of a contact, said later because the cell did not take the joints at which it was.
-    pub said_later: u64,
-    /// Recorded replies whose joints were not recorded.
-    pub joints_unrecorded: u64,
-    /// Recorded replies of cells that measured: what they felt was not recorded.
-    pub measured: u64,
-    /// Recorded sums: nothing says whose children they hold.
-    pub sums: u64,
-}
-
-impl Tally {
-    /// Whether all came back, and nothing else.
-    #[must_use]
-    pub const fn is_good(&self) -> bool {
-        self.different == 0 && self.missing == 0 && self.extra == 0 && self.not_asked == 0
-    }
-}
-
-/// A cell as it is on the bus now.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Present {
-    /// Its last heartbeat.
-    pub heartbeat: Option<Heartbeat>,
-    /// Its counters when they came first, and last.
-    pub heard: Option<(Heard, Heard)>,
-    /// Whether it is waited for no longer: it did not answer.
-    pub is_given_up: bool,
-    /// The latest joints that it has told to be done with, by number of announcement.
-    done: u64,
-    /// Heartbeats since the last announcement.
-    heartbeats: u32,
-}
-
-impl Present {
-    /// Whether its number is its own, and so it answers.
-    #[must_use]
-    pub fn is_settled(&self) -> bool {
-        self.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(Flags::CLAIMING))
-    }
-}
-
-/// Joints as they were announced.
-#[derive(Clone, Copy, Debug)]
-struct Asked {
-    announcement: u64,
-    /// Their number among the replayed ones; none for those that only restore a state.
-    round: Option<u64>,
-}
-
-/// What has become of recorded joints.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Fate {
-    /// Not sent yet.
-    Waiting,
-    Sent,
-    /// A bus did not take them.
-    Unsent,
-}
-
-/// The words of one reply, recorded and now.
-#[derive(Clone, Copy, Debug, Default)]
-struct Pair {
-    recorded: Option<[i16; WORDS]>,
-    now: Option<[i16; WORDS]>,
-}
-
-/// Joints of the capture and their replies.
-#[derive(Debug)]
-struct Round {
-    epoch: Epoch,
-    /// When they were recorded, in ns since 1970.
-    nanos: u64,
-    fate: Fate,
-    replies: BTreeMap<(CellId, What), Pair>,
-}
-
-/// A cell of the capture.
-#[derive(Debug)]
-struct Excuse {
-    cell: Surveyed,
-    /// It said the end of a contact earlier now, because it took joints that it had not taken then.
-    ended_earlier: bool,
-}
-
-/// Recorded answers to `configure`, and those that came now, as far as they are not compared yet.
-#[derive(Debug, Default)]
-struct Answers {
-    /// With the number of rounds before it.
-    recorded: VecDeque<(u64, u8, Answer)>,
-    now: VecDeque<(u8, Answer)>,
-}
-
-/// One bus.
-#[derive(Debug)]
-struct Lane {
-    name: String,
-    roll: BTreeMap<CellId, Present>,
-    excuses: BTreeMap<CellId, Excuse>,
-    announcements: u64,
-    /// By epoch.
-    asked: Vec<Option<Asked>>,
-    /// The same of the capture: the round of its latest joints of each epoch.
-    recorded: Vec<Option<u64>>,
-    /// The number of the first of `rounds`.
-    base: u64,
-    rounds: VecDeque<Round>,
-    answers: BTreeMap<CellId, Answers>,
-    /// Rounds that were announced.
-    sent: u64,
-    /// The round after which the capture has no more joints.
-    last_round: Option<u64>,
-    is_down: bool,
-}
 
 /// All buses.
 #[derive(Debug)]
@@ -206,8 +73,7 @@ impl Judge {
     pub fn record_joints(&mut self, lane: usize, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let lane = self.lanes.get_mut(lane)?;
         let round = is_sent.then(|| {
-            let fate = Fate::Waiting;
-            lane.rounds.push_back(Round { epoch, nanos, fate, replies: BTreeMap::new() });
+            lane.rounds.push_back(Round::new(epoch, nanos));
             lane.base + lane.rounds.len() as u64 - 1
         });
         *lane.recorded.get_mut(usize::from(epoch.0))? = round;
@@ -226,8 +92,35 @@ impl Judge {
             let rounds = lane.base + lane.rounds.len() as u64;
             lane.answers.entry(from).or_default().recorded.push_back((rounds, tag, answer));
         }
-        if matches!(message, Message::Sum { .. }) && is_in_part {
-            tally.lacking.sums += 1;
+        match *message {
+            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Tree(tree) } => {
+                lane.record_parent(cell, epoch, tree.parent);
+            }
+            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Heartbeat(heartbeat) }
+                if heartbeat.state.has(Flags::CLAIMING) =>
+            {
+                lane.record_parent(cell, epoch, None);
+            }
+            Message::Sum { from, epoch, torque, count } => {
+                let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
+                let has_rounds = !lane.rounds.is_empty();
+                match number.and_then(|number| lane.round(number)) {
+                    Some(round) => round.sums[RECORDED].take(from, Sum { torque, count }),
+                    None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
+                    None => {}
+                }
+            }
+            Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
@@ -273,6 +166,9 @@ impl Judge {
         it.sent = it.sent.max(number + 1);
         if let Some(round) = it.round(number) {
             round.fate = Fate::Sent;
+            // Asked again, all cells say their sums again.
+            round.sums[NOW].clear();
+            round.asked_as = epoch;
         }
         while self.lanes.get(lane).is_some_and(|lane| lane.base + WINDOW < number) {
             self.close_round(lane);
@@ -330,7 +226,19 @@ impl Judge {
         }
     }
 
+    fn hear_sum(&mut self, index: usize, cell: CellId, epoch: Epoch, sum: Sum) {
+        let Some(lane) = self.lanes.get_mut(index) else { return };
+        let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
+        let round = asked.and_then(|asked| asked.round).and_then(|number| lane.round(number));
+        if let Some(round) = round.filter(|round| round.asked_as == epoch) {
+            round.sums[NOW].take(cell, sum);
+        }
+    }
+
     fn hear_reply(&mut self, index: usize, message: &Message) {
+        if let Message::Sum { from, epoch, torque, count } = *message {
+            return self.hear_sum(index, from, epoch, Sum { torque, count });
+        }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let Some(lane) = self.lanes.get_mut(index) else { return };
         let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
@@ -379,16 +287,28 @@ impl Judge {
         late
     }
 
-    /// How many recorded torques of the joints of a round have not come, of cells that are there.
+    /// How many recorded torques and sums of the joints of a round have not come, of cells that are there.
     #[must_use]
-    pub fn unanswered(&self, lane: usize, round: u64) -> usize {
+    pub fn unanswered(&self, lane: usize, number: u64) -> usize {
         let Some(lane) = self.lanes.get(lane) else { return 0 };
-        let round = round.checked_sub(lane.base).and_then(|at| lane.rounds.get(usize::try_from(at).ok()?));
-        let misses = |(&(cell, what), pair): (&(CellId, What), &Pair)| {
-            let present = lane.roll.get(&cell).is_some_and(|present| !present.is_given_up);
-            present && what == What::Torque && pair.recorded.is_some() && pair.now.is_none()
+        let Some(round) =
+            number.checked_sub(lane.base).and_then(|at| lane.rounds.get(usize::try_from(at).ok()?))
+        else {
+            return 0;
         };
-        round.map_or(0, |round| round.replies.iter().filter(|it| misses(*it)).count())
+        let is_there =
+            |cell: &CellId| lane.roll.get(cell).is_some_and(|present: &Present| !present.is_given_up);
+        let misses = |((cell, what), pair): &(&(CellId, What), &Pair)| {
+            is_there(cell) && *what == What::Torque && pair.recorded.is_some() && pair.now.is_none()
+        };
+        let torques = round.replies.iter().filter(misses).count();
+        let [then, now] = &round.sums;
+        if then.is_empty() {
+            return torques;
+        }
+        let then = Side::new(then, &lane.trees[RECORDED], number);
+        let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.feels(*cell);
+        torques + round.sums[RECORDED].cells().filter(misses).count()
     }
 
     /// Takes in that a bus is down, so that nobody on it is waited for; it ends with the next message.
@@ -467,7 +387,8 @@ impl Judge {
         }
         let is_last = lane.last_round == Some(number);
         let at = Some((number, round.epoch, round.nanos));
-        for ((cell, what), Pair { recorded, now }) in round.replies {
+        for ((cell, what), &Pair { recorded, now }) in &round.replies {
+            let (cell, what) = (*cell, *what);
             let Some(lane) = self.lanes.get_mut(index) else { return };
             let excuse = lane.excuses.get_mut(&cell);
             let said = Said::Words { what, recorded, now };
@@ -510,6 +431,61 @@ impl Judge {
             };
             self.note(index, how, cell, at, said);
         }
+        if round.sums.iter().any(|sums| !sums.is_empty()) {
+            self.close_sums(index, number, &round);
+        }
+        if let Some(lane) = self.lanes.get_mut(index) {
+            lane.trees.iter_mut().for_each(|trees| trees.forget_before(number));
+        }
+    }
+
+    /// Compares what each cell itself put into its sums of a round.
+    fn close_sums(&mut self, index: usize, number: u64, round: &Round) {
+        let Some(lane) = self.lanes.get_mut(index) else { return };
+        let side = |of: usize| Side::new(&round.sums[of], &lane.trees[of], number);
+        let (then, now) = (side(RECORDED), side(NOW));
+        let cells: BTreeSet<_> = round.sums.iter().flat_map(|sums| sums.cells()).collect();
+        let is_last = lane.last_round == Some(number);
+        let mut notes = Vec::new();
+        for cell in cells {
+            let excuse = lane.excuses.get_mut(&cell);
+            let Tally { different, missing, extra, not_asked, lacking, .. } = &mut self.tally;
+            if excuse.as_ref().is_some_and(|excuse| excuse.cell.measured) {
+                lacking.measured += u64::from(round.sums[RECORDED].has(cell));
+                continue;
+            }
+            let (count, how) = match compare(&then, &now, cell) {
+                Outcome::Nothing => continue,
+                Outcome::Equal => {
+                    self.tally.equal += 1;
+                    self.tally.sums += 1;
+                    continue;
+                }
+                Outcome::Missing if round.fate == Fate::Unsent => (not_asked, How::Missing),
+                Outcome::LeftOut(_) if round.fate == Fate::Unsent => {
+                    *not_asked += 1;
+                    continue;
+                }
+                Outcome::LeftOut(why) => {
+                    *match why {
+                        Why::Changing => &mut lacking.parent_changing,
+                        Why::Unknown => &mut lacking.tree_unknown,
+                        Why::NotTaken => &mut lacking.sums_not_taken,
+                    } += 1;
+                    continue;
+                }
+                Outcome::Different => (different, How::Different),
+                Outcome::Missing => (missing, How::Missing),
+                // The words only say whether a contact has ended, which a sum does not tell.
+                Outcome::Extra if excuse_extra(lacking, excuse, round.nanos, is_last, [1; WORDS]) => continue,
+                Outcome::Extra => (extra, How::Extra),
+            };
+            *count += 1;
+            notes.push((how, cell, Said::Sums { recorded: then.own(cell), now: now.own(cell) }));
+        }
+        for (how, cell, said) in notes {
+            self.note(index, how, cell, Some((number, round.epoch, round.nanos)), said);
+        }
     }
 
     /// Compares the answers to `configure`, in their order.
@@ -541,40 +517,6 @@ fn is_compared(answer: Answer) -> bool {
     !matches!(answer, Answer::Value { number, .. } if number == Parameter::Identity.number())
 }
 
-/// Whether the recording says why it has no such reply.
-fn excuse_extra(
-    lacking: &mut Lacking,
-    excuse: Option<&mut Excuse>,
-    nanos: u64,
-    is_last: bool,
-    now: [i16; WORDS],
-) -> bool {
-    let Some(excuse) = excuse else {
-        // A cell that the recording does not have.
-        lacking.silent += 1;
-        return true;
-    };
-    let cell = &mut excuse.cell;
-    if cell.measured {
-        return true;
-    }
-    if cell.is_silent_at(nanos) {
-        lacking.silent += 1;
-    } else if cell.untaken > 0 {
-        cell.untaken -= 1;
-        excuse.ended_earlier = now == [0; WORDS];
-        lacking.untaken += 1;
-    } else if cell.unrecorded > 0 {
-        cell.unrecorded -= 1;
-        lacking.unrecorded += 1;
-    } else if is_last {
-        lacking.ended += 1;
-    } else {
-        return false;
-    }
-    true
-}
-
 /// A reply that says which joints it answers, or came after.
 fn reply(message: &Message) -> Option<(CellId, Epoch, What, [i16; WORDS])> {
     match *message {
@@ -600,77 +542,6 @@ fn reply(message: &Message) -> Option<(CellId, Epoch, What, [i16; WORDS])> {
 
 fn words(message: &Message) -> [i16; WORDS] {
     message.encode().words
-}
-
-impl Lane {
-    fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
-        let excuse = |(node, cell)| (node, Excuse { cell, ended_earlier: false });
-        Self {
-            name,
-            roll: BTreeMap::new(),
-            excuses: cells.into_iter().map(excuse).collect(),
-            announcements: 0,
-            asked: vec![None; 256],
-            recorded: vec![None; 256],
-            base: 0,
-            rounds: VecDeque::new(),
-            answers: BTreeMap::new(),
-            sent: 0,
-            last_round: None,
-            is_down: false,
-        }
-    }
-
-    fn round(&mut self, number: u64) -> Option<&mut Round> {
-        let at = number.checked_sub(self.base)?;
-        self.rounds.get_mut(usize::try_from(at).ok()?)
-    }
-
-    /// Forgets recorded replies to what was not sent. What was sent after the last joints nobody knows, so replies to
-    /// that are not missed.
-    fn forget_the_unsent(&mut self) {
-        let sent = self.sent;
-        for answers in self.answers.values_mut() {
-            answers.recorded.retain(|(rounds, ..)| *rounds < sent);
-        }
-        if let Some(last) = sent.checked_sub(1).and_then(|last| self.round(last)) {
-            last.replies.retain(|(_, what), pair| *what == What::Torque || pair.now.is_some());
-        }
-    }
-
-    fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
-        let announcement = self.asked.get(usize::from(epoch.0)).copied().flatten();
-        let present = self.roll.entry(cell).or_default();
-        match *page {
-            NetworkPage::Heartbeat(heartbeat) => {
-                present.heartbeat = Some(heartbeat);
-                present.is_given_up = false;
-                present.heartbeats += 1;
-                if let Some(asked) = announcement {
-                    present.done = present.done.max(asked.announcement);
-                }
-            }
-            NetworkPage::Heard(heard) => {
-                let first = present.heard.map_or(heard, |(first, _)| first);
-                present.heard = Some((first, heard));
-            }
-            NetworkPage::Refused(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
-        }
-    }
-
-    /// Whether a cell is done with the joints announced last. One that does not take them, because they are those of
-    /// another robot, tells the epoch before; after two heartbeats it has looked at them: one of the two is the
-    /// answer to the sync that came after them.
-    const fn has_done(&self, present: &Present) -> bool {
-        present.done >= self.announcements || present.heartbeats >= 2
-    }
-
-    /// The cells that are waited for.
-    fn undone(&self) -> impl Iterator<Item = CellId> {
-        let waits =
-            |present: &Present| present.is_settled() && !present.is_given_up && !self.has_done(present);
-        self.roll.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
-    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,440 @@
+//! Sums less their children: what each cell itself put into a sum, whatever the tree was.
+//!
+//! ```text
+//!   tree pages, joints by joints ──> [Trees] ─┐
+//!                                             ├─> Side: own = sum - sums of the children
+//!   sums of one epoch, the last of each ──────┘        recorded and now: compare
+//! ```
+//!
+//! A sum adds whole steps, so the difference is exact, and in it nothing is left of the tree. Two cells that feel the
+//! same may differ by one step, because rounding carries what it took away into the next value. Whose children are
+//! not certain in an epoch is left out, and so is a sum that does not hold all its children's.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use protocol::fixed::{Q, Q7_8};
+use protocol::id::CellId;
+use protocol::packet::WORDS;
+
+/// Where each cell's sums go, from round to round.
+#[derive(Debug, Default)]
+pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
+
+/// From a round on they go there.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    since: u64,
+    /// A cell's number, 0 for the gateway's side; none without a way up.
+    parent: Option<u8>,
+}
+
+impl Trees {
+    /// Takes in where a cell's sums go from a round on, as it says itself.
+    pub(super) fn say(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
+        let steps = self.0.entry(cell).or_default();
+        if steps.back().is_none_or(|last| last.parent != parent) {
+            steps.push_back(Step { since, parent });
+        }
+    }
+
+    /// Where a cell's sums go in a round; none when that is not known.
+    fn parent(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
+        let steps = self.0.get(&cell)?;
+        steps.iter().rev().find(|step| step.since <= round).map(|step| step.parent)
+    }
+
+    /// Cells that had another parent before a round, or have one after it, with these parents. Their pages tell the
+    /// epoch of the last joints, which are the ones before the change or those at it.
+    fn affected(&self, round: u64) -> BTreeSet<CellId> {
+        let mut all = BTreeSet::new();
+        for (cell, steps) in &self.0 {
+            for (before, after) in steps.iter().zip(steps.iter().skip(1)) {
+                if after.since == round || after.since == round + 1 {
+                    all.insert(*cell);
+                    let parents = [before.parent, after.parent].into_iter().flatten();
+                    all.extend(parents.filter_map(|parent| CellId::new(parent.into()).ok()));
+                }
+            }
+        }
+        all
+    }
+
+    /// Forgets what was before a round.
+    pub(super) fn forget_before(&mut self, round: u64) {
+        for steps in self.0.values_mut() {
+            // The step before a change tells from whom the cell came.
+            while steps.get(2).is_some_and(|third| third.since < round) {
+                steps.pop_front();
+            }
+        }
+    }
+}
+
+/// One cell's sum.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) struct Sum {
+    pub(super) torque: [Q7_8; WORDS],
+    /// Cells in it.
+    pub(super) count: u8,
+}
+
+/// The last sum of each cell for one epoch: the one with the most cells.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Sums(BTreeMap<CellId, Sum>);
+
+impl Sums {
+    pub(super) fn take(&mut self, cell: CellId, sum: Sum) {
+        let last = self.0.entry(cell).or_insert(sum);
+        if sum.count > last.count {
+            *last = sum;
+        }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    pub(super) fn has(&self, cell: CellId) -> bool {
+        self.0.contains_key(&cell)
+    }
+
+    pub(super) fn cells(&self) -> impl Iterator<Item = CellId> {
+        self.0.keys().copied()
+    }
+}
+
+/// What one cell put into its sum.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Own {
+    /// The sum as it was said.
+    pub sum: [Q7_8; WORDS],
+    /// Cells in it.
+    pub count: u8,
+    /// The children whose sums are in it.
+    pub children: Vec<CellId>,
+    /// The sum less theirs, in steps of Q7.8; none where a word is saturated.
+    pub steps: [Option<i32>; WORDS],
+    /// The count less theirs: 1 of a cell that feels something, 0 of one that passes on what others feel.
+    pub cells: i32,
+}
+
+/// The sums of one epoch and their tree, recorded or now.
+pub(super) struct Side<'a> {
+    sums: &'a Sums,
+    children: BTreeMap<u8, Vec<CellId>>,
+    affected: BTreeSet<CellId>,
+    /// Whether it is known of all whose children they are.
+    is_known: bool,
+}
+
+/// Why a sum is not compared.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Why {
+    /// The cell, or one that is or was its child, was changing its parent.
+    Changing,
+    /// Some cell has not said where its sums go.
+    Unknown,
+    /// It does not hold all its children's sums, or others than were heard.
+    NotTaken,
+}
+
+/// How a cell's sums compare.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Outcome {
+    /// The cell itself had nothing to say then, nor now.
+    Nothing,
+    Equal,
+    Different,
+    Missing,
+    Extra,
+    LeftOut(Why),
+}
+
+impl<'a> Side<'a> {
+    pub(super) fn new(sums: &'a Sums, trees: &Trees, round: u64) -> Self {
+        let mut children: BTreeMap<u8, Vec<CellId>> = BTreeMap::new();
+        for cell in trees.0.keys() {
+            if let Some(parent) = trees.parent(*cell, round).flatten() {
+                children.entry(parent).or_default().push(*cell);
+            }
+        }
+        let is_known = sums.cells().all(|cell| trees.parent(cell, round).is_some());
+        Self { sums, children, affected: trees.affected(round), is_known }
+    }
+
+    fn children(&self, cell: CellId) -> &[CellId] {
+        self.children.get(&cell.get()).map_or(&[], Vec::as_slice)
+    }
+
+    /// What a cell put into its sum; none when it said none.
+    pub(super) fn own(&self, cell: CellId) -> Option<Own> {
+        let Sum { torque: sum, count } = *self.sums.0.get(&cell)?;
+        let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
+        let (mut children, mut cells) = (Vec::new(), i32::from(count));
+        let mut steps = sum.map(exact);
+        for (child, its) in below {
+            children.push(child);
+            cells -= i32::from(its.count);
+            for (own, word) in steps.iter_mut().zip(its.torque) {
+                *own = own.zip(exact(word)).map(|(own, word)| own - word);
+            }
+        }
+        Some(Own { sum, count, children, steps, cells })
+    }
+
+    /// Whether a cell feels something itself.
+    pub(super) fn feels(&self, cell: CellId) -> bool {
+        self.own(cell).is_some_and(|own| own.cells > 0)
+    }
+
+    /// Whether what a cell said holds the sums of all its children, as they were heard: then what is left is its own.
+    fn is_whole(&self, cell: CellId, other: &Self) -> bool {
+        let Some(own) = self.own(cell) else { return true };
+        let adds_up = match own.cells {
+            0 => own.steps.iter().flatten().all(|step| *step == 0),
+            1 => true,
+            _ => false,
+        };
+        // Of a child that is heard on one side only, nobody knows whether it is in this.
+        let silent = |child: &CellId| !self.sums.has(*child) && other.feels(*child);
+        adds_up && !self.children(cell).iter().any(silent)
+    }
+
+    /// The cells in a cell's sum, by the tree.
+    fn below(&self, cell: CellId) -> BTreeSet<CellId> {
+        let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
+        while let Some(cell) = next.pop() {
+            if self.sums.has(cell) && all.insert(cell) {
+                next.extend(self.children(cell));
+            }
+        }
+        all
+    }
+}
+
+fn exact(word: Q7_8) -> Option<i32> {
+    (!Q::is_saturated(word)).then(|| i32::from(word.to_bits()))
+}
+
+/// Compares what a cell put into its sums.
+pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outcome {
+    if recorded.affected.contains(&cell) || now.affected.contains(&cell) {
+        return Outcome::LeftOut(Why::Changing);
+    }
+    if !recorded.is_known || !now.is_known {
+        return Outcome::LeftOut(Why::Unknown);
+    }
+    if !recorded.is_whole(cell, now) || !now.is_whole(cell, recorded) {
+        return Outcome::LeftOut(Why::NotTaken);
+    }
+    let (then, today) = (recorded.own(cell), now.own(cell));
+    match (then, today) {
+        (Some(then), Some(today)) => {
+            // A word is saturated by all that is below: of another tree, by other cells.
+            let alike = |then: Q7_8, today: Q7_8| {
+                then.is_saturated() == today.is_saturated() || recorded.below(cell) != now.below(cell)
+            };
+            let mut words = then.steps.iter().zip(&today.steps).zip(then.sum.iter().zip(&today.sum));
+            let same = then.cells == today.cells
+                && words.all(|((own, it), (sum, other))| match (own, it) {
+                    (Some(own), Some(it)) => own.abs_diff(*it) <= 1,
+                    (None, _) | (_, None) => alike(*sum, *other),
+                });
+            if same { Outcome::Equal } else { Outcome::Different }
+        }
+        // Whether a cell passes on what others feel depends on the tree.
+        (Some(then), None) if then.cells > 0 => Outcome::Missing,
+        (None, Some(today)) if today.cells > 0 => Outcome::Extra,
+        (Some(_), None) | (None, Some(_) | None) => Outcome::Nothing,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn cell(number: u8) -> CellId {
+        CellId::new(number.into()).unwrap()
+    }
+
+    /// What each cell itself feels, in steps; cells from 1.
+    type Felt = Vec<Option<[i16; WORDS]>>;
+
+    /// A tree: the parent of each cell, 0 for the gateway's side. Only cells of a lesser place are parents.
+    fn sums(felt: &Felt, parents: &[u8]) -> (Sums, Trees) {
+        let (mut sums, mut trees) = (Sums::default(), Trees::default());
+        let mut totals = vec![([0_i32; WORDS], 0_u8); felt.len()];
+        for place in (0..felt.len()).rev() {
+            if let Some(own) = felt[place] {
+                totals[place].1 += 1;
+                (0..WORDS).for_each(|word| totals[place].0[word] += i32::from(own[word]));
+            }
+            let (total, count) = totals[place];
+            if let Some(above) = parents[place].checked_sub(1).map(usize::from) {
+                totals[above].1 += count;
+                (0..WORDS).for_each(|word| totals[above].0[word] += total[word]);
+            }
+            let number = cell(u8::try_from(place + 1).unwrap());
+            trees.say(number, Some(parents[place]), 0);
+            if count > 0 {
+                let torque = total.map(|word| Q7_8::from_bits(word.try_into().unwrap()));
+                sums.take(number, Sum { torque, count });
+            }
+        }
+        (sums, trees)
+    }
+
+    fn outcomes(then: &(Sums, Trees), today: &(Sums, Trees), cells: usize) -> Vec<Outcome> {
+        let (then, today) = (Side::new(&then.0, &then.1, 5), Side::new(&today.0, &today.1, 5));
+        (1..=u8::try_from(cells).unwrap()).map(|number| compare(&then, &today, cell(number))).collect()
+    }
+
+    fn words(first: i16) -> Option<[i16; WORDS]> {
+        Some([first, 0, -3, 0, 0, 0])
+    }
+
+    #[test]
+    fn the_same_contributions_are_equal_in_whatever_tree() {
+        // 1 - 2 - 3 and 1 - (2, 3); cell 2 only passes on in the first.
+        let felt = vec![words(10), None, words(30)];
+        let both = (sums(&felt, &[0, 1, 2]), sums(&felt, &[0, 1, 1]));
+        assert_eq!(outcomes(&both.0, &both.1, 3), [Outcome::Equal, Outcome::Nothing, Outcome::Equal]);
+        let side = Side::new(&both.0.0, &both.0.1, 5);
+        let own = side.own(cell(1)).unwrap();
+        assert_eq!((own.steps[0], own.cells, own.children), (Some(10), 1, vec![cell(2)]));
+        assert_eq!((own.sum[0].to_bits(), own.count), (40, 2));
+    }
+
+    #[test]
+    fn one_step_is_rounding_and_two_are_a_difference() {
+        let then = sums(&vec![words(10), words(20)], &[0, 1]);
+        let today = sums(&vec![words(10), words(21)], &[0, 1]);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal; 2]);
+        let today = sums(&vec![words(10), words(22)], &[0, 1]);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Different]);
+    }
+
+    #[test]
+    fn who_feels_nothing_now_is_missing_and_who_did_not_then_is_extra() {
+        let then = sums(&vec![words(10), words(20), None], &[0, 0, 0]);
+        let today = sums(&vec![words(10), None, words(1)], &[0, 0, 0]);
+        assert_eq!(outcomes(&then, &today, 3), [Outcome::Equal, Outcome::Missing, Outcome::Extra]);
+        // One that passes on what another feels speaks all the same: its own count tells.
+        let then = sums(&vec![words(10), words(20)], &[0, 1]);
+        let today = sums(&vec![None, words(20)], &[0, 1]);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
+    }
+
+    #[test]
+    fn whose_children_are_not_certain_is_left_out() {
+        let felt = vec![words(10), words(20), words(30), words(40)];
+        let then = sums(&felt, &[0, 0, 1, 0]);
+        let mut today = sums(&felt, &[0, 0, 1, 0]);
+        today.1.say(cell(3), None, 6);
+        today.1.say(cell(3), Some(2), 6);
+        let changing = Outcome::LeftOut(Why::Changing);
+        assert_eq!(outcomes(&then, &today, 4), [changing, changing, changing, Outcome::Equal]);
+        // Nobody knows whose child the third is.
+        today.1.0.remove(&cell(3));
+        assert_eq!(outcomes(&then, &today, 4), [Outcome::LeftOut(Why::Unknown); 4]);
+    }
+
+    #[test]
+    fn a_sum_that_lacks_a_childs_is_left_out() {
+        let felt = vec![words(10), words(20), None];
+        let then = sums(&felt, &[0, 1, 0]);
+        let mut today = sums(&felt, &[0, 1, 0]);
+        let alone = Sum { torque: words(10).unwrap().map(Q7_8::from_bits), count: 1 };
+        today.0.0.insert(cell(1), alone);
+        let torn = Outcome::LeftOut(Why::NotTaken);
+        assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Equal]);
+        // The child's was lost on the way to the recording, and is in the parent's.
+        let mut then = sums(&vec![None, words(20)], &[0, 1]);
+        let today = sums(&vec![None, words(20)], &[0, 1]);
+        then.0.0.remove(&cell(2));
+        assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Extra]);
+    }
+
+    #[test]
+    fn of_two_sums_the_one_with_more_cells_counts() {
+        let mut sums = Sums::default();
+        let sum = |word, count| Sum { torque: [Q7_8::from_bits(word); WORDS], count };
+        for next in [sum(1, 1), sum(5, 3), sum(4, 2), sum(6, 3)] {
+            sums.take(cell(1), next);
+        }
+        assert_eq!(sums.0[&cell(1)], sum(5, 3));
+    }
+
+    #[test]
+    fn saturated_words_are_compared_as_saturated() {
+        let then = sums(&vec![words(10), words(20)], &[0, 1]);
+        let saturate = |mut side: (Sums, Trees), number| {
+            side.0.0.get_mut(&cell(number)).unwrap().torque[0] = Q7_8::MAX;
+            side
+        };
+        let whole = |felt: &Felt, parents: &[u8]| saturate(sums(felt, parents), 1);
+        let felt = vec![words(10), words(20)];
+        assert_eq!(outcomes(&whole(&felt, &[0, 1]), &whole(&felt, &[0, 1]), 2), [Outcome::Equal; 2]);
+        assert_eq!(
+            outcomes(&then, &whole(&felt, &[0, 1]), 2),
+            [Outcome::Different, Outcome::Equal],
+            "the same cells are in it"
+        );
+        let other = sums(&felt, &[0, 0]);
+        assert_eq!(outcomes(&other, &whole(&felt, &[0, 1]), 2)[0], Outcome::Equal, "others are in it");
+        // The other words are compared as ever.
+        let felt = vec![Some([10, 9, 0, 0, 0, 0]), words(20)];
+        assert_eq!(outcomes(&whole(&felt, &[0, 1]), &then, 2)[0], Outcome::Different);
+    }
+
+    #[test]
+    fn trees_forget_what_is_over() {
+        let mut trees = Trees::default();
+        for round in 0..1_000_u64 {
+            trees.say(cell(1), Some((round % 2).to_le_bytes()[0]), round);
+            trees.forget_before(round.saturating_sub(100));
+            assert!(trees.0[&cell(1)].len() <= 104);
+            assert_eq!(trees.parent(cell(1), round), Some(Some((round % 2).to_le_bytes()[0])));
+        }
+    }
+
+    proptest! {
+        /// Any two trees over cells that feel the same: nothing differs. And where one cell feels something else, that
+        /// cell alone differs.
+        #[test]
+        fn the_tree_leaves_no_trace(
+            felt in proptest::collection::vec(proptest::option::of([-60_i16..=60, -60..=60, -60..=60, -60..=60, -60..=60, -60..=60]), 1..40),
+            trees: [[u8; 40]; 2],
+            odd: (u8, i16),
+        ) {
+            let parents = |seeds: &[u8; 40]| -> Vec<u8> {
+                (0..felt.len()).map(|place| seeds[place] % u8::try_from(place + 1).unwrap()).collect()
+            };
+            let [then, today] = [parents(&trees[0]), parents(&trees[1])];
+            let recorded = sums(&felt, &then);
+            let all = outcomes(&recorded, &sums(&felt, &today), felt.len());
+            for (place, outcome) in all.iter().enumerate() {
+                let wanted = if felt[place].is_some() {
+                    matches!(outcome, Outcome::Equal)
+                } else {
+                    matches!(outcome, Outcome::Nothing | Outcome::Equal)
+                };
+                prop_assert!(wanted, "cell {}: {outcome:?}", place + 1);
+            }
+            let at = usize::from(odd.0) % felt.len();
+            let mut other = felt.clone();
+            if let (Some(words), true) = (&mut other[at], odd.1.unsigned_abs() > 1) {
+                words[3] = words[3].wrapping_add(odd.1 % 60 + 2 * odd.1.signum());
+                let again = outcomes(&recorded, &sums(&other, &today), felt.len());
+                for (place, outcome) in again.iter().enumerate() {
+                    prop_assert_eq!(*outcome == Outcome::Different, place == at, "cell {}", place + 1);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,65 @@
+//! How replies and recorded ones compare, in counts.
+
+use serde::Serialize;
+
+/// How replies and recorded ones compare.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct Tally {
+    /// Replies that came back as they were recorded.
+    pub equal: u64,
+    /// Replies that came back with other words.
+    pub different: u64,
+    /// Recorded replies that did not come back.
+    pub missing: u64,
+    /// Replies that were not recorded, and nothing says why.
+    pub extra: u64,
+    /// Recorded replies to joints that a bus did not take from this replay.
+    pub not_asked: u64,
+    /// Among the equal ones, sums less their children.
+    pub sums: u64,
+    /// What the recording itself lacks.
+    pub lacking: Lacking,
+}
+
+/// Replies that were not recorded, or not with their joints, by what the recording says of why.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct Lacking {
+    /// The cell was silent then: not there, killed, hung, or claiming its number.
+    pub silent: u64,
+    /// The cell did not take so many joints, by its own counters.
+    pub untaken: u64,
+    /// The cell sent more packets than were recorded, by its own counters.
+    pub unrecorded: u64,
+    /// The last joints of the recording: it ended before they were answered.
+    pub ended: u64,
+    /// The end of a contact, said later because the cell did not take the joints at which it was.
+    pub said_later: u64,
+    /// Recorded replies whose joints were not recorded.
+    pub joints_unrecorded: u64,
+    /// Recorded replies of cells that measured: what they felt was not recorded.
+    pub measured: u64,
+    /// Sums of cells that, or whose children, were changing their parent in that epoch, then or now.
+    pub parent_changing: u64,
+    /// Sums of epochs in which a cell had not said where its sums go, then or now.
+    pub tree_unknown: u64,
+    /// Sums that do not hold all their children's, then or now.
+    pub sums_not_taken: u64,
+}
+
+impl Tally {
+    /// Whether there are sums, and not one of them could be compared, because nothing tells whose children they hold.
+    #[must_use]
+    pub const fn lacks_the_tree(&self) -> bool {
+        self.sums == 0 && self.lacking.tree_unknown > 0
+    }
+
+    /// Whether all came back, and nothing else.
+    #[must_use]
+    pub const fn is_good(&self) -> bool {
+        self.different == 0
+            && self.missing == 0
+            && self.extra == 0
+            && self.not_asked == 0
+            && !self.lacks_the_tree()
+    }
+}
