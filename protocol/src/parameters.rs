@@ -98,6 +98,21 @@ impl Parameter {
         }
     }
 
+    /// Whether it is in force as soon as it is written, is not stored, and is forgotten by a start.
+    #[must_use]
+    pub const fn is_volatile(self) -> bool {
+        match self {
+            Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::Cuts => true,
+            Self::Identity
+            | Self::Mount
+            | Self::Pose
+            | Self::Contact
+            | Self::Timing
+            | Self::Row(_)
+            | Self::Commit => false,
+        }
+    }
+
     /// Its number.
     #[must_use]
     pub const fn number(self) -> u8 {
@@ -577,6 +592,9 @@ mod tests {
             }
         }
         assert_eq!(Parameter::from_number(22), None);
+        let volatile =
+            (0..=u8::MAX).filter(|&it| Parameter::from_number(it).is_some_and(Parameter::is_volatile));
+        assert!(volatile.eq(5..=9));
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! What is in force on a bus: the frames that somebody needs who begins in the middle.
 //!
-//! The last heartbeat of every cell, with the hash of its configuration; the stimuli that it feels and that wait
-//! for their epochs; the last joints, and whether cells were halted.
+//! The last heartbeat of every cell, with the hash of its configuration, and its place in the tree; what was switched
+//! at run time; the stimuli that it feels and that wait for their epochs; the last joints, and whether cells were
+//! halted.
 
 use std::collections::VecDeque;
 
@@ -34,6 +35,10 @@ type Packet = [Option<Seen>; 2];
 pub struct InForce {
     /// By node: the last heartbeat.
     heartbeats: Vec<Packet>,
+    /// By node: the last word on where its sums go.
+    trees: Vec<Packet>,
+    /// By node, everyone being the last, and parameter: the last write.
+    switches: Vec<[Packet; SWITCHES.len()]>,
     /// By node, everyone being the last: the last stimuli.
     stimuli: Vec<VecDeque<Packet>>,
     joints: Packet,
@@ -43,6 +48,13 @@ pub struct InForce {
     halves: Vec<(Half, Option<Seen>)>,
 }
 
+/// Parameters that are in force as soon as they are written, and are not stored: mode, reply, sensing, events, cuts.
+const SWITCHES: [u8; 5] = [5, 6, 7, 8, 9];
+/// Set in the count of a write.
+const WRITE: u8 = 0x80;
+/// The network page that tells where a cell's sums go.
+const TREE: u8 = 3;
+
 /// Where a packet's count stands, which tells pages and commands apart.
 const COUNT: usize = BYTES - 3;
 
@@ -50,6 +62,8 @@ impl Default for InForce {
     fn default() -> Self {
         Self {
             heartbeats: vec![[None; 2]; 256],
+            trees: vec![[None; 2]; 256],
+            switches: vec![[[None; 2]; SWITCHES.len()]; 256],
             stimuli: vec![VecDeque::new(); 256],
             joints: [None; 2],
             halt: [None; 2],
@@ -63,8 +77,8 @@ impl InForce {
     pub fn take(&mut self, seen: Seen) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         let wanted = match id.kind {
-            Kind::Command | Kind::Network | Kind::Stimulus => true,
-            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configure | Kind::Configured => false,
+            Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => true,
+            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
         };
         if !wanted {
             return;
@@ -95,6 +109,17 @@ impl InForce {
                     *last = packet;
                 }
             }
+            (Kind::Network, TREE) => {
+                if let Some(last) = self.trees.get_mut(node) {
+                    *last = packet;
+                }
+            }
+            (Kind::Configure, count) => {
+                let switch = SWITCHES.iter().position(|number| number | WRITE == count);
+                if let Some(last) = switch.and_then(|at| self.switches.get_mut(node)?.get_mut(at)) {
+                    *last = packet;
+                }
+            }
             // Only what touches the skin; its page may bear a flag.
             (Kind::Stimulus, count) if count & 0x7F == 0 => {
                 let Some(last) = self.stimuli.get_mut(node) else { return };
@@ -109,8 +134,8 @@ impl InForce {
 
     /// All of them, oldest first.
     pub fn frames(&self) -> Vec<Seen> {
-        let packets =
-            self.heartbeats.iter().chain(self.stimuli.iter().flatten()).chain([&self.joints, &self.halt]);
+        let cells = self.heartbeats.iter().chain(&self.trees).chain(self.switches.iter().flatten());
+        let packets = cells.chain(self.stimuli.iter().flatten()).chain([&self.joints, &self.halt]);
         let mut frames: Vec<_> = packets.flatten().flatten().copied().collect();
         // Halves of a packet may bear one time: they stay in order.
         frames.sort_by_key(|seen| seen.at_nanos);
@@ -123,8 +148,11 @@ mod tests {
     use super::*;
     use protocol::fixed::{Q1_14, Q5_10};
     use protocol::id::{CellId, Node};
-    use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors};
+    use protocol::message::{
+        From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, Tree,
+    };
     use protocol::packet::{Epoch, WORDS};
+    use protocol::parameters::Parameter;
 
     fn say(force: &mut InForce, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
         let frames: Vec<_> = message.encode().frames(format).collect();
@@ -153,8 +181,24 @@ mod tests {
             let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
             let cell = CellId::new(3).unwrap();
             say(&mut force, 1, format, &heartbeat(3, 1));
+            let write = |number, word| Message::Configure {
+                to: Node::Everyone,
+                tag: 0,
+                request: Request::Write { number, words: [word, 0, 0, 0, 0, 0] },
+            };
+            let tree = |parent| Message::Network {
+                from: Node::Cell(cell),
+                epoch: Epoch(0),
+                page: NetworkPage::Tree(Tree { parent: Some(parent), ..Tree::default() }),
+            };
+            say(&mut force, 1, format, &write(7, 1));
+            say(&mut force, 1, format, &write(1, 1));
+            say(&mut force, 1, format, &tree(4));
             say(&mut force, 2, format, &Message::Halt);
             let mut expected = vec![];
+            expected.extend(say(&mut force, 2, format, &tree(5)));
+            expected.extend(say(&mut force, 2, format, &write(7, 2)));
+            expected.extend(say(&mut force, 2, format, &write(9, 2)));
             expected.extend(say(&mut force, 3, format, &heartbeat(3, 2)));
             say(&mut force, 4, format, &Message::Joints { epoch: Epoch(1), joints });
             expected.extend(say(&mut force, 5, format, &stimulus(3, 1.0, 7)));
@@ -170,6 +214,12 @@ mod tests {
             let frames: Vec<_> = force.frames().iter().map(|seen| seen.frame).collect();
             assert_eq!(frames, expected, "{format:?}");
         }
+    }
+
+    #[test]
+    fn what_is_switched_is_what_is_not_stored() {
+        let volatile = |&number: &u8| Parameter::from_number(number).is_some_and(Parameter::is_volatile);
+        assert!((0..=u8::MAX).filter(volatile).eq(SWITCHES));
     }
 
     #[test]

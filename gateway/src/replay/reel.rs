@@ -18,7 +18,7 @@ use super::judge::Judge;
 use super::order::{Order, Ordered};
 use super::survey::{Survey, is_input, is_joints};
 use crate::decode::pick::Pick;
-use crate::decode::{Decoded, Decoder};
+use crate::decode::{Decoded, Decoder, wired};
 
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
@@ -256,6 +256,9 @@ impl<'a> Reel<'a> {
         if frame.is_error() {
             return Some(reason::ERROR);
         }
+        if wired(frame).is_some() {
+            return Some(reason::WIRE);
+        }
         let id = data_id(frame).ok();
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),
@@ -314,6 +317,8 @@ pub mod reason {
     pub const NO_REPLY: &str = "no reply";
     /// An error frame is a message of a driver, and was never on a bus.
     pub const ERROR: &str = "error frame";
+    /// Cells say over their wires what they have to say now; and wires are on no real bus.
+    pub const WIRE: &str = "simulated wire";
     /// Of a bus that the capture did not have when it was first read.
     pub const NEW: &str = "bus came later";
     /// What stands between frames.

@@ -7,6 +7,7 @@ use protocol::candump::Timestamp;
 use protocol::id::{CellId, Node};
 use protocol::message::From;
 use protocol::message::{SensorPage, SkinSensors};
+use protocol::wire;
 
 const MS: u64 = 1_000_000;
 
@@ -104,6 +105,20 @@ fn inputs_and_replies_are_the_two_sides() {
     let (replies, cut_of_replies) = cut(Part::default(), |selection| selection.only = Only::Replies, 1);
     assert_eq!(shown(&replies), [(0, 0, 0x201), (4, 1, 0x202)], "the first one begins");
     assert_eq!(cut_of_replies.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_REPLY, 5)]));
+}
+
+#[test]
+fn what_cells_said_over_their_wires_is_never_sent() {
+    let survey = Survey::new(Part::default());
+    for only in [Only::All, Only::Inputs, Only::Replies] {
+        let selection = Selection { only, pick: Pick::default(), lanes: vec![Some(0)], reads: true };
+        let reel = Reel::new(&survey, &selection);
+        let frame = wire::Lane { wire: 9, back: false }.frame(wire::PortMessage::Join);
+        assert_eq!(reel.unwanted(0, &frame), Some(reason::WIRE));
+        // Damaged it proves nothing, and is somebody else's.
+        let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
+        assert_ne!(reel.unwanted(0, &other), Some(reason::WIRE));
+    }
 }
 
 #[test]
