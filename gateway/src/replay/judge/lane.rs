@@ -34,9 +34,12 @@ impl Present {
     }
 }
 
-/// Sums and trees of the capture stand before those of now.
-pub(super) const RECORDED: usize = 0;
-pub(super) const NOW: usize = 1;
+/// Something of the capture, and the same of now.
+#[derive(Debug, Default)]
+pub(super) struct Both<T> {
+    pub(super) recorded: T,
+    pub(super) now: T,
+}
 
 /// Joints as they were announced.
 #[derive(Clone, Copy, Debug)]
@@ -72,7 +75,7 @@ pub(super) struct Round {
     pub(super) fate: Fate,
     pub(super) replies: BTreeMap<(CellId, What), Pair>,
     /// Sums, recorded and now.
-    pub(super) sums: [Sums; 2],
+    pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were asked last.
     pub(super) asked_as: Epoch,
 }
@@ -80,7 +83,7 @@ pub(super) struct Round {
 impl Round {
     pub(super) fn new(epoch: Epoch, nanos: u64) -> Self {
         let (fate, asked_as) = (Fate::Waiting, epoch);
-        Self { epoch, nanos, fate, replies: BTreeMap::new(), sums: Default::default(), asked_as }
+        Self { epoch, nanos, fate, replies: BTreeMap::new(), sums: Both::default(), asked_as }
     }
 }
 
@@ -115,7 +118,7 @@ pub(super) struct Lane {
     pub(super) base: u64,
     pub(super) rounds: VecDeque<Round>,
     /// Whose children cells are, recorded and now.
-    pub(super) trees: [Trees; 2],
+    pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
     /// Rounds that were announced.
     pub(super) sent: u64,
@@ -136,7 +139,7 @@ impl Lane {
             recorded: vec![None; 256],
             base: 0,
             rounds: VecDeque::new(),
-            trees: Default::default(),
+            trees: Both::default(),
             answers: BTreeMap::new(),
             sent: 0,
             last_round: None,
@@ -166,13 +169,13 @@ impl Lane {
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
         let last = self.recorded.get(usize::from(epoch.0)).copied().flatten();
-        self.trees[RECORDED].say(cell, parent, last.map_or(next, |last| last + 1));
+        self.trees.recorded.say(cell, parent, last.map_or(next, |last| last + 1));
     }
 
     /// The same as it says now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.asked.get(usize::from(epoch.0)).copied().flatten().and_then(|asked| asked.round);
-        self.trees[NOW].say(cell, parent, last.map_or(self.sent, |last| last + 1));
+        self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
     pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {

@@ -22,7 +22,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
 
 pub use lane::Present;
-use lane::{Answers, Asked, Fate, Lane, NOW, Pair, RECORDED, Round, excuse_extra};
+use lane::{Answers, Asked, Both, Fate, Lane, Pair, Round, excuse_extra};
 pub use sums::Own;
 use sums::{Outcome, Side, Sum, Why, compare};
 pub use tally::{Lacking, Tally};
@@ -105,7 +105,7 @@ impl Judge {
                 let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
                 let has_rounds = !lane.rounds.is_empty();
                 match number.and_then(|number| lane.round(number)) {
-                    Some(round) => round.sums[RECORDED].take(from, Sum { torque, count }),
+                    Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
                     None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
                     None => {}
                 }
@@ -167,7 +167,7 @@ impl Judge {
         if let Some(round) = it.round(number) {
             round.fate = Fate::Sent;
             // Asked again, all cells say their sums again.
-            round.sums[NOW].clear();
+            round.sums.now.clear();
             round.asked_as = epoch;
         }
         while self.lanes.get(lane).is_some_and(|lane| lane.base + WINDOW < number) {
@@ -231,7 +231,7 @@ impl Judge {
         let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
         let round = asked.and_then(|asked| asked.round).and_then(|number| lane.round(number));
         if let Some(round) = round.filter(|round| round.asked_as == epoch) {
-            round.sums[NOW].take(cell, sum);
+            round.sums.now.take(cell, sum);
         }
     }
 
@@ -302,13 +302,13 @@ impl Judge {
             is_there(cell) && *what == What::Torque && pair.recorded.is_some() && pair.now.is_none()
         };
         let torques = round.replies.iter().filter(misses).count();
-        let [then, now] = &round.sums;
+        let Both { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;
         }
-        let then = Side::new(then, &lane.trees[RECORDED], number);
+        let then = Side::new(then, &lane.trees.recorded, number);
         let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.feels(*cell);
-        torques + round.sums[RECORDED].cells().filter(misses).count()
+        torques + round.sums.recorded.cells().filter(misses).count()
     }
 
     /// Takes in that a bus is down, so that nobody on it is waited for; it ends with the next message.
@@ -431,27 +431,28 @@ impl Judge {
             };
             self.note(index, how, cell, at, said);
         }
-        if round.sums.iter().any(|sums| !sums.is_empty()) {
+        if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
             self.close_sums(index, number, &round);
         }
         if let Some(lane) = self.lanes.get_mut(index) {
-            lane.trees.iter_mut().for_each(|trees| trees.forget_before(number));
+            lane.trees.recorded.forget_before(number);
+            lane.trees.now.forget_before(number);
         }
     }
 
     /// Compares what each cell itself put into its sums of a round.
     fn close_sums(&mut self, index: usize, number: u64, round: &Round) {
         let Some(lane) = self.lanes.get_mut(index) else { return };
-        let side = |of: usize| Side::new(&round.sums[of], &lane.trees[of], number);
-        let (then, now) = (side(RECORDED), side(NOW));
-        let cells: BTreeSet<_> = round.sums.iter().flat_map(|sums| sums.cells()).collect();
+        let then = Side::new(&round.sums.recorded, &lane.trees.recorded, number);
+        let now = Side::new(&round.sums.now, &lane.trees.now, number);
+        let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
         let is_last = lane.last_round == Some(number);
         let mut notes = Vec::new();
         for cell in cells {
             let excuse = lane.excuses.get_mut(&cell);
             let Tally { different, missing, extra, not_asked, lacking, .. } = &mut self.tally;
             if excuse.as_ref().is_some_and(|excuse| excuse.cell.measured) {
-                lacking.measured += u64::from(round.sums[RECORDED].has(cell));
+                lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
             let (count, how) = match compare(&then, &now, cell) {

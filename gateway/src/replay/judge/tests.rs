@@ -338,10 +338,12 @@ fn who_changes_its_parent_is_left_out_in_that_epoch_and_counted() {
     // After joints 2: from joints 3 on it is a root.
     now.insert(at, tree(3, 2, Some(0)));
     for message in &mut now[at..] {
-        match *message {
-            Message::Sum { from, epoch, .. } if from.get() == 1 => *message = sum(1, epoch.0, 10, 1),
-            Message::Sum { from, .. } if from.get() == 2 => *message = Message::Sync,
-            _ => {}
+        if let Message::Sum { from, epoch, .. } = *message {
+            *message = match from.get() {
+                1 => sum(1, epoch.0, 10, 1),
+                2 => Message::Sync,
+                _ => *message,
+            };
         }
     }
     let judge = judged(&row(), &now);
