@@ -661,6 +661,8 @@ fn wires_bytes_and_meaning_agree_both_ways() {
     }
     assert!(kinds.into_iter().eq(1..=11), "every kind is there");
     assert_eq!(odd, 4, "frames that nobody should write so");
+    let hello = lines(WIRE).into_iter().find(|golden| golden.comment.contains("number=7")).unwrap();
+    assert!(PROTOCOL_MD.contains(hello.text), "the document's hello is {}", hello.text);
 }
 
 /// The document's arithmetic of Algorithm 1, on its own example: 3 N on a cell with
