@@ -418,6 +418,22 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
 
 #[test]
 #[ignore = "needs Kvaser controllers"]
+fn wires_are_not_simulated_on_a_real_bus() {
+    let controllers = Controllers::up();
+    assert!(!open("can0", &options(&[])).unwrap().is_virtual().unwrap());
+    let place = Place::new();
+    let (reply, format) = (gateway::generate::Reply::Sum, Generated::Classic);
+    let text = generate(&Wanted { cells: CELLS, reply, format, ..Wanted::default() }).unwrap();
+    place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
+    let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");
+    let said = "cell-node: can0 is real hardware, and cells that answer with sums simulate their wires by frames that \
+                may not go there: use a vcan or the embedded bus, or reply = \"torque\"";
+    assert_eq!(cell.end().refusal(2), said);
+    drop(controllers);
+}
+
+#[test]
+#[ignore = "needs Kvaser controllers"]
 fn error_frames_of_the_driver_are_counted() {
     let (place, controllers) = (Place::on_vcan(), Controllers::up());
     prepare(&place, "can1", "can0");

@@ -70,6 +70,7 @@ fn the_kernel_changes_filters_of_an_open_socket() {
     other.send(&[frame(1), frame(2), frame(LAST)]).unwrap();
     let ids: Vec<_> = read(&client, &mut Inbox::new()).iter().map(Frame::id).collect();
     assert_eq!(ids, [1, 2]);
+    assert!(client.is_virtual().unwrap());
 }
 
 #[test]
