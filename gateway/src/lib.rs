@@ -2,6 +2,7 @@
 
 pub mod capture;
 pub mod central;
+pub mod commission;
 pub mod controller;
 pub mod cycle;
 pub mod dbc;
@@ -9,6 +10,7 @@ pub mod decode;
 pub mod explain;
 pub mod external;
 pub mod generate;
+pub mod listing;
 pub mod network;
 pub mod record;
 pub mod replay;

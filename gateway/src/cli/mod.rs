@@ -2,6 +2,8 @@
 //! 1 (the run failed) and 2 (wrong use or configuration).
 
 mod ack;
+mod cells;
+mod commission;
 mod convert;
 mod dbc;
 mod dump;
@@ -38,6 +40,8 @@ enum Command {
     Convert(convert::Convert),
     Replay(replay::Replay),
     Frame(frame::Frame),
+    Commission(commission::Commission),
+    Cells(cells::Cells),
     Ack(ack::Ack),
     Skin(skin::Skin),
     Dbc(dbc::Dbc),
@@ -54,6 +58,8 @@ impl Command {
             Self::Convert(command) => command.run(),
             Self::Replay(command) => command.run(),
             Self::Frame(command) => command.run(),
+            Self::Commission(command) => command.run(),
+            Self::Cells(command) => command.run(),
             Self::Ack(command) => command.run(),
             Self::Skin(command) => command.run(),
             Self::Dbc(command) => command.run(),

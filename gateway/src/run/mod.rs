@@ -17,7 +17,7 @@ pub mod file;
 mod io;
 pub mod launch;
 mod measured;
-mod progress;
+pub mod progress;
 pub mod realtime;
 pub mod receiver;
 mod start;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
 /// Writes a line on standard error in one piece, for the cells write there too.
-pub(super) fn say(line: &str) {
+pub fn say(line: &str) {
     write_piece(&format!("{line}\n"));
 }
 
@@ -18,7 +18,7 @@ fn write_piece(text: &str) {
 
 /// The progress line, on standard error.
 #[derive(Debug)]
-pub(super) struct Progress {
+pub struct Progress {
     terminal: bool,
     quiet: bool,
     due: Instant,
@@ -26,12 +26,14 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    pub(super) fn new(quiet: bool) -> Self {
+    /// A line that has not been shown yet; never will be if `quiet`.
+    #[must_use]
+    pub fn new(quiet: bool) -> Self {
         Self { terminal: std::io::stderr().is_terminal(), quiet, due: Instant::now(), shown: false }
     }
 
     /// Shows the line when its time has come.
-    pub(super) fn show(&mut self, line: impl FnOnce() -> String) {
+    pub fn show(&mut self, line: impl FnOnce() -> String) {
         let now = Instant::now();
         if self.quiet || now < self.due {
             return;
@@ -42,7 +44,7 @@ impl Progress {
     }
 
     /// Writes something above the line.
-    pub(super) fn note(&mut self, text: &str) {
+    pub fn note(&mut self, text: &str) {
         if self.quiet {
             return;
         }
@@ -51,7 +53,7 @@ impl Progress {
     }
 
     /// Takes the line away.
-    pub(super) fn clear(&mut self) {
+    pub fn clear(&mut self) {
         if self.terminal && self.shown {
             write_piece("\r\x1b[2K");
             self.shown = false;

@@ -1,0 +1,105 @@
+//! A copy of a description with the numbers that cells have on their buses.
+
+use std::collections::BTreeMap;
+
+use protocol::id::CellId;
+use protocol::skin::Skin;
+use thiserror::Error;
+use toml_edit::{DocumentMut, Item, Table, Value, value};
+
+/// Why there is no copy.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum NumbersError {
+    /// Not all cells of a bus have shown their numbers.
+    #[error("{missing} of the {cells} cells on {bus} were not heard, so their numbers are not known")]
+    Missing {
+        /// The bus.
+        bus: String,
+        /// Cells that were not heard.
+        missing: usize,
+        /// Cells of the bus.
+        cells: usize,
+    },
+    /// The file is no longer what was read.
+    #[error("the description's text is not that of the skin that was read: {0}")]
+    Text(String),
+}
+
+/// The numbers that cells have, by serial number; `None` of those that were not heard.
+pub type Numbers = BTreeMap<u32, Option<CellId>>;
+
+/// The text of a description with other numbers, and everything else as it was: comments, order, what is left out.
+/// Cells that `numbers` does not have keep theirs. Neighbors are renumbered with the cells.
+///
+/// # Errors
+/// When a number is not known, or the text is not the skin's.
+pub fn renumbered(skin: &Skin, text: &str, numbers: &Numbers) -> Result<String, NumbersError> {
+    for (bus, described) in skin.buses.iter().enumerate() {
+        let here = || skin.cells_of(bus).filter_map(|cell| numbers.get(&cell.serial));
+        let missing = here().filter(|number| number.is_none()).count();
+        if missing > 0 {
+            return Err(NumbersError::Missing {
+                bus: described.name.clone(),
+                missing,
+                cells: here().count(),
+            });
+        }
+    }
+    let number = |serial: u32, own: CellId| numbers.get(&serial).copied().flatten().unwrap_or(own);
+    // What each cell is called now, by its bus and its number in the file.
+    let renamed: BTreeMap<_, _> =
+        skin.cells.iter().map(|cell| ((cell.bus, cell.node), number(cell.serial, cell.node))).collect();
+    let not_the_text = |why: String| NumbersError::Text(why);
+    let mut document: DocumentMut =
+        text.parse().map_err(|error: toml_edit::TomlError| not_the_text(error.to_string()))?;
+    let cells = document.get_mut("cell").and_then(Item::as_array_of_tables_mut);
+    let cells = cells.ok_or_else(|| not_the_text("its cells are not [[cell]] tables".to_owned()))?;
+    if cells.len() != skin.cells.len() {
+        return Err(not_the_text(format!("{} cells, not {}", cells.len(), skin.cells.len())));
+    }
+    for (table, cell) in cells.iter_mut().zip(&skin.cells) {
+        let new = number(cell.serial, cell.node);
+        if new != cell.node {
+            // A serial number that is left out would follow the number.
+            if !table.contains_key("serial") {
+                put_after_node(table, i64::from(cell.serial));
+            }
+            set(table.get_mut("node"), new);
+        }
+        let ports = table.get_mut("neighbors").and_then(Item::as_array_mut);
+        for (port, neighbor) in ports.into_iter().flat_map(|ports| ports.iter_mut()).zip(cell.neighbors) {
+            let renamed = neighbor.and_then(|neighbor| renamed.get(&(cell.bus, neighbor)));
+            if let (Some(&renamed), Some(neighbor)) = (renamed, neighbor)
+                && renamed != neighbor
+            {
+                *port = keep_decor(port, renamed);
+            }
+        }
+    }
+    Ok(document.to_string())
+}
+
+/// Puts a number in the place of another, with the white space and the comment that stand around that.
+fn set(item: Option<&mut Item>, number: CellId) {
+    if let Some(old) = item.and_then(Item::as_value_mut) {
+        *old = keep_decor(old, number);
+    }
+}
+
+fn keep_decor(old: &Value, number: CellId) -> Value {
+    let mut new = Value::from(i64::from(number.get()));
+    *new.decor_mut() = old.decor().clone();
+    new
+}
+
+/// A serial number right after the node, where people look for it.
+fn put_after_node(table: &mut Table, serial: i64) {
+    let keys: Vec<String> = table.iter().map(|(key, _)| key.to_owned()).collect();
+    table.insert("serial", value(serial));
+    let order = |key: &str| match key {
+        "serial" => keys.iter().position(|key| key == "node").map(|place| 2 * place + 1),
+        key => keys.iter().position(|other| other == key).map(|place| 2 * place),
+    };
+    table.sort_values_by(|one, _, other, _| order(one.get()).cmp(&order(other.get())));
+}

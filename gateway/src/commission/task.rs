@@ -1,0 +1,337 @@
+//! What one cell still needs, and what it was asked last.
+
+use protocol::id::CellId;
+use protocol::message::{Answer, Heartbeat, State, VERSION};
+use protocol::packet::WORDS;
+use protocol::parameters::{Parameter, Parameters};
+use protocol::time::{Micros, Span};
+
+use super::outcome::{Ask, Outcome, Reason};
+
+/// How long an answer may take at first, and at most after it did not come; a commit writes flash, which takes longer.
+const ANSWER: Span = Span::from_millis(100);
+const COMMIT: Span = Span::from_millis(400);
+const LONGEST: Span = Span::from_millis(800);
+/// How often a cell is asked the same before it is given up.
+const TRIES: u8 = 6;
+/// How often a cell is written anew, after it was switched off and on in the middle.
+const ROUNDS: u8 = 6;
+/// How long a cell that has started or fallen out may take to settle.
+pub(super) const SETTLING: Span = Span::from_millis(3_000);
+/// How long a heartbeat with the right hash may be missing after everything was read back.
+const BEAT: Span = Span::from_millis(2_000);
+
+/// How far a cell is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Stage {
+    /// It was not heard yet.
+    Missing,
+    /// It needs some parameters, then a commit.
+    Write,
+    /// It has committed, or had the right hash; what it has is to be compared.
+    Read,
+    /// A heartbeat is to bear the right hash; since when.
+    Beat(Micros),
+    /// Nothing is left to do.
+    Done(Outcome),
+}
+
+/// A request whose answer is awaited.
+#[derive(Clone, Copy, Debug)]
+struct Asked {
+    ask: Ask,
+    tag: u8,
+    tries: u8,
+    due: Micros,
+}
+
+/// A cell of the description.
+#[derive(Debug)]
+pub(super) struct Task {
+    /// Its serial number, by which it is known.
+    pub(super) serial: u32,
+    /// Its number in the description.
+    pub(super) described: CellId,
+    /// Its number on the bus.
+    pub(super) number: Option<CellId>,
+    /// How far it is.
+    pub(super) stage: Stage,
+    wanted: Parameters,
+    hash: u16,
+    /// Whether this commissioning has changed, or would change, what it computes with.
+    touched: bool,
+    /// Bit i: the stored parameter i is staged, or reads back right.
+    written: u16,
+    read: u16,
+    asked: Option<Asked>,
+    tag: u8,
+    rounds: u8,
+    /// The number that it had before this one.
+    before: Option<CellId>,
+    /// Since when it cannot be asked, because it claims its number or has lost it.
+    pub(super) unsettled: Option<Micros>,
+    said_hash: u16,
+}
+
+/// What may be done to cells that have another configuration, or the right one.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Wish {
+    /// Nothing is written.
+    pub dry_run: bool,
+    /// Cells that have the right hash are read back too.
+    pub verify: bool,
+}
+
+const fn bit(place: usize) -> u16 {
+    1 << place
+}
+
+const ALL: u16 = (1 << Parameter::STORED.len()) - 1;
+
+fn place(parameter: Parameter) -> Option<usize> {
+    Parameter::STORED.iter().position(|&stored| stored == parameter)
+}
+
+fn first_missing(mask: u16) -> Option<Parameter> {
+    let mut stored = Parameter::STORED.iter().enumerate();
+    stored.find(|(place, _)| mask & bit(*place) == 0).map(|(_, &parameter)| parameter)
+}
+
+impl Task {
+    pub(super) fn new(serial: u32, described: CellId, wanted: Parameters) -> Self {
+        Self {
+            serial,
+            described,
+            number: None,
+            stage: Stage::Missing,
+            wanted,
+            hash: wanted.hash(),
+            touched: false,
+            written: 0,
+            read: 0,
+            asked: None,
+            tag: 0,
+            rounds: 0,
+            before: None,
+            unsettled: None,
+            said_hash: 0,
+        }
+    }
+
+    /// The words of a parameter as the cell should have them.
+    pub(super) fn words(&self, parameter: Parameter) -> [i16; WORDS] {
+        if parameter == Parameter::Commit {
+            return [self.hash.cast_signed(), 0, 0, 0, 0, 0];
+        }
+        self.wanted.words(parameter)
+    }
+
+    pub(super) const fn is_done(&self) -> bool {
+        matches!(self.stage, Stage::Done(_))
+    }
+
+    pub(super) const fn is_asked(&self) -> bool {
+        self.asked.is_some()
+    }
+
+    /// Whether it waits for this of a request to everyone.
+    pub(super) fn needs(&self, ask: Ask) -> bool {
+        let missing = |mask| place(ask.parameter()).is_some_and(|place| mask & bit(place) == 0);
+        let can = self.number.is_some() && self.unsettled.is_none() && self.asked.is_none();
+        can && match ask {
+            Ask::Write(_) => self.stage == Stage::Write && missing(self.written),
+            Ask::Read(_) => self.stage == Stage::Read && missing(self.read),
+            Ask::Commit => false,
+        }
+    }
+
+    /// Takes a heartbeat that came under a number.
+    pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: Wish) {
+        if let Some(old) = self.number.filter(|&old| old != number) {
+            // One change is a cell that was given another number; two cells come back.
+            if self.before == Some(number) {
+                return self.fail(Reason::Twins(old.min(number), old.max(number)));
+            }
+            self.before = Some(old);
+            self.start_anew();
+        }
+        self.number = Some(number);
+        self.said_hash = heartbeat.configuration;
+        let version = heartbeat.state.version();
+        if version != u16::from(VERSION) {
+            return self.fail(Reason::Version { got: version });
+        }
+        if heartbeat.state.has(State::CLAIMING) {
+            self.unsettled = Some(now);
+            return self.start_anew();
+        }
+        self.unsettled = None;
+        match self.stage {
+            Stage::Missing => self.place(wish),
+            Stage::Beat(_) if self.said_hash == self.hash => self.finish(),
+            Stage::Write | Stage::Read | Stage::Beat(_) | Stage::Done(_) => {}
+        }
+    }
+
+    /// It was switched on, or has another number now: what it had staged is gone, what it has in flash is seen
+    /// when it has settled.
+    fn start_anew(&mut self) {
+        self.asked = None;
+        (self.written, self.read) = (0, 0);
+        if matches!(self.stage, Stage::Write | Stage::Read | Stage::Beat(_)) {
+            self.stage = Stage::Missing;
+        }
+    }
+
+    /// It is there and has settled: what does it need?
+    fn place(&mut self, wish: Wish) {
+        let has_it = self.said_hash == self.hash;
+        self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
+            (true, _, true) => Stage::Read,
+            (true, _, false) => Stage::Done(Outcome::AlreadySo),
+            (false, true, _) => Stage::Done(Outcome::WouldWrite),
+            (false, false, _) => Stage::Write,
+        };
+    }
+
+    /// Another cell has its number now.
+    pub(super) fn lose_number(&mut self, now: Micros) {
+        self.number = None;
+        self.unsettled.get_or_insert(now);
+        self.start_anew();
+    }
+
+    pub(super) fn fail(&mut self, reason: Reason) {
+        if !matches!(self.stage, Stage::Done(Outcome::Failed(_))) {
+            self.asked = None;
+            self.stage = Stage::Done(Outcome::Failed(reason));
+        }
+    }
+
+    fn finish(&mut self) {
+        self.stage = Stage::Done(if self.touched { Outcome::Written } else { Outcome::Verified });
+    }
+
+    /// Asks the next thing, if there is one and nothing is asked; returns it with its tag.
+    pub(super) fn ask(&mut self, now: Micros) -> Option<(Ask, u8)> {
+        if self.asked.is_some() || self.unsettled.is_some() || self.number.is_none() {
+            return None;
+        }
+        let ask = match self.stage {
+            Stage::Write => first_missing(self.written).map_or(Ask::Commit, Ask::Write),
+            Stage::Read => Ask::Read(first_missing(self.read)?),
+            Stage::Missing | Stage::Beat(_) | Stage::Done(_) => return None,
+        };
+        // The upper half of the tags is that of requests to everyone.
+        self.tag = self.tag.wrapping_add(1) & 0x7F;
+        // What a commit that is not answered leads to is in use all the same.
+        self.touched |= ask == Ask::Commit;
+        self.asked = Some(Asked { ask, tag: self.tag, tries: 1, due: now + patience(ask, 1) });
+        Some((ask, self.tag))
+    }
+
+    /// Asks again what was not answered in time; gives up after some times, and what never settles too.
+    pub(super) fn time(&mut self, now: Micros) -> Option<(Ask, u8)> {
+        if self.unsettled.is_some_and(|since| now.since(since) >= SETTLING) && !self.is_done() {
+            self.fail(Reason::Gone);
+        }
+        if let Stage::Beat(since) = self.stage
+            && now.since(since) >= BEAT
+        {
+            self.fail(Reason::Hash { wanted: self.hash, got: self.said_hash });
+        }
+        let asked = self.asked.as_mut().filter(|asked| asked.due <= now)?;
+        let Asked { ask, tag, tries, .. } = *asked;
+        if tries == TRIES {
+            self.fail(Reason::Silent { ask, tries });
+            return None;
+        }
+        asked.tries += 1;
+        asked.due = now + patience(ask, asked.tries);
+        Some((ask, tag))
+    }
+
+    /// When [`Task::time`] has something to do.
+    pub(super) fn due(&self) -> Option<Micros> {
+        let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLING);
+        let beat = if let Stage::Beat(since) = self.stage { Some(since + BEAT) } else { None };
+        [self.asked.map(|asked| asked.due), settled, beat].into_iter().flatten().min()
+    }
+
+    /// Takes an answer: to what it was asked itself, or to `call`, which everyone was.
+    pub(super) fn answer(
+        &mut self,
+        now: Micros,
+        tag: u8,
+        answer: Answer,
+        call: Option<(Ask, u8)>,
+        wish: Wish,
+    ) {
+        let own = self.asked.filter(|asked| asked.tag == tag).map(|asked| asked.ask);
+        let called = call.filter(|&(ask, called)| called == tag && self.needs(ask)).map(|(ask, _)| ask);
+        let Some(ask) = own.or(called) else { return };
+        let parameter = ask.parameter();
+        let is_write = !matches!(ask, Ask::Read(_));
+        match answer {
+            Answer::Refused { number, reason } if number == parameter.number() => {
+                self.asked = None;
+                if ask == Ask::Commit && reason == Answer::WRONG_HASH {
+                    // It was switched off and on in the middle, and nobody heard it.
+                    return self.again(Reason::Refused { ask, code: reason });
+                }
+                self.fail(Reason::Refused { ask, code: reason });
+            }
+            Answer::Value { number, written, words }
+                if number == parameter.number() && written == is_write =>
+            {
+                self.asked = None;
+                let wanted = self.words(parameter);
+                if words == wanted {
+                    return self.is_right(now, ask);
+                }
+                let differs = Reason::Differs { ask, wanted, got: words };
+                if is_write {
+                    self.fail(differs);
+                } else if wish.dry_run {
+                    self.stage = Stage::Done(Outcome::WouldWrite);
+                } else {
+                    self.again(differs);
+                }
+            }
+            // Of another request that had this tag.
+            Answer::Value { .. } | Answer::Refused { .. } => {}
+        }
+    }
+
+    fn is_right(&mut self, now: Micros, ask: Ask) {
+        let bit = place(ask.parameter()).map_or(0, bit);
+        match ask {
+            Ask::Write(_) => self.written |= bit,
+            Ask::Commit => (self.stage, self.read) = (Stage::Read, 0),
+            Ask::Read(_) => {
+                self.read |= bit;
+                if self.read == ALL {
+                    self.stage = Stage::Beat(now);
+                    // A heartbeat may have said it meanwhile.
+                    if self.said_hash == self.hash {
+                        self.finish();
+                    }
+                }
+            }
+        }
+    }
+
+    /// Begins at the beginning, unless it has too often.
+    fn again(&mut self, why: Reason) {
+        self.rounds += 1;
+        if self.rounds > ROUNDS {
+            return self.fail(why);
+        }
+        (self.written, self.read, self.stage) = (0, 0, Stage::Write);
+    }
+}
+
+fn patience(ask: Ask, tries: u8) -> Span {
+    let first = if ask == Ask::Commit { COMMIT } else { ANSWER };
+    Span((first.0 << (tries - 1)).min(LONGEST.0))
+}

@@ -1,0 +1,199 @@
+//! What the cells of a bus say of themselves, and nothing else: what a cell has not said is not there.
+
+use std::collections::BTreeMap;
+
+use protocol::can::Format;
+use protocol::id::Node;
+use protocol::message::{Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Tree};
+use protocol::time::{Micros, Span};
+
+/// What one cell has said.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Cell {
+    /// Who it is and how it is.
+    pub heartbeat: Option<Heartbeat>,
+    /// What became of what it heard.
+    pub heard: Option<Heard>,
+    /// What it refused.
+    pub refused: Option<Refused>,
+    /// Its place in the tree.
+    pub tree: Option<Tree>,
+    /// What its ports lead to.
+    pub ports: Option<Ports>,
+    /// The serial number that spoke under this number before the present one.
+    pub other: Option<u32>,
+    /// When it said its last word.
+    last: Micros,
+}
+
+impl Cell {
+    /// How long ago its last word was.
+    #[must_use]
+    pub const fn age(&self, now: Micros) -> Span {
+        now.since(self.last)
+    }
+}
+
+/// All that was heard on a bus.
+#[derive(Clone, Debug, Default)]
+pub struct Listing {
+    cells: BTreeMap<u8, Cell>,
+    gateway: bool,
+    format: Option<Format>,
+}
+
+impl Listing {
+    /// Nothing heard yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Takes a message, which came in frames of this format.
+    pub fn hear(&mut self, now: Micros, format: Format, message: &Message) {
+        let from = match *message {
+            Message::Network { from: Node::Cell(cell), .. }
+            | Message::Torque { from: cell, .. }
+            | Message::Sum { from: cell, .. }
+            | Message::Sensors { from: cell, .. }
+            | Message::Configured { from: cell, .. } => cell,
+            Message::Joints { .. } | Message::Network { .. } => {
+                self.gateway = true;
+                return;
+            }
+            Message::Halt
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Configure { .. }
+            | Message::Stimulus { .. } => return,
+        };
+        self.format.get_or_insert(format);
+        let cell = self.cells.entry(from.get()).or_default();
+        cell.last = now;
+        if let Message::Network { page, .. } = message {
+            cell.says(page);
+        }
+    }
+
+    /// The cells, by number.
+    pub fn cells(&self) -> impl ExactSizeIterator<Item = (u8, &Cell)> {
+        self.cells.iter().map(|(&number, cell)| (number, cell))
+    }
+
+    /// Whether a gateway was heard.
+    #[must_use]
+    pub const fn has_gateway(&self) -> bool {
+        self.gateway
+    }
+
+    /// What the first cell that was heard sends its packets in.
+    #[must_use]
+    pub const fn format(&self) -> Option<Format> {
+        self.format
+    }
+
+    /// Whether a cell with this serial number was heard, and under which number.
+    #[must_use]
+    pub fn number_of(&self, serial: u32) -> Option<u8> {
+        let is = |cell: &Cell| cell.heartbeat.is_some_and(|heartbeat| heartbeat.serial == serial);
+        self.cells.iter().find(|(_, cell)| is(cell)).map(|(&number, _)| number)
+    }
+}
+
+impl Cell {
+    fn says(&mut self, page: &NetworkPage) {
+        match *page {
+            NetworkPage::Heartbeat(heartbeat) => {
+                let before = self.heartbeat.map(|before| before.serial);
+                if let Some(before) = before.filter(|&before| before != heartbeat.serial) {
+                    // Whatever is known is the other's.
+                    *self = Self { other: Some(before), last: self.last, ..Self::default() };
+                }
+                self.heartbeat = Some(heartbeat);
+            }
+            NetworkPage::Heard(heard) => self.heard = Some(heard),
+            NetworkPage::Refused(refused) => self.refused = Some(refused),
+            NetworkPage::Tree(tree) => self.tree = Some(tree),
+            NetworkPage::Ports(ports) => self.ports = Some(ports),
+        }
+    }
+}
+
+/// A cell's parent, for people: a number, `gateway`, or `none`.
+#[must_use]
+pub fn parent(tree: &Tree) -> String {
+    match tree.parent {
+        None => "none".to_owned(),
+        Some(0) => "gateway".to_owned(),
+        Some(number) => number.to_string(),
+    }
+}
+
+/// What the ports lead to, for people: numbers, `?` after one that does not hear back, `0` for a cell without a
+/// number, `.` where nothing is heard.
+#[must_use]
+pub fn ports(ports: &Ports) -> String {
+    let port = |port: &protocol::message::PortState| match (port.hears, port.works, port.other_version) {
+        (false, _, _) => ".".to_owned(),
+        (true, _, true) => format!("{}!", port.number),
+        (true, false, false) => format!("{}?", port.number),
+        (true, true, false) => port.number.to_string(),
+    };
+    ports.ports.iter().map(port).collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::id::CellId;
+    use protocol::message::{PortState, State};
+    use protocol::packet::Epoch;
+
+    fn says(number: i64, page: NetworkPage) -> Message {
+        Message::Network { from: Node::Cell(CellId::new(number).unwrap()), epoch: Epoch(0), page }
+    }
+
+    #[test]
+    fn only_what_a_cell_has_said_is_known_of_it() {
+        let mut listing = Listing::new();
+        let heartbeat = Heartbeat { serial: 7, state: State(0x1101), ..Heartbeat::default() };
+        listing.hear(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
+        listing.hear(Micros(20), Format::Classic, &says(4, NetworkPage::Refused(Refused::default())));
+        let cells: Vec<_> = listing.cells().collect();
+        let [(3, third), (4, fourth)] = cells.as_slice() else { panic!("{cells:?}") };
+        assert_eq!((third.heartbeat, third.refused, third.tree), (Some(heartbeat), None, None));
+        assert_eq!((fourth.heartbeat, fourth.refused), (None, Some(Refused::default())));
+        assert_eq!(
+            (third.age(Micros(110)), listing.number_of(7), listing.number_of(8)),
+            (Span(100), Some(3), None)
+        );
+        assert_eq!((listing.format(), listing.has_gateway()), (Some(Format::Classic), false));
+    }
+
+    #[test]
+    fn another_cell_under_a_number_has_nothing_of_the_one_before_it() {
+        let mut listing = Listing::new();
+        let of = |serial| NetworkPage::Heartbeat(Heartbeat { serial, ..Heartbeat::default() });
+        for page in [of(7), NetworkPage::Heard(Heard::default()), of(8)] {
+            listing.hear(Micros(0), Format::Fd, &says(3, page));
+        }
+        let (_, cell) = listing.cells().next().unwrap();
+        assert_eq!((cell.other, cell.heard), (Some(7), None));
+    }
+
+    #[test]
+    fn places_in_the_tree_are_words() {
+        let tree = |parent| parent_of(Tree { parent, ..Tree::default() });
+        assert_eq!([tree(None), tree(Some(0)), tree(Some(12))], ["none", "gateway", "12"]);
+        let heard = PortState { number: 12, hears: true, ..PortState::default() };
+        let works = PortState { works: true, ..heard };
+        let other = PortState { other_version: true, ..works };
+        let all = Ports { ports: [PortState::default(), heard, works, other], changes: 0 };
+        assert_eq!(ports(&all), ". 12? 12 12!");
+    }
+
+    fn parent_of(tree: Tree) -> String {
+        parent(&tree)
+    }
+}
