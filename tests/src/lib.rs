@@ -20,3 +20,4 @@ pub mod gateway;
 pub mod seat;
 pub mod skins;
 pub mod witness;
+pub mod workshop;

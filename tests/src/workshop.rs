@@ -1,0 +1,334 @@
+//! Where cells are commissioned in virtual time: real [`Node`]s, a bus that loses, repeats and damages by seeded
+//! chance, and a hand that switches cells, and the commissioning, off and on.
+
+use std::collections::BTreeMap;
+
+use cell_node::node::{Flash, Identity, Node};
+use gateway::commission::{Commission, Report, Wish};
+use gateway::decode::{Decoded, Decoder};
+use protocol::can::{Format, Frame};
+use protocol::id::CellId;
+use protocol::message::Message;
+use protocol::packet::Packet;
+use protocol::parameters::Parameters;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+/// From the wire to a receiver, at least and at most.
+const LATENCY: (u64, u64) = (40, 300);
+/// No commissioning takes longer.
+const PATIENCE: Span = Span::from_millis(60_000);
+
+/// One cell on the bench of the workshop.
+#[derive(Debug)]
+pub struct Piece {
+    /// Who it is.
+    pub identity: Identity,
+    /// What its flash holds.
+    pub flash: Flash,
+    /// Everything that its flash has ever held, the first first.
+    pub history: Vec<Flash>,
+    /// Its flash cannot be written.
+    pub worn: bool,
+    node: Option<Node>,
+    /// When the newest frame comes in: none overtakes another.
+    newest: Micros,
+}
+
+impl Piece {
+    /// The cell, while it is on.
+    #[must_use]
+    pub const fn node(&self) -> Option<&Node> {
+        self.node.as_ref()
+    }
+}
+
+/// What happens at a time.
+#[derive(Clone, Copy, Debug)]
+enum Event {
+    ToCell(usize, Frame),
+    ToGateway(Frame),
+    Off(usize),
+    On(usize),
+}
+
+/// Turns packets into others on their way: for cells that lie, and for damage that no CRC notices.
+pub type Forger = fn(Packet) -> Packet;
+
+/// The workshop.
+#[derive(Debug)]
+pub struct Workshop {
+    /// The cells.
+    pub pieces: Vec<Piece>,
+    /// A frame is lost, comes twice, or has a bit turned, by these chances.
+    pub loss: f64,
+    /// See `loss`.
+    pub twice: f64,
+    /// See `loss`.
+    pub damage: f64,
+    /// What becomes of packets to cells, and of those from cells.
+    pub forgers: Option<(Forger, Forger)>,
+    /// Messages that cells and the gateway's side said.
+    pub said: u64,
+    now: Micros,
+    format: Format,
+    events: BTreeMap<(Micros, u64), Event>,
+    scheduled: u64,
+    gateway_newest: Micros,
+    dice: Pcg64Mcg,
+}
+
+impl Workshop {
+    /// An empty one.
+    #[must_use]
+    pub fn new(format: Format, seed: u64) -> Self {
+        Self {
+            pieces: Vec::new(),
+            loss: 0.0,
+            twice: 0.0,
+            damage: 0.0,
+            forgers: None,
+            said: 0,
+            now: Micros(0),
+            format,
+            events: BTreeMap::new(),
+            scheduled: 0,
+            gateway_newest: Micros(0),
+            dice: Pcg64Mcg::seed_from_u64(seed),
+        }
+    }
+
+    /// One with a skin's cells, switched on now, with what `flash` says they have.
+    #[must_use]
+    pub fn of(skin: &Skin, seed: u64, flash: impl Fn(usize) -> Flash) -> Self {
+        let mut workshop = Self::new(skin.buses.first().map_or(Format::Fd, |bus| bus.format), seed);
+        for (place, cell) in skin.cells.iter().enumerate() {
+            workshop.add(Identity { cell: Some(cell.node), serial: cell.serial }, flash(place));
+        }
+        workshop
+    }
+
+    /// One more cell, switched on now; its place.
+    pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
+        let place = self.pieces.len();
+        let (history, newest) = (vec![flash], Micros(0));
+        self.pieces.push(Piece { identity, flash, history, worn: false, node: None, newest });
+        self.switch_on(place);
+        place
+    }
+
+    /// What time it is.
+    #[must_use]
+    pub const fn now(&self) -> Micros {
+        self.now
+    }
+
+    /// A whole number below `bound`, by chance.
+    pub fn chance(&mut self, bound: u64) -> u64 {
+        self.dice.random_range(0..bound)
+    }
+
+    /// Switches a cell off in a while.
+    pub fn switch_off_in(&mut self, span: Span, place: usize) {
+        self.schedule(self.now + span, Event::Off(place));
+    }
+
+    /// Switches a cell on in a while; off before, if it is on.
+    pub fn switch_on_in(&mut self, span: Span, place: usize) {
+        self.schedule(self.now + span, Event::On(place));
+    }
+
+    fn schedule(&mut self, at: Micros, event: Event) {
+        self.scheduled += 1;
+        self.events.insert((at.max(self.now), self.scheduled), event);
+    }
+
+    fn switch_on(&mut self, place: usize) {
+        let (now, format) = (self.now, self.format);
+        if let Some(piece) = self.pieces.get_mut(place) {
+            piece.node = Some(Node::new(piece.identity, format, &piece.flash, true, now));
+        }
+    }
+
+    /// Lets cells be for some time, with nobody who commissions them.
+    pub fn rest(&mut self, span: Span) {
+        let until = self.now + span;
+        while let Some(at) = self.next().filter(|&at| at <= until) {
+            self.step(at, &mut |_, _| {});
+        }
+        self.now = until;
+    }
+
+    /// Commissions until it is over, or is killed after a time.
+    ///
+    /// # Panics
+    /// When it does not end.
+    pub fn commission(&mut self, skin: &Skin, wish: Wish, killed_after: Option<Span>) -> Report {
+        let mut commission = Commission::new(skin, 0, wish, 1_000, self.now);
+        let mut decoder = Decoder::new(Some(self.format));
+        let (began, end) = (self.now, killed_after.map(|span| self.now + span));
+        loop {
+            commission.handle_time(self.now);
+            while let Some(message) = commission.poll_transmit() {
+                self.say(&message);
+            }
+            let Some(timeout) = commission.poll_timeout() else { return commission.report() };
+            let at = timeout.min(self.next().unwrap_or(timeout)).max(self.now);
+            if let Some(end) = end.filter(|&end| end <= at) {
+                self.now = end;
+                return commission.report();
+            }
+            assert!(at.since(began) < PATIENCE, "it does not end: {commission:#?}");
+            self.step(at, &mut |now, frame| {
+                if let Decoded::Message(message) = decoder.decode(now, "bus", &frame) {
+                    commission.handle_message(now, &message);
+                }
+            });
+        }
+    }
+
+    /// When something happens next.
+    fn next(&self) -> Option<Micros> {
+        let timers = self.pieces.iter().filter_map(|piece| Some(piece.node.as_ref()?.poll_timeout()));
+        timers.chain(self.events.keys().next().map(|(at, _)| *at)).min()
+    }
+
+    fn step(&mut self, at: Micros, gateway: &mut impl FnMut(Micros, Frame)) {
+        self.now = at.max(self.now);
+        let now = self.now;
+        while let Some(entry) = self.events.first_entry().filter(|entry| entry.key().0 <= now) {
+            match entry.remove() {
+                Event::ToGateway(frame) => gateway(now, frame),
+                Event::ToCell(place, frame) => {
+                    let node = self.pieces.get_mut(place).and_then(|piece| piece.node.as_mut());
+                    if let Some(node) = node {
+                        node.handle_frame(now, Span(0), &frame);
+                        self.collect(place);
+                    }
+                }
+                Event::Off(place) => {
+                    self.pieces.get_mut(place).into_iter().for_each(|piece| piece.node = None)
+                }
+                Event::On(place) => self.switch_on(place),
+            }
+        }
+        for place in 0..self.pieces.len() {
+            let node = self.pieces.get_mut(place).and_then(|piece| piece.node.as_mut());
+            if let Some(node) = node.filter(|node| node.poll_timeout() <= now) {
+                node.handle_timeout(now);
+                self.collect(place);
+            }
+        }
+    }
+
+    /// Writes what a cell has for flash, and takes what it says.
+    fn collect(&mut self, place: usize) {
+        let Some(piece) = self.pieces.get_mut(place) else { return };
+        let Some(node) = piece.node.as_mut() else { return };
+        if let Some(kept) = node.poll_store() {
+            if !piece.worn {
+                piece.flash = kept.parameters.map_or(Flash::Empty, Flash::Sound);
+                piece.history.push(piece.flash);
+            }
+            node.handle_stored(!piece.worn);
+        }
+        let packets: Vec<_> = core::iter::from_fn(|| node.poll_transmit()).collect();
+        if node.taken().is_some() {
+            piece.node = None;
+        }
+        let forge = self.forgers.map(|(_, from)| from);
+        for packet in packets {
+            let packet = forge.map_or(packet, |forge| forge(packet));
+            for frame in packet.frames(self.format) {
+                self.pass(frame, Some(place));
+            }
+        }
+    }
+
+    /// Somebody on the gateway's side says something to the cells.
+    pub fn say(&mut self, message: &Message) {
+        let packet = message.encode();
+        let packet = self.forgers.map_or(packet, |(to, _)| to(packet));
+        for frame in packet.frames(self.format) {
+            self.pass(frame, None);
+        }
+    }
+
+    /// Somebody else on the bus says something, which the gateway's side hears too.
+    pub fn overhear(&mut self, message: &Message) {
+        for frame in message.encode().frames(self.format) {
+            self.pass(frame, Some(usize::MAX));
+        }
+    }
+
+    /// From one to all that hear it, each by its own chances.
+    fn pass(&mut self, frame: Frame, from: Option<usize>) {
+        self.said += 1;
+        let id = frame.id();
+        let hears = |piece: &Piece| {
+            let node = piece.node.as_ref();
+            node.is_some_and(|node| node.hears().any(|heard| u32::from(heard.to_bits()) == id))
+        };
+        let all = self.pieces.iter().enumerate();
+        let hearers: Vec<_> = all.filter(|(_, piece)| hears(piece)).map(|(place, _)| place).collect();
+        for place in hearers.into_iter().filter(|place| from != Some(*place)) {
+            for frame in self.fate(frame) {
+                let at = self.arrival(self.pieces.get(place).map(|piece| piece.newest));
+                self.pieces.get_mut(place).into_iter().for_each(|piece| piece.newest = at);
+                self.schedule(at, Event::ToCell(place, frame));
+            }
+        }
+        if from.is_some() {
+            for frame in self.fate(frame) {
+                self.gateway_newest = self.arrival(Some(self.gateway_newest));
+                self.schedule(self.gateway_newest, Event::ToGateway(frame));
+            }
+        }
+    }
+
+    fn arrival(&mut self, newest: Option<Micros>) -> Micros {
+        let at = self.now + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        newest.map_or(at, |newest| at.max(newest))
+    }
+
+    /// What comes of a frame at one receiver.
+    fn fate(&mut self, frame: Frame) -> Vec<Frame> {
+        if self.dice.random_bool(self.loss) {
+            return Vec::new();
+        }
+        let mut frames = vec![frame; if self.dice.random_bool(self.twice) { 2 } else { 1 }];
+        for frame in &mut frames {
+            if self.dice.random_bool(self.damage) {
+                *frame = damaged(*frame, self.dice.random_range(0..64));
+            }
+        }
+        frames
+    }
+
+    /// The cells whose flash holds exactly this.
+    #[must_use]
+    pub fn holding(&self, wanted: impl Fn(usize) -> Parameters) -> usize {
+        let holds = |(place, piece): &(usize, &Piece)| piece.flash == Flash::Sound(wanted(*place));
+        self.pieces.iter().enumerate().filter(holds).count()
+    }
+}
+
+/// The same frame with a bit of its data turned.
+fn damaged(frame: Frame, bit: usize) -> Frame {
+    let mut data = frame.data().to_vec();
+    if let Some(byte) = data.get_mut(bit / 8) {
+        *byte ^= 1 << (bit % 8);
+    }
+    Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), &data).unwrap_or(frame)
+}
+
+/// A cell's number that a test names.
+///
+/// # Panics
+/// When there is none.
+#[must_use]
+pub fn cell(number: u8) -> CellId {
+    CellId::new(number.into()).expect("a cell's number")
+}
