@@ -38,7 +38,7 @@ pub use task::Wish;
 /// How long a bus is listened to before anything is said: two gateways notice each other in this time.
 pub const LISTEN: Span = Span::from_millis(500);
 /// How long cells may stay away after the last one showed up.
-const SHOWING: Span = Span::from_millis(2_000);
+const SHOWING: Span = Span::from_millis(3_000);
 /// Cells that are asked by themselves at the same time.
 const WINDOW: usize = 16;
 /// How long nobody may answer a request to everyone before it is over, and what remains is asked of each.
@@ -188,6 +188,12 @@ impl Commission {
         self.phase == Phase::Over
     }
 
+    /// Whether something may be said on the bus: not while it is only listened to, and not in a dry run.
+    #[must_use]
+    pub const fn speaks(&self) -> bool {
+        !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run
+    }
+
     /// Takes what somebody else said on the bus; [`Commission::handle_time`] says what that leads to.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         match *message {
@@ -299,8 +305,7 @@ impl Commission {
         while let Some(next) = self.turn(now) {
             self.phase = next;
         }
-        let speaks = !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run;
-        if speaks && self.announced.is_none_or(|at| now.since(at) >= ANNOUNCE) {
+        if self.speaks() && self.announced.is_none_or(|at| now.since(at) >= ANNOUNCE) {
             self.announced = Some(now);
             let heartbeat = Heartbeat { state: State::default().with_joint(0), ..Heartbeat::default() };
             let page = NetworkPage::Heartbeat(heartbeat);

@@ -117,6 +117,7 @@ impl BusShown {
         let cells = format!("{} cells described", self.cells.len());
         let others = match self.strangers.len() {
             0 => String::new(),
+            1 => "1 other, left alone".to_owned(),
             count => format!("{count} others, left alone"),
         };
         rows.section(format!("{} ({})", self.name, self.kind), cells, others);
@@ -219,7 +220,8 @@ impl Whole {
     pub(super) fn end(&self) -> Result<(), Failure> {
         let sum = |part: fn(&BusShown) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));
-        let what = format!("{failed} of {cells} cells are not commissioned");
+        let are = if failed == 1 { "is" } else { "are" };
+        let what = format!("{failed} of {cells} cells {are} not commissioned");
         if let Some(failure) = self.buses.iter().find_map(|bus| bus.failure.as_deref()) {
             return Err(Failure::run(format!("{failure}; {what}")));
         }

@@ -6,11 +6,14 @@ use std::time::{Duration, Instant};
 
 use gateway::commission::{Commission, Progress, Report, Wish};
 use gateway::decode::{Decoded, Decoder};
+use gateway::network::Uplinks;
 use protocol::bus::{Bus, BusError, Choice, Filter, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
-use protocol::can::{Format, Frame};
-use protocol::id::{Command, Id, Kind};
-use protocol::skin::Skin;
+use protocol::can::{EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
+use protocol::id::{Command, Id, Kind, Node};
+use protocol::message::Message;
+use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
+use protocol::wire::Lane;
 
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
@@ -25,6 +28,8 @@ pub(super) struct Bench {
     index: usize,
     bus: Arc<Bus>,
     format: Format,
+    /// Where this side speaks to the roots of a network, whose cells may have no numbers yet.
+    roots: Vec<Lane>,
 }
 
 /// What became of a bus.
@@ -41,19 +46,28 @@ pub(super) struct Done {
 
 /// Opens a bus of a skin.
 pub(super) fn open(skin: &Skin, index: usize, kind: Choice) -> Result<Bench, BusError> {
-    let (name, format) =
-        skin.buses.get(index).map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
+    let described = skin.buses.get(index);
+    let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
+    let sums = described.is_some_and(|bus| matches!(bus.reply, Reply::Sum { .. }));
+    let mut roots: Vec<_> = skin.wires(index).roots().map(|(_, lane)| lane).filter(|_| sums).collect();
     let of_kind =
         |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(of_kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
+    let wire = |lane: &Lane| Filter { id: lane.reversed().raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE };
+    filters.extend(roots.iter().map(wire));
     let options = Options {
         filters,
         fd: format == Format::Fd,
         receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
         ..Options::default()
     };
-    Ok(Bench { index, bus: Arc::new(Bus::open(name, kind, &options)?), format })
+    let bus = Bus::open(name, kind, &options)?;
+    if !roots.is_empty() && !bus.is_virtual()? {
+        // Simulated wires have no place among real cells, which have real ones.
+        roots.clear();
+    }
+    Ok(Bench { index, bus: Arc::new(bus), format, roots })
 }
 
 impl Bench {
@@ -98,30 +112,83 @@ impl Bench {
         mut tell: impl FnMut(Progress),
     ) -> Result<(), BusError> {
         let mut decoder = Decoder::new(Some(self.format));
+        let mut network = Network::new(&self.roots, clock());
         loop {
             if stopped.load(Ordering::Relaxed) {
                 commission.stop();
             }
             commission.handle_time(clock());
             tell(commission.progress());
+            if commission.speaks() {
+                let frames = network.frames(clock());
+                passing(self.bus.send(&frames).map_err(BusError::from))?;
+            }
             while let Some(message) = commission.poll_transmit() {
                 let frames: Vec<Frame> = message.encode().frames(self.format).collect();
                 // What was not sent is not answered, and is sent again.
                 passing(self.bus.send(&frames).map_err(BusError::from))?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
+            let next = if commission.speaks() { next.min(network.due()) } else { next };
             let wait = Duration::from_micros(next.since(clock()).0).min(LOOK);
             if passing(self.bus.wait(Some(wait)))?.unwrap_or(false) {
                 passing(self.bus.receive(inbox))?;
                 for received in inbox.frames() {
                     let at = Micros(received.at_nanos / 1_000);
                     if let Decoded::Message(message) = decoder.decode(at, self.bus.name(), &received.frame) {
+                        network.hear(&message);
                         commission.handle_message(clock(), &message);
+                    } else {
+                        network.take(clock(), &received.frame);
                     }
                 }
                 inbox.clear();
             }
         }
+    }
+}
+
+/// This side's ends of the wires to the roots: cells without numbers get theirs from here.
+struct Network<'a> {
+    roots: &'a [Lane],
+    uplinks: Uplinks,
+}
+
+impl<'a> Network<'a> {
+    fn new(roots: &'a [Lane], now: Micros) -> Self {
+        // Another number than that of the walks of whoever was here before.
+        let walk = std::process::id().to_le_bytes()[0].wrapping_mul(37);
+        Self { roots, uplinks: Uplinks::new(roots.len(), walk, now) }
+    }
+
+    /// Somebody with a number speaks.
+    fn hear(&mut self, message: &Message) {
+        if let Message::Network { from: Node::Cell(cell), .. } = message {
+            self.uplinks.claimed(*cell);
+        }
+    }
+
+    fn take(&mut self, now: Micros, frame: &Frame) {
+        for (root, lane) in self.roots.iter().enumerate() {
+            if let Some(message) = lane.reversed().read(frame) {
+                self.uplinks.handle(now, root, message);
+            }
+        }
+    }
+
+    /// What is to be said to the roots now.
+    fn frames(&mut self, now: Micros) -> Vec<Frame> {
+        if self.roots.is_empty() {
+            return Vec::new();
+        }
+        self.uplinks.handle_time(now);
+        let (uplinks, roots) = (&mut self.uplinks, self.roots);
+        let said = std::iter::from_fn(|| uplinks.poll_transmit());
+        said.filter_map(|(root, message)| Some(roots.get(root)?.frame(message))).collect()
+    }
+
+    fn due(&self) -> Micros {
+        if self.roots.is_empty() { Micros(u64::MAX) } else { self.uplinks.poll_timeout() }
     }
 }
 
