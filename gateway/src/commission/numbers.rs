@@ -103,3 +103,90 @@ fn put_after_node(table: &mut Table, serial: i64) {
     };
     table.sort_values_by(|one, _, other, _| order(one.get()).cmp(&order(other.get())));
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generate::{Wanted, generate};
+
+    fn cell(number: u8) -> CellId {
+        CellId::new(number.into()).unwrap()
+    }
+
+    /// Three cells in a row; the second one's serial number is left out, which makes it 2.
+    const CELLS: &str = r#"
+[[cell]]
+bus = "vcan0"
+serial = 7
+node   = 1   # at the elbow
+joint = 1
+position = [0.0, 0.0, 0.1]
+orientation = [0.0, 0.0, 0.0, 1.0]
+neighbors = [2, 0, 0, 0] # a cable
+
+# The next one was replaced.
+[[cell]]
+bus = "vcan0"
+node = 2
+joint = 1
+position = [0.0, 0.1, 0.1]
+orientation = [0.0, 0.0, 0.0, 1.0]
+neighbors = [0, 1, 3, 0]
+
+[[cell]]
+bus = "vcan0"
+node = 3
+serial = 9
+joint = 1
+position = [0.0, 0.1, 0.2]
+orientation = [0.0, 0.0, 0.0, 1.0]
+neighbors = [2, 0, 0, 0]
+"#;
+
+    fn text() -> String {
+        let text = generate(&Wanted { cells: 3, ..Wanted::default() }).unwrap();
+        let (head, _) = text.split_once("\n[[cell]]").unwrap();
+        format!("{head}{CELLS}")
+    }
+
+    #[test]
+    fn numbers_and_neighbors_change_and_nothing_else_does() {
+        let text = text();
+        let skin = Skin::parse("skin.toml", &text).unwrap();
+        let numbers = Numbers::from([(7, Some(cell(2))), (2, Some(cell(50))), (9, Some(cell(3)))]);
+        let expected = text
+            .replace("node   = 1   # at the elbow", "node   = 2   # at the elbow")
+            .replace("neighbors = [2, 0, 0, 0] # a cable", "neighbors = [50, 0, 0, 0] # a cable")
+            .replace("node = 2\njoint", "node = 50\nserial = 2\njoint")
+            .replace("neighbors = [0, 1, 3, 0]", "neighbors = [0, 2, 3, 0]")
+            .replace(
+                "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [2,",
+                "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [50,",
+            );
+        let copy = renumbered(&skin, &text, &numbers).unwrap();
+        assert_eq!(copy, expected);
+        // The same cells by their serial numbers, wired as before.
+        let copied = Skin::parse("copy.toml", &copy).unwrap();
+        for (old, new) in skin.cells.iter().zip(&copied.cells) {
+            assert_eq!((old.serial, numbers[&old.serial]), (new.serial, Some(new.node)));
+            assert_eq!(skin.parameters(old), copied.parameters(new));
+        }
+    }
+
+    #[test]
+    fn the_numbers_that_are_there_already_change_nothing() {
+        let text = text();
+        let skin = Skin::parse("skin.toml", &text).unwrap();
+        let numbers = skin.cells.iter().map(|cell| (cell.serial, Some(cell.node))).collect();
+        assert_eq!(renumbered(&skin, &text, &numbers).unwrap(), text);
+    }
+
+    #[test]
+    fn a_cell_that_was_not_heard_has_no_number_to_be_written() {
+        let text = text();
+        let skin = Skin::parse("skin.toml", &text).unwrap();
+        let numbers = Numbers::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
+        let said = renumbered(&skin, &text, &numbers).unwrap_err().to_string();
+        assert_eq!(said, "1 of the 3 cells on vcan0 were not heard, so their numbers are not known");
+    }
+}

@@ -147,7 +147,7 @@ impl BusShown {
         }
         let moved = self.moved().count();
         if moved > 0 {
-            rows.row("under another number", moved, "--numbers writes a description with theirs");
+            rows.row("under another number", moved, "than in the description; --numbers writes a copy");
         }
         if self.requests > 0 {
             rows.row("requests", self.requests, format!("{} said again", self.repeated));
