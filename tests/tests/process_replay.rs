@@ -75,6 +75,21 @@ fn a_recording_brings_its_own_skin() {
 }
 
 #[test]
+fn the_second_file_of_a_recording_begins_with_what_was_in_force() {
+    let place = Place::new();
+    place.skin(5);
+    place.scenario(process::PRESSED);
+    place.bench(2.5, "--record run.mcap --record-split 1s").end().well();
+    let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --max"));
+    let first = first.all_came_back(&ended);
+    let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --max"));
+    // It was pressed in the first file, and is felt in the second.
+    let second = second.all_came_back(&ended);
+    assert!(first > 30 && second > 30, "{first} and {second}");
+    place.is_left_clean();
+}
+
+#[test]
 fn two_buses_of_classic_frames_come_back_too() {
     let place = Place::new();
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));

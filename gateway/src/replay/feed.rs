@@ -38,7 +38,14 @@ impl Source {
             if if pass == 0 { self.restores.0 } else { self.restores.1 } {
                 self.push(&mut queue, reel.restoring());
             }
-            self.hall.judge().record_begin();
+            let mut judge = self.hall.judge();
+            judge.record_begin();
+            for (bus, lane) in self.survey.buses.iter().zip(&self.selection.lanes) {
+                let in_force =
+                    lane.iter().flat_map(|lane| bus.in_force.iter().map(|message| (*lane, message)));
+                in_force.for_each(|(lane, message)| judge.record(lane, message, false));
+            }
+            drop(judge);
             self.pass(path, &mut reel, &mut queue)?;
             pass = pass.saturating_add(1);
         }

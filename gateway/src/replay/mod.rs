@@ -170,6 +170,10 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
     let name = options.file.display();
     let mut reader = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
     let mut survey = Survey::new(options.part);
+    // What was in force stands before the first frame, and is known when that is read.
+    let mut beginning = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
+    beginning.next().map_err(failed)?;
+    survey.begin(&beginning.extras().in_force);
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(failed)? {
         match entry {

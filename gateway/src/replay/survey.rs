@@ -12,6 +12,7 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::state::State;
+use crate::capture::InForce;
 use crate::decode::{Decoded, Decoder};
 
 /// A cell that says nothing for so long is not there, in ns.
@@ -58,6 +59,8 @@ pub struct Bus {
     pub joints: u64,
     /// Of these, those that were under way when somebody last asked for a report.
     at_report: u64,
+    /// What was said before the capture began and is in force at its beginning, as it has it.
+    pub in_force: Vec<Message>,
     /// The state in force where the part begins.
     pub state: State,
     /// The first joints in the part.
@@ -108,6 +111,18 @@ impl Survey {
     pub const fn new(part: Part) -> Self {
         let decoder = Decoder::new(None);
         Self { part, first: None, last: 0, frames: 0, dropped: 0, buses: Vec::new(), decoder }
+    }
+
+    /// Takes what was in force when the capture began, before its first frame.
+    pub fn begin(&mut self, in_force: &[InForce]) {
+        let mut decoder = Decoder::new(None);
+        for InForce { bus, frame, nanos } in in_force {
+            if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
+                let bus = self.bus(bus);
+                bus.state.take(&message);
+                bus.in_force.push(message);
+            }
+        }
     }
 
     /// Takes the next frame.
@@ -187,6 +202,7 @@ impl Bus {
             format: None,
             joints: 0,
             at_report: 0,
+            in_force: Vec::new(),
             state: State::default(),
             first_joints: None,
             sums: 0,

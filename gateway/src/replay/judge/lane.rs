@@ -120,6 +120,8 @@ pub(super) struct Lane {
     /// Whose children cells are, recorded and now.
     pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
+    /// Whether somebody had cells say what they feel without being asked: then that comes at times of their own.
+    pub(super) senses: bool,
     /// Rounds that were announced.
     pub(super) sent: u64,
     /// The round after which the capture has no more joints.
@@ -141,6 +143,7 @@ impl Lane {
             rounds: VecDeque::new(),
             trees: Both::default(),
             answers: BTreeMap::new(),
+            senses: false,
             sent: 0,
             last_round: None,
             is_down: false,

@@ -17,9 +17,9 @@ mod tally;
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Message, NetworkPage, SensorPage, State as Flags};
+use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State as Flags};
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::Parameter;
+use protocol::parameters::{Parameter, Sensing};
 
 pub use lane::Present;
 use lane::{Answers, Asked, Both, Fate, Lane, Pair, Round, excuse_extra};
@@ -109,6 +109,11 @@ impl Judge {
                     None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
                     None => {}
                 }
+            }
+            Message::Configure { request: Request::Write { number, words }, .. }
+                if number == Parameter::Sensing.number() =>
+            {
+                lane.senses |= Sensing::from_words(words).is_some_and(|sensing| sensing != Sensing::Off);
             }
             Message::Halt
             | Message::Joints { .. }
@@ -404,6 +409,10 @@ impl Judge {
                     }
                     self.tally.different += 1;
                     How::Different
+                }
+                (Some(_), None) if what != What::Torque && lane.senses => {
+                    self.tally.lacking.sensed_otherwise += 1;
+                    continue;
                 }
                 (Some(_), None) if round.fate == Fate::Unsent => {
                     self.tally.not_asked += 1;

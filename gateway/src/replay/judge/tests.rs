@@ -218,6 +218,31 @@ fn a_cell_that_measured_is_not_compared() {
 }
 
 #[test]
+fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
+    let says = |bits| {
+        let contact = [protocol::fixed::Q5_10::from_bits(bits); 3];
+        let skin = protocol::message::SkinSensors { contact, ..Default::default() };
+        Message::Sensors { from: cell(1), epoch: Epoch(3), page: SensorPage::Skin(skin) }
+    };
+    let at = run().len() - 1;
+    let mut recording = run();
+    recording.insert(at, says(5));
+    let judge = judged(&recording, &run());
+    assert_eq!(counts(&judge), [3, 0, 1, 0], "somebody had asked for it");
+    let request = Request::Write { number: 7, words: [2, 0, 0, 0, 0, 0] };
+    recording.insert(0, Message::Configure { to: Node::Everyone, tag: 0, request });
+    let judge = judged(&recording, &run());
+    assert_eq!((counts(&judge), judge.tally.lacking.sensed_otherwise), ([3, 0, 0, 0], 1));
+    let mut now = run();
+    now.insert(at, says(6));
+    assert_eq!(
+        counts(&judged(&recording, &now)),
+        [3, 1, 0, 0],
+        "but what is said at the same joints is compared"
+    );
+}
+
+#[test]
 fn joints_that_a_bus_did_not_take_have_no_answer() {
     let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
     judge.mute(false);
