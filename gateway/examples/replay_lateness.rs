@@ -11,7 +11,7 @@ use gateway::replay::player::Pace;
 use gateway::replay::reel::Only;
 use gateway::replay::survey::Part;
 use gateway::replay::{Options, replay};
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options as BusOptions};
+use protocol::bus::{Bus, BusKind, Choice, Inbox, Kinds, Options as BusOptions};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
 
@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for spin in [0, 20, 50, 100, 150, 300] {
         let options = Options {
             file: file.clone(),
-            kind,
+            kinds: Kinds::all(kind),
             only: Only::All,
             pick: gateway::decode::pick::Pick::default(),
             buses: Vec::new(),

@@ -38,6 +38,9 @@ pub struct Input {
     pub contributing: u32,
     /// Whether the torque may be used.
     pub valid: bool,
+    /// Buses that are lost, whose cells are not in the torque, or fade from it: bit n is bus n of the skin, bit 31
+    /// stands for all from there on.
+    pub missing: u32,
     /// Whether the robot is halted: nothing that a controller asks for is done.
     pub halted: bool,
 }

@@ -2,25 +2,31 @@
 //! comes out.
 //!
 //! ```text
-//!   Tick, Sums ──────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
+//!   Tick, Heard ─────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
 //!                                   ├─> Outcome::command > a halt or a resume for every bus
 //!                                   └─> Record ──────────> what this tick was like
 //! ```
 //!
+//! A bus that is lost is lost alone: what its cells said last counts less and less ([`carried`]), and the loop goes on
+//! with the others.
+//!
 //! A tick allocates nothing, takes no lock, writes no log, and its work does not grow with the cells,
 //! unless it computes centrally beside them ([`Cycle::central`]).
+
+pub mod carried;
 
 use protocol::fixed::Q1_14;
 use protocol::id::Command;
 use protocol::message::Joints;
 use protocol::packet::{Epoch, WORDS};
-use protocol::skin::Skin;
+use protocol::skin::{LostBus, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::central::{Central, Felt};
 use crate::controller::{BadCycle, Controller, Input, Step};
 use crate::robot::{Moved, Robot};
-use crate::table::{Snapshot, Sums};
+use crate::table::Snapshot;
+use carried::{Carried, Heard, bit};
 
 /// When a tick is.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -63,6 +69,8 @@ pub struct Record {
     pub stale: u32,
     /// Cells that have fallen silent.
     pub dead: u32,
+    /// Buses that are lost: bit n is bus n of the skin, bit 31 stands for all from there on.
+    pub missing: u32,
     /// Why the cycle was bad, if it was.
     pub bad: Option<BadCycle>,
     /// Why the robot is halted, if it is.
@@ -93,9 +101,9 @@ pub struct Cycle {
     joints: Joints,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
-    bad_limit: u32,
-    /// Broadcasts that may be on their way before the bus counts as broken.
-    unread_limit: u64,
+    safety: Safety,
+    /// How far each bus has carried the broadcasts.
+    carried: Vec<Carried>,
     epoch: Epoch,
     broadcasts: u64,
     /// The last broadcast's place in the schedule.
@@ -127,8 +135,8 @@ impl Cycle {
             joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use },
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
-            bad_limit: skin.safety.bad_cycles,
-            unread_limit: u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1),
+            safety: skin.safety,
+            carried: vec![Carried::default(); skin.buses.len()],
             epoch: Epoch(255),
             broadcasts: 0,
             slot: None,
@@ -162,34 +170,51 @@ impl Cycle {
         self.broadcasts
     }
 
-    /// One tick; `skipped` ticks before it did not happen, and `valid` says whether the buses work. It is
-    /// given sums and no cells, so its work cannot grow with them.
+    /// One tick; `skipped` ticks before it did not happen. It is given the buses' sums, in the skin's order, and no
+    /// cells, so its work cannot grow with them.
     pub fn tick<'a>(
         &mut self,
         tick: Tick,
         skipped: u64,
-        buses: impl IntoIterator<Item = &'a Sums>,
-        valid: bool,
+        buses: impl IntoIterator<Item = Heard<'a>>,
     ) -> Outcome {
         let mut input = Input {
             tick: tick.number,
             time: tick.time,
             q: self.robot.positions(),
             qdot: self.robot.velocities(),
-            valid,
             ..Input::default()
         };
         let (mut stale, mut dead, mut halts, mut resumes) = (0, 0, 0, 0);
-        for bus in buses {
-            for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
-                *sum += torque;
+        let mut some_bus_works = false;
+        for (index, (Heard { sums: bus, works }, carried)) in
+            buses.into_iter().zip(&mut self.carried).enumerate()
+        {
+            let missed = carried.missed(bus.read_back, self.epoch, self.broadcasts);
+            if works && !carried::is_lost(missed, &self.safety) {
+                some_bus_works = true;
+            } else {
+                input.missing |= bit(index);
             }
-            input.valid &= self.is_read_back(bus.read_back);
-            input.contributing += bus.contributing;
-            input.age = input.age.max(bus.age);
-            (stale, dead) = (stale + bus.stale, dead + bus.dead);
+            let part = carried::part(missed, &self.safety);
+            if part > 0.0 {
+                for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
+                    *sum += part * torque;
+                }
+                input.contributing += bus.contributing;
+                stale += bus.stale;
+                if bus.contributing > 0 {
+                    let more = u32::try_from(missed).unwrap_or(u32::MAX);
+                    input.age = input.age.max(bus.age.saturating_add(more));
+                }
+            }
+            dead += bus.dead;
             (halts, resumes) = (halts + bus.halts, resumes + bus.resumes);
         }
+        input.valid = match self.safety.lost_bus {
+            LostBus::GoOn => some_bus_works,
+            LostBus::Halt => input.missing == 0,
+        };
         let heard = self.obey(halts, resumes);
         input.halted = self.halted.is_some();
 
@@ -207,7 +232,7 @@ impl Cycle {
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
         let (joints, broadcasts_skipped) = self.broadcast(tick);
-        let Input { q, qdot, torque, contributing, age, .. } = input;
+        let Input { q, qdot, torque, contributing, age, missing, .. } = input;
         let record = Record {
             tick,
             skipped,
@@ -219,6 +244,7 @@ impl Cycle {
             age,
             stale,
             dead,
+            missing,
             bad,
             halted: self.halted,
             moved,
@@ -239,13 +265,6 @@ impl Cycle {
             felt.active += part.active;
         }
         felt
-    }
-
-    /// Whether a bus still carries what is sent on it: torques are let go by the broadcasts that are read
-    /// back, so without them an old torque would be held for ever.
-    fn is_read_back(&self, last: Option<Epoch>) -> bool {
-        let behind = last.map_or(self.broadcasts, |last| u64::from(self.epoch.0.wrapping_sub(last.0)));
-        behind <= self.unread_limit
     }
 
     /// Halts and resumes that others sent; a halt outdoes a resume. Returns what the other buses have to
@@ -273,7 +292,7 @@ impl Cycle {
             return false;
         };
         self.bad_in_a_row = self.bad_in_a_row.saturating_add(1);
-        let halt = self.bad_in_a_row >= self.bad_limit && self.halted.is_none();
+        let halt = self.bad_in_a_row >= self.safety.bad_cycles && self.halted.is_none();
         if halt {
             self.halted = Some(Halt::BadCycles(why));
         }
@@ -300,10 +319,12 @@ impl Cycle {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "quarters are exact")]
 mod tests {
     use super::*;
     use crate::controller::Kinesthetic;
     use crate::robot::SimulatedArm;
+    use crate::table::Sums;
     use crate::testing;
 
     struct Dead;
@@ -312,6 +333,10 @@ mod tests {
         fn step(&mut self, _: &Input) -> Step {
             Step::Bad(BadCycle::NoAnswer)
         }
+    }
+
+    const fn works(sums: &Sums) -> Heard<'_> {
+        Heard { sums, works: true }
     }
 
     fn tick(number: u64) -> Tick {
@@ -329,7 +354,7 @@ mod tests {
         let (mut cycle, bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
         let mut sent = vec![];
         for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
-            let outcome = cycle.tick(tick(number), 0, [&bus], true);
+            let outcome = cycle.tick(tick(number), 0, [works(&bus)]);
             if let Some((epoch, _)) = outcome.joints {
                 sent.push((number, epoch.0, outcome.broadcasts_skipped));
             }
@@ -342,15 +367,15 @@ mod tests {
         let (mut cycle, mut bus) = cycle(Box::new(Dead));
         let limit = u64::from(testing::skin().safety.bad_cycles);
         let halts: Vec<u64> = (0..limit + 10)
-            .filter(|&number| cycle.tick(tick(number), 0, [&bus], true).command.is_some())
+            .filter(|&number| cycle.tick(tick(number), 0, [works(&bus)]).command.is_some())
             .collect();
         assert_eq!(halts, [limit - 1]);
         bus.resumes = 1;
-        let after = cycle.tick(tick(99), 0, [&bus], true);
+        let after = cycle.tick(tick(99), 0, [works(&bus)]);
         assert_eq!((after.record.halted, after.record.bad), (None, Some(BadCycle::NoAnswer)));
         assert_eq!(after.command, Some(Command::Resume), "the other buses have not heard it");
         bus.halts = 1;
-        let halted = cycle.tick(tick(100), 0, [&bus], true);
+        let halted = cycle.tick(tick(100), 0, [works(&bus)]);
         assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
     }
 
@@ -359,7 +384,8 @@ mod tests {
         let skin = testing::skin();
         let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
         let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
-        let bad = |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [bus], true).record.bad;
+        let bad =
+            |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
         for number in 0..=limit * 8 {
             assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
         }
@@ -368,18 +394,115 @@ mod tests {
         assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
     }
 
+    /// Two buses in a loop of eight ticks an epoch; each feels 1 Nm.
+    struct Two {
+        cycle: Cycle,
+        buses: [Sums; 2],
+        works: [bool; 2],
+        number: u64,
+    }
+
+    impl Two {
+        fn new(lost_bus: LostBus) -> Self {
+            let mut skin = testing::two_buses();
+            skin.safety.lost_bus = lost_bus;
+            let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+            let controller = Box::new(Kinesthetic::new(&skin).unwrap());
+            let felt = Sums { torque: [1.0; WORDS], contributing: 1, ..Sums::default() };
+            let cycle = Cycle::new(&skin, controller, Box::new(robot));
+            Self { cycle, buses: [felt; 2], works: [true; 2], number: 0 }
+        }
+
+        /// The ticks of an epoch, of which the last is returned; those buses that carry it read it back.
+        fn epoch(&mut self, carries: [bool; 2]) -> Record {
+            let mut last = None;
+            for _ in 0..8 {
+                let heard = self.buses.iter().zip(self.works).map(|(sums, works)| Heard { sums, works });
+                let outcome = self.cycle.tick(tick(self.number), 0, heard);
+                self.number += 1;
+                if let Some((epoch, _)) = outcome.joints {
+                    for (bus, _) in self.buses.iter_mut().zip(carries).filter(|(_, carries)| *carries) {
+                        bus.read_back = Some(epoch);
+                    }
+                }
+                last = Some(outcome.record);
+            }
+            last.unwrap()
+        }
+    }
+
+    #[test]
+    fn a_lost_bus_is_let_go_by_the_rule_for_cells_and_the_others_go_on() {
+        let mut two = Two::new(LostBus::GoOn);
+        for _ in 0..5 {
+            let record = two.epoch([true, true]);
+            assert_eq!((record.torque[0], record.contributing, record.missing), (2.0, 2, 0));
+        }
+        two.works[1] = false;
+        let mut torques = Vec::new();
+        for missed in 0..300 {
+            let record = two.epoch([true, false]);
+            torques.push(record.torque[0]);
+            assert_eq!((record.bad, record.halted, record.missing), (None, None, 0b10), "epoch {missed}");
+            let held = missed < 6;
+            assert_eq!((record.contributing, record.age), if held { (2, missed) } else { (1, 0) });
+        }
+        assert_eq!(torques[..8], [2.0, 2.0, 2.0, 1.75, 1.5, 1.25, 1.0, 1.0]);
+        assert!(
+            torques[8..].iter().all(|&torque| torque == 1.0),
+            "epochs come round, a lost torque does not"
+        );
+        two.works[1] = true;
+        two.epoch([true, true]);
+        let back = two.epoch([true, true]);
+        assert_eq!((back.torque[0], back.contributing, back.missing, back.bad), (2.0, 2, 0, None));
+    }
+
+    #[test]
+    fn a_bus_that_carries_nothing_is_lost_also_when_nobody_says_so() {
+        let mut two = Two::new(LostBus::GoOn);
+        two.epoch([true, true]);
+        let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
+        assert_eq!(missing[..7], [0; 7]);
+        assert_eq!(missing[7..], [0b10; 293], "also when the same epoch comes round again");
+    }
+
+    #[test]
+    fn without_any_bus_the_torque_is_not_valid() {
+        let mut two = Two::new(LostBus::GoOn);
+        two.epoch([true, true]);
+        two.works = [false, false];
+        assert_eq!(two.epoch([false, false]).bad, Some(BadCycle::Torque));
+        two.works = [false, true];
+        assert_eq!(two.epoch([false, true]).bad, None);
+    }
+
+    #[test]
+    fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
+        let mut two = Two::new(LostBus::Halt);
+        assert_eq!(two.epoch([true, true]).bad, None);
+        two.works[0] = false;
+        assert_eq!(two.epoch([true, true]).bad, Some(BadCycle::Torque));
+        for _ in 0..3 {
+            two.epoch([true, true]);
+        }
+        assert_eq!(two.epoch([true, true]).halted, Some(Halt::BadCycles(BadCycle::Torque)));
+        two.works[0] = true;
+        assert_eq!(two.epoch([true, true]).bad, None);
+    }
+
     #[test]
     fn a_halted_robot_stands_whatever_is_asked() {
         let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
         bus.torque = [5.0; WORDS];
         for number in 0..50 {
-            cycle.tick(tick(number), 0, [&bus], true);
+            cycle.tick(tick(number), 0, [works(&bus)]);
         }
         let moved = cycle.positions();
         assert!(moved[0] > 0.0);
         bus.halts = 1;
         for number in 50..99 {
-            cycle.tick(tick(number), 0, [&bus], true);
+            cycle.tick(tick(number), 0, [works(&bus)]);
         }
         assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
     }

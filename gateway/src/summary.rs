@@ -177,7 +177,7 @@ pub struct Processor {
     pub buses: f64,
 }
 
-/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + unknown.
+/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + unknown.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct UplinkSummary {
     /// Sent, by the cells' own count, as of their last heartbeats.
@@ -192,6 +192,8 @@ pub struct UplinkSummary {
     pub dropped: u64,
     /// Sent and not arrived, as far as drops of the kernel's backlog explain it.
     pub backlog: u64,
+    /// Sent and not arrived, while the bus was lost.
+    pub outage: u64,
     /// Sent and not arrived, and nobody knows why.
     pub unknown: u64,
     /// Arrived more often than sent.
@@ -232,7 +234,7 @@ pub struct RepliesSummary {
     pub not_heard: u64,
     /// Sent by the cell and lost or damaged on the way.
     pub lost: u64,
-    /// Of cells that were dead or started anew.
+    /// Of cells that were dead or started anew, or whose bus was lost.
     pub in_doubt: u64,
     /// Missing, and nobody knows why.
     pub unknown: u64,
@@ -274,6 +276,19 @@ pub struct ContributionsSummary {
     pub unasked: u64,
 }
 
+/// How often a bus was lost, and for how long.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct OutagesSummary {
+    /// How often.
+    pub times: u64,
+    /// For how long in all, in s: from when it was noticed to the first frame after it.
+    pub lost_s: f64,
+    /// Whether it was lost at the end.
+    pub at_end: bool,
+    /// Ticks that had to do without it.
+    pub ticks: u64,
+}
+
 /// One bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusSummary {
@@ -283,6 +298,8 @@ pub struct BusSummary {
     pub kind: String,
     /// Bytes that the socket may hold.
     pub receive_buffer: usize,
+    /// How often it was lost.
+    pub outages: OutagesSummary,
     /// Cells by status at the end.
     pub cells: BTreeMap<&'static str, usize>,
     /// Cells that were dead or never heard at the end.
@@ -341,6 +358,7 @@ impl BusSummary {
             name: name.to_owned(),
             kind: kind.to_owned(),
             receive_buffer,
+            outages: OutagesSummary::default(),
             cells,
             silent_cells,
             uplink: uplink(table, dropped),
@@ -359,7 +377,8 @@ impl BusSummary {
 
 fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
     let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink));
-    let dropped = total.lost.min(dropped_by_bus);
+    let unexplained = total.lost - total.outage;
+    let dropped = unexplained.min(dropped_by_bus);
     UplinkSummary {
         sent: total.sent,
         delivered: total.delivered,
@@ -367,7 +386,8 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         unheard: total.unheard,
         dropped,
         backlog: 0,
-        unknown: total.lost - dropped,
+        outage: total.outage,
+        unknown: unexplained - dropped,
         surplus: total.surplus,
         in_doubt: total.in_doubt,
         unsettled: total.unsettled(),

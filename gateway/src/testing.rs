@@ -47,6 +47,15 @@ position = [0.2, 0.01, 0.15]
 orientation = [0.7071068, 0.0, 0.0, 0.7071068]
 "#;
 
+/// [`SKIN`] with a second bus like the first one.
+pub(crate) fn two_buses() -> Skin {
+    let bus = SKIN.find("[[bus]]").zip(SKIN.find("[controller]")).and_then(|(from, to)| SKIN.get(from..to));
+    let cell = SKIN.find("[[cell]]").and_then(|from| SKIN.get(from..));
+    let more = bus.into_iter().chain(cell).map(|part| format!("\n{}", part.replace("vcan0", "vcan1")));
+    let text = SKIN.to_owned() + &more.collect::<String>();
+    Skin::parse("skin.toml", &text).expect("the tests' skin is sound")
+}
+
 /// [`SKIN`], checked.
 pub(crate) fn skin() -> Skin {
     Skin::parse("skin.toml", SKIN).expect("the tests' skin is sound")

@@ -8,7 +8,7 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use gateway::controller::Kinesthetic;
 use gateway::cycle::{Cycle, Tick};
@@ -57,17 +57,33 @@ fn skin(cells: usize) -> Skin {
 
 /// A loop over one bus, in one mode; its records pile up in a queue that is large enough.
 fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<gateway::table::Snapshot>, Table) {
+    let (turn, input, table, _) = turn_of(skin, mode);
+    (turn, input, table)
+}
+
+/// The same, and whether its bus works.
+fn turn_of(
+    skin: &Skin,
+    mode: Mode,
+) -> (Turn, triple_buffer::Input<gateway::table::Snapshot>, Table, Arc<AtomicBool>) {
     let table = Table::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, _) = rtrb::RingBuffer::new(4_096);
     let (records, _) = rtrb::RingBuffer::new(4_096);
     let works = Arc::new(AtomicBool::new(true));
-    let line = Line { format: protocol::can::Format::Fd, snapshot, positions, works };
+    let line = Line {
+        format: protocol::can::Format::Fd,
+        snapshot,
+        positions,
+        works: Arc::clone(&works),
+        commands: Arc::default(),
+    };
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
     let controller = Box::new(Kinesthetic::new(skin).unwrap());
     let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, [0.1; WORDS])));
-    (Turn::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records), input, table)
+    let turn = Turn::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
+    (turn, input, table, works)
 }
 
 #[test]
@@ -113,6 +129,36 @@ fn a_halt_that_a_bus_did_not_take_is_said_before_its_next_joints_and_then_every_
     // The 14th to the 25th: joints of epochs 13 to 24.
     let expected = [&[halt][..], &[joints; 3], &[halt], &[joints; 8], &[halt], &[joints; 1]].concat();
     assert_eq!(taken, expected);
+}
+
+#[test]
+fn a_bus_that_is_back_is_told_before_its_next_joints_to_be_as_the_robot_is() {
+    let (mut turn, mut snapshots, table, works) = turn_of(&skin(4), Mode::Distributed);
+    let mut said = Vec::new();
+    for number in 0..64_u64 {
+        works.store(!(20..30).contains(&number), Ordering::Relaxed);
+        let snapshot = snapshots.input_buffer_mut();
+        snapshot.take(table.snapshot(), false);
+        snapshot.sums.read_back = number.checked_sub(1).map(|sent| Epoch((sent / 8).to_le_bytes()[0]));
+        // Somebody halts the robot while the bus works for the second time.
+        snapshot.sums.halts = u32::from(number >= 44);
+        snapshots.publish();
+        let tick = Tick { number, time: Micros(number * 2_000) };
+        turn.turn(
+            tick,
+            0,
+            0,
+            || 0,
+            |_, frames| {
+                said.extend(frames.iter().map(|frame| (number, frame.id())));
+                true
+            },
+        );
+    }
+    let (halt, joints, resume) = (0x000, 0x001, 0x003);
+    let others: Vec<_> = said.iter().copied().filter(|(_, id)| *id != joints).collect();
+    assert_eq!(others[..2], [(32, resume), (44, halt)], "back at tick 30, and the next joints are due at 32");
+    assert!(said.iter().position(|it| *it == (32, resume)) < said.iter().position(|it| *it == (32, joints)));
 }
 
 #[derive(Debug, PartialEq)]

@@ -46,11 +46,13 @@ mod inbox;
 mod io;
 mod kernel;
 mod link;
+mod kinds;
 
 pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, Received};
 pub use kernel::{GATEWAY_RECEIVE_BUFFER, set_receive_buffer};
+pub use kinds::{Kinds, KindsError, OneKind};
 
 /// What carries the frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use gateway::controller;
+use gateway::cycle::carried::Heard;
 use gateway::cycle::{Cycle, Record, Tick};
 use gateway::robot::SimulatedArm;
 use gateway::scenario::{Scenario, Touches};
@@ -134,7 +135,8 @@ impl Gateway {
         let skipped = self.records.last().map_or(0, |last| self.tick - last.tick.number - 1);
         self.snapshot.take(self.table.snapshot(), true);
         let tick = Tick { number: self.tick, time };
-        let outcome = self.cycle.tick(tick, skipped, [&self.snapshot.sums], self.works);
+        let outcome =
+            self.cycle.tick(tick, skipped, [Heard { sums: &self.snapshot.sums, works: self.works }]);
         self.tick += 1;
         self.records.push(outcome.record);
         self.broadcasts_skipped += outcome.broadcasts_skipped;

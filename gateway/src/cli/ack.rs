@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use gateway::generate::Format;
-use protocol::bus::{Bus, BusError, Choice, Options};
+use protocol::bus::{Bus, BusError, Choice, Kinds, OneKind, Options};
 use protocol::can;
 use protocol::message::Message;
 use protocol::skin::Skin;
@@ -25,25 +25,29 @@ pub(crate) struct Ack {
     /// What a packet travels in on the bus; a skin says it itself
     #[arg(long, value_enum, default_value = "fd")]
     format: Format,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of a
+    /// skin BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
 }
 
 impl Ack {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.whom.display();
         let is_skin = self.whom.is_file();
-        let wanted = if is_skin {
+        let wanted: Vec<_> = if is_skin {
             let skin = Skin::read(&self.whom).map_err(Failure::usage)?;
             skin.buses.into_iter().map(|bus| (bus.name, bus.format)).collect()
         } else {
             vec![(name.to_string(), wire(self.format))]
         };
+        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
+            .and_then(|kinds| kinds.only(wanted.iter().map(|(bus, _): &(String, _)| bus.as_str())))
+            .map_err(Failure::usage)?;
         // All are opened before anybody is told.
         let mut buses = Vec::new();
         for (bus, format) in &wanted {
-            buses.push(open(bus, self.bus_kind, *format).map_err(|error| match is_skin {
+            buses.push(open(bus, kinds.of(bus), *format).map_err(|error| match is_skin {
                 true => Failure::usage(error),
                 false => Failure::usage(format!("there is no file {name}, and as a bus: {error}")),
             })?);

@@ -129,6 +129,11 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     let replies = &bus.replies;
     let statuses: Vec<_> = bus.cells.iter().map(|(status, count)| format!("{count} {status}")).collect();
     rows.section(format!("{} ({})", bus.name, bus.kind), statuses.join(", "), "");
+    if bus.outages.times > 0 {
+        let end = if bus.outages.at_end { ", also at the end" } else { "" };
+        let ticks = format!("{} ticks without it", bus.outages.ticks);
+        rows.row("lost", format!("{} times, {:.1} s{end}", bus.outages.times, bus.outages.lost_s), ticks);
+    }
     if !bus.silent_cells.is_empty() {
         let names: Vec<_> = bus.silent_cells.iter().map(u8::to_string).collect();
         rows.row("silent cells", names.join(" "), "");
@@ -165,13 +170,17 @@ fn explained(reasons: &[(u64, &str)], unknown: u64) -> String {
 
 fn frames(rows: &mut Rows, bus: &BusSummary) {
     let up = &bus.uplink;
-    let lost = up.dropped + up.backlog + up.unknown;
+    let lost = up.dropped + up.backlog + up.outage + up.unknown;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
     if up.unheard > 0 {
         rows.row("  for other cells", up.unheard, "sums that the gateway does not take");
     }
-    let reasons = [(up.dropped, "dropped by the bus"), (up.backlog, "by the kernel's backlog")];
+    let reasons = [
+        (up.dropped, "dropped by the bus"),
+        (up.backlog, "by the kernel's backlog"),
+        (up.outage, "with the bus"),
+    ];
     rows.row("  lost", lost, explained(&reasons, up.unknown));
     for (name, count) in
         [("surplus", up.surplus), ("in doubt", up.in_doubt), ("after the last heartbeat", up.unsettled)]

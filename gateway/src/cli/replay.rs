@@ -16,7 +16,7 @@ use gateway::replay::{Options, Spawn, replay};
 use gateway::run::RunError;
 use gateway::run::file::WholeFile;
 use gateway::summary::Quantiles;
-use protocol::bus::Choice;
+use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
@@ -38,9 +38,10 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 pub(crate) struct Replay {
     /// A candump log or an MCAP recording
     file: PathBuf,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
     /// Send the frames of one of the capture's buses on another bus
     #[arg(long, value_name = "FROM=TO", value_parser = route)]
     map: Vec<(String, String)>,
@@ -187,7 +188,7 @@ impl Replay {
         };
         Ok(Options {
             file: self.file.clone(),
-            kind: self.bus_kind,
+            kinds: Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)?,
             only,
             pick: Pick { kinds: self.kind.clone(), nodes: self.node.clone(), ..Pick::default() },
             buses: self.bus.clone(),

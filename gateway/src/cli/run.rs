@@ -14,7 +14,7 @@ use gateway::run::file::WholeFile;
 use gateway::run::{self, Options, RunError};
 use gateway::scenario::Scenario;
 use gateway::summary::Summary;
-use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER};
+use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
 use protocol::skin::Skin;
 use protocol::time::Span;
 use protocol::usage::Failure;
@@ -155,7 +155,7 @@ pub(crate) struct Demo {
 ///
 /// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
-/// table. Exit code 0: it came to its end; 1: it did not, or its recording is not whole; 2: wrong use or
+/// table. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2: wrong use or
 /// configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -172,9 +172,10 @@ pub(crate) struct Run {
     /// Write all frames as candump text
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
     /// Start no cells: they are on the bus already, or are real
     #[arg(long)]
     no_spawn: bool,
@@ -208,7 +209,7 @@ impl Demo {
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         let mut options = self.common.options(skin_file, skin, scenario);
-        options.kind = self.bus_kind;
+        options.kinds = Kinds::all(self.bus_kind);
         let Common { mut recording, summary, .. } = self.common;
         // Who shows it again wants no other name for it.
         recording.force |= self.candump == Path::new(DEMO_LOG);
@@ -231,7 +232,9 @@ impl Run {
         let (skin_file, scenario_file) = (self.skin.clone(), self.scenario);
         let mut options = self.common.options(self.skin, skin, scenario);
         let Common { recording, summary, .. } = self.common;
-        options.kind = self.bus_kind;
+        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
+            .and_then(|kinds| kinds.only(options.skin.buses.iter().map(|bus| bus.name.as_str())));
+        options.kinds = kinds.map_err(Failure::usage)?;
         options.record = recording.options(
             self.candump,
             &options.skin,
@@ -255,7 +258,7 @@ impl Common {
             skin_file,
             skin,
             scenario,
-            kind: Choice::Auto,
+            kinds: Kinds::default(),
             spawn: true,
             cells_per_process: self.cells_per_process.into(),
             flash: None,
@@ -288,6 +291,11 @@ fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> 
         write_json(whole, file, &summary)?;
     }
     print::summary(&summary)?;
+    let lost: Vec<_> = summary.buses.iter().filter(|bus| bus.outages.at_end).collect();
+    if !lost.is_empty() {
+        let names = lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        return Err(Failure::run(format!("lost at the end of the run: {names}")));
+    }
     match &summary.recording {
         Some(Recorded { errors, lost_write, .. }) if !errors.is_empty() || *lost_write > 0 => {
             let first = errors.first().map_or("", String::as_str);

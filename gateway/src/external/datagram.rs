@@ -3,7 +3,7 @@
 //! ```text
 //!   all      0 magic "SKBC" | 4 version u16 | 6 kind u16: 1 state, 2 answer, 3 hello
 //!   state    8 tick u64 | 16 time in us u64 | 24 age in epochs u32 | 28 contributing cells u32
-//!           32 flags u32 | 36 joints u32 | 40 q 6 f64 | 88 qdot 6 f64 | 136 torque 6 f64   184 bytes
+//!           32 flags u32, from bit 16 on a mask of lost buses | 36 joints u32 | 40 q 6 f64 | 88 qdot 6 f64 | 136 torque 6 f64   184 bytes
 //!   answer   8 tick u64 | 16 command u32 | 20 zero u32 | 24 six f64                         72 bytes
 //!   hello                                                                                    8 bytes
 //! ```
@@ -148,6 +148,8 @@ impl Reader<'_> {
 impl State {
     const VALID: u32 = 1;
     const HALTED: u32 = 1 << 1;
+    /// Bit 16 is the first bus, bit 31 the 16th and all after it.
+    const MISSING: u32 = 16;
 
     /// The bytes.
     #[must_use]
@@ -161,7 +163,9 @@ impl State {
         out.put(input.age.to_le_bytes());
         out.put(input.contributing.to_le_bytes());
         let flag = |bit, set| if set { bit } else { 0 };
-        out.put((flag(Self::VALID, input.valid) | flag(Self::HALTED, input.halted)).to_le_bytes());
+        let missing = input.missing | flag(1 << 15, input.missing >> 16 != 0);
+        let flags = flag(Self::VALID, input.valid) | flag(Self::HALTED, input.halted);
+        out.put((flags | missing << Self::MISSING).to_le_bytes());
         out.put(self.joints.to_le_bytes());
         out.joints(input.q);
         out.joints(input.qdot);
@@ -191,6 +195,7 @@ impl State {
         let flags = u32::from_le_bytes(from.take());
         input.valid = flags & Self::VALID != 0;
         input.halted = flags & Self::HALTED != 0;
+        input.missing = flags >> Self::MISSING;
         let joints = u32::from_le_bytes(from.take());
         input.q = from.joints();
         input.qdot = from.joints();

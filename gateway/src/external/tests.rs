@@ -61,15 +61,25 @@ fn a_state_is_the_bytes_of_the_documented_table() {
         age: 3,
         contributing: 20,
         valid: true,
+        missing: 0b101,
         halted: true,
     };
     let bytes = State { input, joints: 6 }.encode();
     assert_eq!(bytes[..16], *b"SKBC\x01\x00\x01\x00\x02\x01\0\0\0\0\0\0");
-    assert_eq!(bytes[16..40], *b"\xa0\xdf\x07\0\0\0\0\0\x03\0\0\0\x14\0\0\0\x03\0\0\0\x06\0\0\0");
+    assert_eq!(bytes[16..40], *b"\xa0\xdf\x07\0\0\0\0\0\x03\0\0\0\x14\0\0\0\x03\0\x05\0\x06\0\0\0");
     assert_eq!(bytes[40..48], *b"\0\0\0\0\0\0\xf0\x3f");
     assert_eq!(bytes[80..96], *b"\0\0\0\0\0\0\0\xc0\0\0\0\0\0\0\xe0\x3f");
     assert_eq!(bytes[176..], *b"\0\0\0\0\0\0\xd0\x3f");
     assert_eq!(State::decode(&bytes), Ok(State { input, joints: 6 }));
+}
+
+#[test]
+fn buses_beyond_the_16th_share_its_bit() {
+    let said = |missing| {
+        let bytes = State { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
+        State::decode(&bytes).unwrap().input.missing
+    };
+    assert_eq!([1, 1 << 15, 1 << 16, 1 << 31].map(said), [1, 1 << 15, 1 << 15, 1 << 15]);
 }
 
 #[test]

@@ -73,6 +73,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
         ("hold_epochs", skin.safety.hold_epochs.to_string()),
         ("decay_epochs", skin.safety.decay_epochs.to_string()),
         ("bad_cycles", skin.safety.bad_cycles.to_string()),
+        ("lost_bus", skin.safety.lost_bus.name().to_owned()),
     ]);
     all.extend(run);
     all

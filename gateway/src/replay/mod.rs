@@ -37,7 +37,7 @@ use std::thread;
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
-use protocol::bus::Choice;
+use protocol::bus::Kinds;
 use protocol::id::CellId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
@@ -78,7 +78,7 @@ pub struct Options {
     /// The capture.
     pub file: PathBuf,
     /// Which kind of bus.
-    pub kind: Choice,
+    pub kinds: Kinds,
     /// Whose frames are sent.
     pub only: Only,
     /// Which kinds, to and from whom; its times are not looked at.
@@ -138,7 +138,7 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
         teller.say(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
     }
     let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
-    let heard = if speaks { buses.listen(options)? } else { Vec::new() };
+    let heard = if speaks { buses.listen()? } else { Vec::new() };
     if let (Some(spawn), Some(wearing)) = (&options.spawn, &wearing) {
         buses.start_cells(spawn, wearing, &heard)?;
     } else if options.only == Only::All {

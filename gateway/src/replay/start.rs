@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options as BusOptions};
+use protocol::bus::{Bus, BusError, Choice, Filter, Inbox, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, State as Flags};
@@ -77,6 +77,8 @@ impl Routes {
                 routes.names.push((bus, target));
             }
         }
+        let names = routes.names.iter().map(|(_, name)| name.as_str());
+        options.kinds.clone().only(names).map_err(|error| RunError::Usage(error.to_string()))?;
         let distinct: BTreeSet<_> = routes.names.iter().map(|(_, name)| name).collect();
         if options.hears() && distinct.len() < routes.names.len() {
             return Err(RunError::Usage(
@@ -175,8 +177,8 @@ pub(super) fn open(
             ..BusOptions::default()
         };
         let (bus, of_ours) = match wearing {
-            Some(_) => open_or_serve(name, options.kind, &wanted, options.vcan_setup.as_deref())?,
-            None => (Bus::open(name, options.kind, &wanted)?, None),
+            Some(_) => open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?,
+            None => (Bus::open(name, options.kinds.of(name), &wanted)?, None),
         };
         own.push(of_ours.is_some());
         served.extend(of_ours);
@@ -187,7 +189,7 @@ pub(super) fn open(
 
 impl Buses {
     /// Listens on the buses that were there before, as long as two gateways need to notice each other.
-    pub(super) fn listen(&self, options: &Options) -> Result<Vec<BTreeSet<CellId>>, RunError> {
+    pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, RunError> {
         let mut heard = vec![BTreeSet::new(); self.lanes.len()];
         let wanted = BusOptions {
             filters: vec![
@@ -205,7 +207,11 @@ impl Buses {
                 let fd = lane.format == Format::Fd;
                 open.push((
                     index,
-                    Bus::open(lane.bus.name(), options.kind, &BusOptions { fd, ..wanted.clone() })?,
+                    Bus::open(
+                        lane.bus.name(),
+                        Choice::Only(lane.bus.kind()),
+                        &BusOptions { fd, ..wanted.clone() },
+                    )?,
                 ));
             }
         }
@@ -248,12 +254,12 @@ impl Buses {
                 names(&cells)
             )));
         }
-        let kind = self.lanes.first().map_or(BusKind::Embedded, |lane| lane.bus.kind());
+        let kinds = Kinds::exactly(self.lanes.iter().map(|lane| (lane.bus.name(), lane.bus.kind())));
         self.processes = Processes::start(&Plan {
             program: &program("cell-node", spawn.cell_node.as_deref())?,
             skin_file: &wearing.file,
             skin: &wearing.skin,
-            kind: Choice::Only(kind),
+            kinds: &kinds,
             per_process: spawn.cells_per_process,
             flash: None,
         })?;

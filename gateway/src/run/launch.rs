@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, Choice, Options};
+use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
 use protocol::skin::Skin;
 use rustix::process::{Pid, Signal, kill_process};
 use thiserror::Error;
@@ -75,6 +75,7 @@ pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, Laun
 /// killed.
 #[derive(Debug)]
 pub struct ServedBus {
+    bus: String,
     child: Child,
 }
 
@@ -88,7 +89,7 @@ impl ServedBus {
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
         apart(&mut command);
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
-        let mut served = Self { child: command.spawn().map_err(start)? };
+        let mut served = Self { bus: bus.to_owned(), child: command.spawn().map_err(start)? };
         let mut line = String::new();
         if let Some(out) = served.child.stdout.take() {
             BufReader::new(out).read_line(&mut line).map_err(start)?;
@@ -104,6 +105,17 @@ impl ServedBus {
     #[must_use]
     pub fn pid(&self) -> u32 {
         self.child.id()
+    }
+
+    /// The bus.
+    #[must_use]
+    pub fn bus(&self) -> &str {
+        &self.bus
+    }
+
+    /// How its process ended, if it did.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().ok().flatten()
     }
 }
 
@@ -179,8 +191,8 @@ pub struct Plan<'a> {
     pub skin_file: &'a Path,
     /// The skin.
     pub skin: &'a Skin,
-    /// Which kind of bus.
-    pub kind: Choice,
+    /// Which kind each bus is.
+    pub kinds: &'a Kinds,
     /// At most so many cells in a process.
     pub per_process: usize,
     /// Where cells keep their parameters, if they do.
@@ -281,7 +293,7 @@ impl Plan<'_> {
             arguments.extend(["--nodes".to_owned(), format!("{first}-{last}")]);
         }
         arguments.extend(["--skin".to_owned(), self.skin_file.display().to_string()]);
-        arguments.extend(["--bus-kind".to_owned(), self.kind.to_string()]);
+        arguments.extend(["--bus-kind".to_owned(), self.kinds.of(bus).to_string()]);
         arguments.extend(["--with-parent".to_owned(), std::process::id().to_string()]);
         if let Some(flash) = self.flash {
             arguments.extend(["--flash".to_owned(), flash.display().to_string()]);

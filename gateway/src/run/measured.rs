@@ -19,6 +19,8 @@ pub(super) struct Measured {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
     pub(super) bad: BTreeMap<String, u64>,
+    /// Ticks without each bus, as [`crate::cycle::Record::missing`] has the buses.
+    pub(super) missing: [u64; 32],
     last: Option<Timed>,
     pub(super) first_broadcast_s: Option<f64>,
 }
@@ -33,6 +35,7 @@ impl Measured {
             ticks: 0,
             skipped: 0,
             bad: BTreeMap::new(),
+            missing: [0; 32],
             last: None,
             first_broadcast_s: None,
         }
@@ -50,6 +53,9 @@ impl Measured {
             match timed.central {
                 Some((nanos, _)) => record(&mut self.central, nanos),
                 None => record(&mut self.took_distributed, timed.took_ns),
+            }
+            for (bus, ticks) in self.missing.iter_mut().enumerate() {
+                *ticks += u64::from(timed.record.missing >> bus & 1);
             }
             if let Some(bad) = timed.record.bad {
                 *self.bad.entry(bad.to_string()).or_default() += 1;

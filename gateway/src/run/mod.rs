@@ -16,6 +16,7 @@ pub mod file;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
 pub mod launch;
+pub mod link;
 mod measured;
 pub mod progress;
 pub mod realtime;
@@ -27,7 +28,7 @@ mod watch;
 
 use std::path::PathBuf;
 
-use protocol::bus::{BusError, Choice};
+use protocol::bus::{BusError, Kinds};
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use thiserror::Error;
@@ -44,8 +45,8 @@ pub struct Options {
     pub skin: Skin,
     /// What happens.
     pub scenario: Scenario,
-    /// Which kind of bus.
-    pub kind: Choice,
+    /// Which kind each bus is.
+    pub kinds: Kinds,
     /// Whether cells are started; else they are on the bus already.
     pub spawn: bool,
     /// At most so many cells in a process.

@@ -1,17 +1,18 @@
 //! The thread that receives on one bus: it keeps the table, and leaves snapshots for the tick.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, Inbox, Received};
+use protocol::bus::{BusError, Inbox, Received};
 use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
+use super::link::{Ear, Outages};
 use super::turn::Shared;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;
@@ -21,6 +22,8 @@ use crate::table::{Notice, Said, Snapshot, Status, Table};
 const LOOK: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(50);
+/// From one try to open a bus that is gone to the next.
+const REOPEN: Duration = Duration::from_millis(100);
 
 /// What a receiver tells the main thread at once.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -31,8 +34,10 @@ pub enum News {
     Down(String),
     /// It works again.
     Up,
-    /// The bus is gone for good.
+    /// The bus is gone: it has to be opened anew, which its receiver tries.
     Lost(String),
+    /// It is there and cannot be opened.
+    Refused(String),
 }
 
 /// The state of a bus' cells, renewed every 20 ms.
@@ -40,7 +45,7 @@ pub enum News {
 pub struct View {
     /// Each cell, in the bus' order.
     pub cells: Vec<CellView>,
-    /// Commands of our own that were read back from the bus.
+    /// Commands of our own that were read back from the bus, or were lost with it.
     pub commands: u64,
 }
 
@@ -73,7 +78,7 @@ pub struct Receiver {
     /// Where this bus stands among the skin's.
     pub index: usize,
     /// The bus.
-    pub bus: Arc<Bus>,
+    pub ear: Ear,
     /// So long frames are left to gather, so that one wake-up takes many: a tick, as nobody looks more often.
     pub gather: Duration,
     /// What is known of it.
@@ -86,8 +91,6 @@ pub struct Receiver {
     pub outlet: Option<Outlet>,
     /// What everyone looks at.
     pub shared: Arc<Shared>,
-    /// Whether the bus works.
-    pub works: Arc<AtomicBool>,
     /// What the main thread sees.
     pub view: Arc<Mutex<View>>,
     /// What it is told at once.
@@ -105,57 +108,53 @@ pub struct Left {
     pub unrecorded: Unrecorded,
     /// Bytes that were no frame.
     pub unreadable: u64,
+    /// How often the bus was lost, and for how long.
+    pub outages: Outages,
+}
+
+/// What came through the sockets of a bus so far.
+#[derive(Debug, Default)]
+struct Account {
+    /// Frames that the bus dropped, and bytes that were no frame, on sockets before this one.
+    before: (u64, u64),
+    /// What this socket had dropped when it was last told to the recorder.
+    told: u32,
+    /// The newest joints whose feelings the recorder has.
+    newest: Option<u64>,
+    outages: Outages,
+    /// Commands that the bus took and did not carry, because it was lost.
+    unread: u64,
+    /// When a bus that is gone is to be opened again.
+    retry: Option<Instant>,
+    /// Why it could not be, for people.
+    refused: String,
 }
 
 impl Receiver {
-    /// Receives until someone says stop or the bus is gone.
+    /// Receives until someone says stop. A bus that is lost is waited for, and opened again when it is gone.
     #[must_use]
     pub fn run(mut self) -> Left {
         super::realtime::prepare_receiver();
         let mut inbox = Inbox::new();
-        let (mut dropped, mut newest) = (0_u32, None);
+        let mut account = Account::default();
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
-            let came = self
-                .bus
-                .wait(Some(LOOK))
-                .and_then(|ready| if ready { self.bus.receive(&mut inbox) } else { Ok(0) });
-            let count = match came {
-                Ok(count) => count,
-                Err(error) if error.may_pass() => {
-                    if self.works.swap(false, Ordering::Relaxed) {
-                        self.tell(News::Down(error.to_string()));
-                    }
-                    std::thread::sleep(DOWN);
-                    // Time passes for the cells all the same.
-                    0
-                }
-                Err(error) => {
-                    self.works.store(false, Ordering::Relaxed);
-                    self.tell(News::Lost(error.to_string()));
-                    break;
-                }
+            let count = if let Some(retry) = account.retry {
+                inbox.clear();
+                self.retry(&mut inbox, &mut account, retry);
+                0
+            } else {
+                self.take(&mut inbox, &mut account)
             };
-            if count > 0 && !self.works.swap(true, Ordering::Relaxed) {
+            if count > 0 && self.ear.regain() {
+                account.outages.end(Instant::now());
                 self.tell(News::Up);
             }
-            self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
-            if count > 0 {
-                for received in inbox.frames() {
-                    let at = Micros(received.at_nanos / 1_000);
-                    let queue = &mut self.positions;
-                    let mut positions = |epoch| positions_of(queue, epoch);
-                    self.table.handle_frame(at, received.own, &received.frame, &mut positions);
-                    if let Some(outlet) = &mut self.outlet {
-                        let Received { frame, at_nanos, own } = received;
-                        outlet.frame(Seen { at_nanos, own, frame });
-                    }
-                }
-            }
-            self.record(&inbox, &mut dropped, &mut newest);
+            self.hear(&inbox);
+            self.record(&inbox, &mut account);
             if count == 0 || looked.elapsed() >= LOOK {
                 looked = Instant::now();
-                self.look();
+                self.look(&mut account);
             }
             self.publish();
             // A full inbox has more behind it.
@@ -165,20 +164,97 @@ impl Receiver {
         }
         self.table.finish();
         let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
-        let (dropped, unreadable) = (u64::from(inbox.dropped()), inbox.unreadable());
-        Left { table: self.table, dropped, unrecorded, unreadable }
+        let (dropped, unreadable) = account.before;
+        let (dropped, unreadable) = (dropped + u64::from(inbox.dropped()), unreadable + inbox.unreadable());
+        Left { table: self.table, dropped, unrecorded, unreadable, outages: account.outages }
+    }
+
+    /// Waits for frames and takes them; how many.
+    fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
+        let bus = &self.ear.bus;
+        inbox.clear();
+        let came = bus.wait(Some(LOOK)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
+        came.unwrap_or_else(|error| {
+            self.lose(inbox, account, &error);
+            0
+        })
+    }
+
+    /// The bus is lost, for a while or until it is opened again.
+    fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: &BusError) {
+        let gone = !error.may_pass();
+        if gone {
+            account.retry = Some(Instant::now());
+            account.refused.clear();
+        }
+        if self.ear.lose(gone) {
+            account.outages.begin(Instant::now());
+            self.tell(if gone { News::Lost(error.to_string()) } else { News::Down(error.to_string()) });
+        }
+        if gone {
+            inbox.clear();
+            return self.table.interrupt();
+        }
+        std::thread::sleep(DOWN);
+        // What stood on it before is no sign that it works again.
+        while let Ok(1..) = self.ear.bus.receive(inbox) {
+            self.hear(inbox);
+            self.record(inbox, account);
+        }
+        inbox.clear();
+        self.table.interrupt();
+    }
+
+    /// Tries to open a bus that is gone, when it is time; time passes for the cells all the same.
+    fn retry(&mut self, inbox: &mut Inbox, account: &mut Account, retry: Instant) {
+        let now = Instant::now();
+        if now < retry {
+            return std::thread::sleep(LOOK.min(retry - now));
+        }
+        match self.ear.reopen() {
+            Ok(()) => {
+                let (dropped, unreadable) = &mut account.before;
+                *dropped += u64::from(inbox.dropped());
+                *unreadable += inbox.unreadable();
+                *inbox = Inbox::new();
+                (account.told, account.retry) = (0, None);
+            }
+            Err(error) => {
+                account.retry = Some(now + REOPEN);
+                let why = error.to_string();
+                if !is_absent(&error) && account.refused != why {
+                    self.tell(News::Refused(why.clone()));
+                }
+                account.refused = why;
+            }
+        }
+    }
+
+    /// Takes what came.
+    fn hear(&mut self, inbox: &Inbox) {
+        self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
+        for received in inbox.frames() {
+            let at = Micros(received.at_nanos / 1_000);
+            let queue = &mut self.positions;
+            let mut positions = |epoch| positions_of(queue, epoch);
+            self.table.handle_frame(at, received.own, &received.frame, &mut positions);
+            if let Some(outlet) = &mut self.outlet {
+                let Received { frame, at_nanos, own } = received;
+                outlet.frame(Seen { at_nanos, own, frame });
+            }
+        }
     }
 
     /// Hands on what is no frame: what the bus dropped, and once an epoch what cells feel.
-    fn record(&mut self, inbox: &Inbox, dropped: &mut u32, newest: &mut Option<u64>) {
+    fn record(&mut self, inbox: &Inbox, account: &mut Account) {
         let Some(outlet) = &mut self.outlet else { return };
-        let more = inbox.dropped().wrapping_sub(*dropped);
+        let more = inbox.dropped().wrapping_sub(account.told);
         if more > 0 {
-            *dropped = inbox.dropped();
+            account.told = inbox.dropped();
             outlet.dropped(wall_nanos(), more.into());
         }
         let Some((number, epoch, at)) = self.table.newest() else { return };
-        if outlet.wants_touched() && newest.replace(number) != Some(number) {
+        if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
             let cells = self.table.felt(at).collect();
             outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
         }
@@ -191,7 +267,7 @@ impl Receiver {
     }
 
     /// Lets time pass, and shows the main thread how things are.
-    fn look(&mut self) {
+    fn look(&mut self, account: &mut Account) {
         let now = Micros(wall_nanos() / 1_000);
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
@@ -215,7 +291,12 @@ impl Receiver {
                 said: cell.said(),
             }
         });
-        let (cells, commands) = (cells.collect(), self.table.counters().sent(Kind::Command));
+        let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
+        if !self.ear.link.is_there() {
+            // What it took and has not carried by now it will not carry.
+            account.unread = self.ear.link.commands().load(Ordering::Relaxed).saturating_sub(read);
+        }
+        let commands = read + account.unread;
         if let Ok(mut view) = self.view.lock() {
             *view = View { cells, commands };
         }
@@ -225,6 +306,18 @@ impl Receiver {
         // Nobody listens any more when the run ends.
         let _ = self.news.send((self.index, news));
     }
+}
+
+/// Whether a bus that does not open is just not there.
+const fn is_absent(error: &BusError) -> bool {
+    matches!(
+        error,
+        BusError::NoInterface { .. }
+            | BusError::Down { .. }
+            | BusError::Gone { .. }
+            | BusError::NotServed { .. }
+            | BusError::Closed { .. }
+    )
 }
 
 /// Says what did not fit; the recorder makes room as long as a receiver is there.

@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Options as BusOptions};
+use protocol::bus::{BusError, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
@@ -16,6 +16,7 @@ use protocol::skin::Reply;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
+use super::link::{Ear, Link, Slot, may_return};
 use super::progress::say;
 use super::receiver::{CellView, Left, News, Receiver, View};
 use super::turn::{Line, Shared, Timed};
@@ -48,7 +49,9 @@ const RECORDS: usize = 1_024;
 /// One bus of a bench.
 #[derive(Debug)]
 pub(super) struct Lane {
-    pub(super) bus: Arc<Bus>,
+    pub(super) link: Arc<Link>,
+    /// Where the loop finds the bus, until it begins.
+    pub(super) slot: Option<Slot>,
     pub(super) view: Arc<Mutex<View>>,
     pub(super) receiver: Option<JoinHandle<Left>>,
 }
@@ -97,25 +100,24 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let mut served = Vec::new();
     let mut buses = Vec::new();
     for described in &options.skin.buses {
-        let bus = open(options, &described.name, &mut served)?;
+        let (link, ear, slot) = open(options, &described.name, &mut served)?;
         if !options.quiet {
-            let kib = bus.receive_buffer() / 1_024;
-            let (name, kind) = (&described.name, bus.kind());
-            let less = if bus.receive_buffer() < options.receive_buffer { LIMITED } else { "" };
+            let kib = link.receive_buffer() / 1_024;
+            let (name, kind) = (link.name(), link.kind());
+            let less = if link.receive_buffer() < options.receive_buffer { LIMITED } else { "" };
             say(&format!("{name} is {kind}, with a receive buffer of {kib} KiB{less}"));
         }
-        buses.push(Arc::new(bus));
+        buses.push((link, ear, slot));
     }
     let shared = Arc::new(Shared::default());
     let (tell, news) = mpsc::channel();
     let (mut lanes, mut lines) = (Vec::new(), Vec::new());
     let mut feeds = Vec::new();
-    for (index, bus) in buses.into_iter().enumerate() {
+    for (index, (link, ear, slot)) in buses.into_iter().enumerate() {
         let view = Arc::new(Mutex::new(View::default()));
-        let works = Arc::new(AtomicBool::new(true));
-        let recorded = |()| feed::lane(outputs.wants_all(), Arc::clone(&view), Arc::clone(&works));
+        let recorded = |()| feed::lane(outputs.wants_all(), Arc::clone(&view), Arc::clone(link.works()));
         let (outlet, feed) = (!outputs.is_empty()).then_some(()).map(recorded).unzip();
-        let seat = Seat { index, bus, view, works, outlet };
+        let seat = Seat { index, ear, slot, view, outlet };
         let (lane, line) = listen(options, seat, &shared, tell.clone())?;
         lanes.push(lane);
         lines.push(line);
@@ -199,7 +201,11 @@ fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 }
 
 /// Opens a bus; an embedded one that nobody serves is served.
-fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bus, RunError> {
+fn open(
+    options: &Options,
+    name: &str,
+    served: &mut Vec<ServedBus>,
+) -> Result<(Arc<Link>, Ear, Slot), RunError> {
     let wanted = BusOptions {
         fd: options.skin.buses.iter().any(|bus| bus.name == name && bus.format == Format::Fd),
         filters: vec![Filter::ALL],
@@ -209,9 +215,9 @@ fn open(options: &Options, name: &str, served: &mut Vec<ServedBus>) -> Result<Bu
         send_patience: SEND_PATIENCE,
         ..BusOptions::default()
     };
-    let (bus, own) = open_or_serve(name, options.kind, &wanted, options.vcan_setup.as_deref())?;
+    let (bus, own) = open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?;
     served.extend(own);
-    Ok(bus)
+    Ok(Link::new(bus, wanted))
 }
 
 /// Starts the thread that records, if anything is to be recorded; where the loop's records go to it.
@@ -245,7 +251,7 @@ fn head(options: &Options, mcap: &Mcap, lanes: &[Lane]) -> Head {
         ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
     ];
     for (lane, described) in lanes.iter().zip(&options.skin.buses) {
-        let (kind, bytes) = (lane.bus.kind(), lane.bus.receive_buffer());
+        let (kind, bytes) = (lane.link.kind(), lane.link.receive_buffer());
         let format = match described.format {
             Format::Fd => "fd",
             Format::Classic => "classic",
@@ -267,9 +273,9 @@ fn head(options: &Options, mcap: &Mcap, lanes: &[Lane]) -> Head {
 /// What a bus and its receiver have in common with others.
 struct Seat {
     index: usize,
-    bus: Arc<Bus>,
+    ear: Ear,
+    slot: Slot,
     view: Arc<Mutex<View>>,
-    works: Arc<AtomicBool>,
     outlet: Option<feed::Outlet>,
 }
 
@@ -280,29 +286,30 @@ fn listen(
     shared: &Arc<Shared>,
     news: mpsc::Sender<(usize, News)>,
 ) -> Result<(Lane, Line), RunError> {
-    let Seat { index, bus, view, works, outlet } = seat;
+    let Seat { index, ear, slot, view, outlet } = seat;
+    let link = Arc::clone(&ear.link);
     let table = Table::new(&options.skin, index);
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
     let format = options.skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
-    let line = Line { format, snapshot, positions, works: Arc::clone(&works) };
+    let (works, commands) = (Arc::clone(link.works()), Arc::clone(link.commands()));
+    let line = Line { format, snapshot, positions, works, commands };
     let receiver = Receiver {
         index,
-        bus: Arc::clone(&bus),
+        ear,
         gather: Duration::from_nanos(options.skin.timing.tick_nanos()).min(GATHER),
         table,
         snapshots,
         positions: of_broadcasts,
         outlet,
         shared: Arc::clone(shared),
-        works,
         view: Arc::clone(&view),
         news,
     };
-    let name = format!("rx {}", bus.name());
+    let name = format!("rx {}", link.name());
     let thread = thread::Builder::new().name(name).spawn(move || receiver.run());
     let thread = thread.map_err(|error| RunError::Failed(format!("cannot start a thread: {error}")))?;
-    Ok((Lane { bus, view, receiver: Some(thread) }, line))
+    Ok((Lane { link, slot: Some(slot), view, receiver: Some(thread) }, line))
 }
 
 impl Bench<'_> {
@@ -319,7 +326,7 @@ impl Bench<'_> {
                 program: &program,
                 skin_file: &options.skin_file,
                 skin: &options.skin,
-                kind: Choice::Only(self.lanes.first().map_or(BusKind::Embedded, |lane| lane.bus.kind())),
+                kinds: &Kinds::exactly(self.lanes.iter().map(|lane| (lane.link.name(), lane.link.kind()))),
                 per_process: options.cells_per_process,
                 flash: options.flash.as_deref(),
             })?;
@@ -440,7 +447,7 @@ impl Bench<'_> {
             let name = self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
             match news {
                 News::Notice(Notice::Rival) => return Err(rival(name)),
-                News::Down(why) | News::Lost(why) => return Err(RunError::Failed(why)),
+                News::Down(why) | News::Lost(why) | News::Refused(why) => return Err(RunError::Failed(why)),
                 News::Notice(_) | News::Up => {}
             }
         }
@@ -482,7 +489,7 @@ impl Bench<'_> {
     }
 
     pub(super) fn each_view<T>(&self, look: impl Fn(&str, &View) -> T) -> Vec<T> {
-        let look = |lane: &Lane| lane.view.lock().ok().map(|view| look(lane.bus.name(), &view));
+        let look = |lane: &Lane| lane.view.lock().ok().map(|view| look(lane.link.name(), &view));
         self.lanes.iter().filter_map(look).collect()
     }
 
@@ -490,10 +497,10 @@ impl Bench<'_> {
     pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
         for (lane, described) in self.lanes.iter().zip(&self.options.skin.buses) {
             let frames: Vec<Frame> = message.encode().frames(described.format).collect();
-            match lane.bus.send(&frames).map_err(BusError::from) {
-                Ok(()) => self.shared.commands.fetch_add(1, Ordering::Relaxed),
-                // Counted; a bus that is down for a while costs no run its end.
-                Err(error) if error.may_pass() => {
+            match lane.link.send(&frames).map_err(BusError::from) {
+                Ok(()) => lane.link.commands().fetch_add(1, Ordering::Relaxed),
+                // Counted; a bus that is lost for a while costs no run its end.
+                Err(error) if may_return(&error) => {
                     self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed)
                 }
                 Err(error) => return Err(error.into()),

@@ -10,6 +10,7 @@ use protocol::message::Message;
 use protocol::packet::{Epoch, Packet, WORDS};
 
 use crate::central::Felt;
+use crate::cycle::carried::Heard;
 use crate::cycle::{Cycle, Record, Tick};
 use crate::scenario::{Mode, Scenario};
 use crate::table::Snapshot;
@@ -28,8 +29,6 @@ pub struct Shared {
     pub comparing: AtomicBool,
     /// Broadcasts sent so far.
     pub broadcasts: AtomicU64,
-    /// Commands that buses took, joints among them.
-    pub commands: AtomicU64,
     /// Records that did not fit into their queue.
     pub records_lost: AtomicU64,
     /// Records that did not fit into the queue to the recorder.
@@ -66,6 +65,8 @@ pub struct Line {
     pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
     /// Whether the bus works, as the receiver sees it.
     pub works: Arc<AtomicBool>,
+    /// Commands that the bus took, joints among them.
+    pub commands: Arc<AtomicU64>,
 }
 
 /// The control loop between two looks at the clock.
@@ -80,6 +81,8 @@ pub struct Turn {
     recorded: Option<rtrb::Producer<Timed>>,
     /// The halt or resume that each bus has not taken yet: its cells would else not be as the robot is.
     owed: Vec<Option<Message>>,
+    /// Whether each bus worked in the tick before.
+    worked: Vec<bool>,
 }
 
 impl Turn {
@@ -92,8 +95,8 @@ impl Turn {
         shared: Arc<Shared>,
         records: rtrb::Producer<Timed>,
     ) -> Self {
-        let owed = vec![None; lines.len()];
-        Self { cycle, lines, scenario, shared, records, recorded: None, owed }
+        let (owed, worked) = (vec![None; lines.len()], vec![true; lines.len()]);
+        Self { cycle, lines, scenario, shared, records, recorded: None, owed, worked }
     }
 
     /// Hands every tick to a recorder too.
@@ -125,15 +128,19 @@ impl Turn {
         for line in &mut self.lines {
             line.snapshot.update();
         }
-        let valid = self.lines.iter().all(|line| line.works.load(Ordering::Relaxed));
         let snapshots = || self.lines.iter().map(|line| line.snapshot.output_buffer());
-        let outcome = self.cycle.tick(tick, skipped, snapshots().map(|snapshot| &snapshot.sums), valid);
+        let heard = self.lines.iter().map(|line| Heard {
+            sums: &line.snapshot.output_buffer().sums,
+            works: line.works.load(Ordering::Relaxed),
+        });
+        let outcome = self.cycle.tick(tick, skipped, heard);
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
             let felt = self.cycle.central(snapshots());
             // Nobody else needs the result, and without anybody the compiler could leave out the work.
             (now().saturating_sub(before), std::hint::black_box(felt))
         });
+        self.owe_to_returned_buses(outcome.record.halted.is_some());
         if let Some((epoch, joints)) = outcome.joints {
             // A cell that started anew, or did not hear it, would go on answering.
             if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
@@ -170,6 +177,18 @@ impl Turn {
         }
     }
 
+    /// What a bus took just before it was lost its cells may not have heard: once it is back they are told to be as the
+    /// robot is.
+    fn owe_to_returned_buses(&mut self, halted: bool) {
+        for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
+            let works = line.works.load(Ordering::Relaxed);
+            if works && !*worked {
+                *owed = Some(if halted { Message::Halt } else { Message::Resume });
+            }
+            *worked = works;
+        }
+    }
+
     /// Tells every bus to halt or to resume; one that does not take it is told before each of its next joints.
     fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         self.owed.fill(Some(message));
@@ -178,34 +197,34 @@ impl Turn {
 
     fn say_what_is_owed(&mut self, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         for (bus, (line, owed)) in self.lines.iter().zip(&mut self.owed).enumerate() {
-            owed.take_if(|message| self.shared.say(bus, line.format, message, send));
+            owed.take_if(|message| line.say(bus, message, &self.shared, send));
         }
     }
 
     /// Sends joints on every bus.
     fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         for (bus, line) in self.lines.iter().enumerate() {
-            self.shared.say(bus, line.format, message, send);
+            line.say(bus, message, &self.shared, send);
         }
     }
 }
 
-impl Shared {
-    /// Sends a command on a bus, and counts it; whether the bus took it.
+impl Line {
+    /// Sends a command on this bus, and counts it; whether the bus took it.
     fn say(
         &self,
         bus: usize,
-        format: Format,
         message: &Message,
+        shared: &Shared,
         send: &mut impl FnMut(usize, &[Frame]) -> bool,
     ) -> bool {
-        let (frames, count) = frames(&message.encode(), format);
+        let (frames, count) = frames(&message.encode(), self.format);
         let frames = frames.get(..count).unwrap_or_default();
         let taken = send(bus, frames);
         if taken {
             self.commands.fetch_add(1, Ordering::Relaxed);
         } else {
-            self.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+            shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
         }
         taken
     }

@@ -7,24 +7,26 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::{Bus, BusKind};
+use protocol::bus::BusKind;
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Cell;
 use protocol::time::Micros;
 
+use super::launch::{ServedBus, program};
+use super::link::{Slot, may_return};
 use super::measured::Measured;
 use super::progress::Progress;
 use super::realtime::{self, Granted};
-use super::receiver::{Left, News};
-use super::start::{Bench, rival};
+use super::receiver::{Left, News, View};
+use super::start::{Bench, Lane, rival};
 use super::turn::{Timed, Turn};
 use super::{RunError, backlog, usage};
 use crate::record::Recorder;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{AccuracySummary, BusSummary, Loop, Processor, Quantiles, Summary};
-use crate::table::{Accuracy, Notice};
+use crate::summary::{AccuracySummary, BusSummary, Loop, OutagesSummary, Processor, Quantiles, Summary};
+use crate::table::{Accuracy, Notice, Said};
 
 /// What a controller counted, by name.
 type Counts = BTreeMap<String, u64>;
@@ -116,7 +118,7 @@ impl Bench<'_> {
             control: self.loop_summary(&measured, granted, controller),
             accuracy: accuracy(&received),
             backlog_dropped,
-            buses: self.bus_summaries(&received, backlog_dropped),
+            buses: self.bus_summaries(&received, backlog_dropped, &measured),
             processor,
             cell_private_kib,
             recording,
@@ -124,14 +126,16 @@ impl Bench<'_> {
     }
 
     /// The loop's thread, which leaves what the machine granted and what the controller counted.
-    fn start_loop(&self, mut turn: Turn) -> Result<thread::JoinHandle<(Granted, Counts)>, RunError> {
+    fn start_loop(&mut self, mut turn: Turn) -> Result<thread::JoinHandle<(Granted, Counts)>, RunError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
-        let buses: Vec<Arc<Bus>> = self.lanes.iter().map(|lane| Arc::clone(&lane.bus)).collect();
+        let mut slots: Vec<Slot> = self.lanes.iter_mut().filter_map(|lane| lane.slot.take()).collect();
         let control = move || {
             let granted = realtime::prepare();
-            let send = |bus: usize, frames: &[Frame]| buses.get(bus).is_some_and(|bus| bus.offer(frames));
+            let send = |bus: usize, frames: &[Frame]| {
+                slots.get_mut(bus).is_some_and(|slot| slot.read().offer(frames))
+            };
             realtime::run(&mut turn, &shared, period_ns, ticks, send);
             (granted, turn.counts().into_iter().filter(|(_, count)| *count > 0).collect())
         };
@@ -150,18 +154,19 @@ impl Bench<'_> {
     ) -> Result<(), RunError> {
         self.press(script)?;
         if self.lanes.iter().any(|lane| lane.receiver.as_ref().is_some_and(thread::JoinHandle::is_finished)) {
-            // One that lost its bus says so; one that has gone without a word must not be missed.
-            self.hear(script, progress)?;
+            // One that loses its bus stays; one that has gone without a word must not be missed.
             return Err(RunError::Failed("a receiver ended while the loop ran".to_owned()));
         }
         self.break_things(script, progress, started)?;
         self.hear(script, progress)?;
+        self.serve_again(progress);
         let before = measured.halted();
         measured.take(records, self.began);
         match (before, measured.halted()) {
             (None, Some(why)) => {
                 // One bus is enough: what is heard on it is said on the others.
-                let lane = self.lanes.first().map(|lane| (lane.bus.name(), lane.bus.kind()));
+                let lane = self.lanes.iter().find(|lane| lane.link.is_there()).or(self.lanes.first());
+                let lane = lane.map(|lane| (lane.link.name(), lane.link.kind()));
                 let (bus, kind) = lane.unwrap_or(("BUS", BusKind::SocketCan));
                 let remedy = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
                 progress.note(&format!("the robot is halted: {why}; {remedy}"));
@@ -222,9 +227,9 @@ impl Bench<'_> {
             page: SensorPage::Skin(stimulus.sensors),
         };
         let frames: Vec<Frame> = message.encode().frames(described.format).collect();
-        match lane.bus.send(&frames) {
+        match lane.link.send(&frames) {
             // Counted; what the cells then feel is what the bus carried.
-            Err(error) if error.cause.may_pass() => {
+            Err(error) if may_return(&error.cause) => {
                 self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
                 Ok(())
             }
@@ -288,7 +293,17 @@ impl Bench<'_> {
                     // What was to change meanwhile did not come to them.
                     self.remind(script, |it| it.bus == bus)?;
                 }
-                News::Lost(why) => return Err(RunError::Failed(why)),
+                // Who has no bus left feels nothing.
+                News::Lost(why) if self.lanes.iter().all(|lane| lane.link.is_gone()) => {
+                    return Err(RunError::Failed(why));
+                }
+                News::Lost(why) => {
+                    progress
+                        .note(&format!("{why}; the others go on, and it is opened again when it is back"));
+                }
+                News::Refused(why) => {
+                    progress.note(&format!("{} cannot be opened again yet: {why}", name(bus)))
+                }
             }
         }
         for ((bus, how), cells) in changed {
@@ -310,21 +325,52 @@ impl Bench<'_> {
     fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
         thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
         self.wait_until(|bench| bench.has_caught_up())?;
-        let alive = self.count(|cell| cell.ready);
         self.say(&Message::Report)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.count(|cell| cell.said.counters) >= alive)?;
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters))?;
         if interrupted {
             self.say(&Message::Halt)?;
         }
         // Last of all, so that each cell's own count covers everything else that it has sent.
         self.say(&Message::Sync)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.count(|cell| cell.said.heartbeat) >= alive)
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat))
     }
 
-    /// Whether the receivers have read everything that was sent; what came before it they have read too.
+    /// Whether the receivers have read everything that was sent; what came before it they have read too. Of a bus
+    /// that is lost nothing is waited for.
     fn has_caught_up(&self) -> bool {
-        self.each_view(|_, view| view.commands).into_iter().sum::<u64>()
-            >= self.shared.commands.load(Ordering::Relaxed)
+        self.lanes.iter().all(|lane| {
+            let read = lane.view.lock().map_or(u64::MAX, |view| view.commands);
+            !lane.link.is_there() || read >= lane.link.commands().load(Ordering::Relaxed)
+        })
+    }
+
+    /// Whether all cells have said it that can be expected to, on buses that work.
+    fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
+        self.lanes.iter().filter(|lane| lane.link.is_there()).all(|lane| {
+            let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
+            lane.view.lock().map_or(true, |view| all(&view))
+        })
+    }
+
+    /// Serves embedded buses again that were ours and whose processes have ended.
+    fn serve_again(&mut self, progress: &mut Progress) {
+        let gone: Vec<_> = self.lanes.iter().filter(|lane| lane.link.is_gone()).collect();
+        for served in &mut self.served {
+            let name = served.bus().to_owned();
+            if !gone.iter().any(|lane| lane.link.name() == name) {
+                continue;
+            }
+            let Some(status) = served.ended() else { continue };
+            let again = program("vcan-setup", self.options.vcan_setup.as_deref())
+                .and_then(|program| ServedBus::start(&program, &name));
+            progress.note(&match again {
+                Ok(again) => {
+                    *served = again;
+                    format!("the process that served {name} ended ({status}); it is served again")
+                }
+                Err(error) => format!("the process that served {name} ended ({status}), and {error}"),
+            });
+        }
     }
 
     /// Waits for something, but not for ever; what is missing then shows in the accounts.
@@ -340,7 +386,7 @@ impl Bench<'_> {
         Spent {
             gateway: usage::own_seconds(),
             cells: self.processes.pids().map(|pid| (pid, usage::processor_seconds(pid))).collect(),
-            buses: self.served.iter().map(|served| usage::processor_seconds(served.pid())).sum(),
+            buses: self.served.iter().map(|it| (it.pid(), usage::processor_seconds(it.pid()))).collect(),
         }
     }
 
@@ -365,21 +411,34 @@ impl Bench<'_> {
         }
     }
 
-    fn bus_summaries(&self, received: &[Option<Left>], backlog_dropped: Option<u64>) -> Vec<BusSummary> {
+    fn bus_summaries(
+        &self,
+        received: &[Option<Left>],
+        backlog_dropped: Option<u64>,
+        measured: &Measured,
+    ) -> Vec<BusSummary> {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now = Micros(u64::try_from(wall.as_micros()).unwrap_or(u64::MAX));
-        let pairs = self.lanes.iter().zip(received);
-        let summary = |(lane, received): (&super::start::Lane, &Option<Left>)| {
+        let pairs = self.lanes.iter().zip(received).enumerate();
+        let summary = |(index, (lane, received)): (usize, (&Lane, &Option<Left>))| {
             let received = received.as_ref()?;
-            let (bus, kind) = (&lane.bus, lane.bus.kind().to_string());
-            Some(BusSummary::new(
+            let (bus, kind) = (&lane.link, lane.link.kind().to_string());
+            let mut summary = BusSummary::new(
                 bus.name(),
                 &kind,
                 bus.receive_buffer(),
                 &received.table,
                 received.dropped,
                 now,
-            ))
+            );
+            let Left { outages, .. } = received;
+            summary.outages = OutagesSummary {
+                times: outages.times,
+                lost_s: outages.lost(Instant::now()).as_secs_f64(),
+                at_end: outages.lasts(),
+                ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
+            };
+            Some(summary)
         };
         let mut summaries: Vec<_> = pairs.filter_map(summary).collect();
         // Nobody knows of which bus they were, but of the kernel's own.
@@ -401,18 +460,22 @@ struct Spent {
     gateway: f64,
     /// Of each cell's process.
     cells: HashMap<u32, f64>,
-    buses: f64,
+    /// Of each process that serves a bus.
+    buses: HashMap<u32, f64>,
 }
 
 impl Spent {
     /// What was spent since, in cores; of processes that are still there.
     fn since(&self, before: &Self, seconds: f64) -> Processor {
-        let cell = |(pid, spent): (&u32, &f64)| spent - before.cells.get(pid).copied().unwrap_or(0.0);
+        let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
+            let one = |(pid, spent): (&u32, &f64)| spent - before.get(pid).copied().unwrap_or(0.0);
+            // Not sum(), which is -0.0 of no processes.
+            now.iter().map(one).fold(0.0, |all, one| all + one) / seconds
+        };
         Processor {
             gateway: (self.gateway - before.gateway) / seconds,
-            // Not sum(), which is -0.0 of no cells.
-            cells: self.cells.iter().map(cell).fold(0.0, |all, one| all + one) / seconds,
-            buses: (self.buses - before.buses) / seconds,
+            cells: since(&self.cells, &before.cells),
+            buses: since(&self.buses, &before.buses),
         }
     }
 }

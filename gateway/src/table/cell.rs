@@ -452,6 +452,15 @@ impl Cell {
         Some((skipped.into(), if unheard > u16::MAX - 64 { 0 } else { unheard.into() }))
     }
 
+    /// The bus is lost: what is still due may have been said and not carried.
+    pub(super) fn interrupt(&mut self) {
+        let due = u64::from(self.due.count_ones());
+        self.replies.missing += due;
+        self.replies.in_doubt += due;
+        self.due = 0;
+        self.uplink.interrupt();
+    }
+
     /// Nothing more will come: what is still due is missing.
     pub(super) fn settle(&mut self) {
         self.uplink.finish();

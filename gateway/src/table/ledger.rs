@@ -15,6 +15,8 @@ pub struct Uplink {
     pub rejected: u64,
     /// Sent and never arrived.
     pub lost: u64,
+    /// Of the lost ones, those of a time in which the bus was lost.
+    pub outage: u64,
     /// Arrived more often than sent: repeated on the way, or sent by somebody else under this name.
     pub surplus: u64,
     /// Arrived with nothing to compare it with: before a cell's first heartbeat, and between its last one
@@ -28,6 +30,8 @@ pub struct Uplink {
     arrived_since: u64,
     rejected_since: u64,
     sums: Option<Sums>,
+    /// The bus was lost since the last heartbeat.
+    interrupted: bool,
 }
 
 /// Sums that a cell sends to another one and the gateway does not take, by the cell's own count.
@@ -45,6 +49,11 @@ struct Sums {
 }
 
 impl Uplink {
+    /// The bus is lost: what the cell sends until it is heard again does not arrive.
+    pub(super) const fn interrupt(&mut self) {
+        self.interrupted = true;
+    }
+
     /// A packet arrived.
     pub(super) const fn arrive(&mut self) {
         self.arrived_since += 1;
@@ -80,7 +89,7 @@ impl Uplink {
         let Some(sums) = &mut self.sums else { return };
         // With joints between its page and its heartbeat, it may have said more of them than the page counts.
         let at_most = if sums.page_at == sums.heartbeat_at { sums.count - sums.found } else { u64::MAX };
-        let found = self.lost.min(at_most);
+        let found = (self.lost - self.outage).min(at_most);
         self.lost -= found;
         self.unheard += found;
         sums.found += found;
@@ -108,6 +117,7 @@ impl Uplink {
                 *sums = Sums { said: Some(0), ..Sums::default() };
             }
         }
+        let interrupted = core::mem::take(&mut self.interrupted);
         let Some(before) = before.filter(|_| !restarted) else {
             // The account begins with this heartbeat.
             self.sent += 1;
@@ -119,7 +129,9 @@ impl Uplink {
         self.sent += sent;
         self.delivered += arrived;
         self.rejected += rejected;
-        self.lost += sent.saturating_sub(arrived + rejected);
+        let lost = sent.saturating_sub(arrived + rejected);
+        self.lost += lost;
+        self.outage += if interrupted { lost } else { 0 };
         self.surplus += (arrived + rejected).saturating_sub(sent);
     }
 
@@ -137,6 +149,7 @@ impl Uplink {
             delivered: sum.delivered + one.delivered,
             rejected: sum.rejected + one.rejected,
             lost: sum.lost + one.lost,
+            outage: sum.outage + one.outage,
             surplus: sum.surplus + one.surplus,
             in_doubt: sum.in_doubt + one.in_doubt,
             restarts: sum.restarts + one.restarts,
@@ -145,6 +158,7 @@ impl Uplink {
             arrived_since: sum.arrived_since + one.arrived_since,
             rejected_since: sum.rejected_since + one.rejected_since,
             sums: None,
+            interrupted: false,
         })
     }
 }
@@ -162,7 +176,7 @@ pub struct Replies {
     pub late: u64,
     /// Not answered.
     pub missing: u64,
-    /// Of the missing ones, those of a cell that was dead or started anew.
+    /// Of the missing ones, those of a cell that was dead or started anew, or whose bus was lost.
     pub in_doubt: u64,
     /// Torques that nobody was waiting for: ends of contacts, and cells whose sensors are unknown.
     pub unasked: u64,
@@ -205,6 +219,24 @@ mod tests {
         uplink.settle(0, true);
         assert_eq!((uplink.sent, uplink.lost, uplink.in_doubt), (7, 2, 1));
         assert_eq!((uplink.restarts, uplink.unsettled()), (1, 0));
+    }
+
+    #[test]
+    fn what_did_not_arrive_while_the_bus_was_lost_is_known_to_be_so() {
+        let mut uplink = Uplink::default();
+        uplink.settle(0, false);
+        uplink.interrupt();
+        uplink.arrive();
+        uplink.settle(5, false);
+        assert_eq!((uplink.sent, uplink.lost, uplink.outage), (6, 4, 4));
+        uplink.arrive();
+        uplink.settle(8, false);
+        assert_eq!((uplink.sent, uplink.lost, uplink.outage), (9, 6, 4), "the bus is back");
+        uplink.interrupt();
+        uplink.settle(0, true);
+        uplink.arrive();
+        uplink.settle(2, false);
+        assert_eq!((uplink.lost, uplink.outage), (7, 4), "a new life has an account of its own");
     }
 
     proptest! {

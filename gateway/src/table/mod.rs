@@ -145,6 +145,8 @@ pub struct Table {
     trunk: Option<Trunk>,
     /// Nodes that the skin does not have, each with its last heartbeat.
     strangers: BTreeMap<CellId, Heartbeat>,
+    /// The bus was lost since the last broadcast.
+    interrupted: bool,
     /// Twice, four times ... a torque is a whole number of these, so that the sum never drifts.
     sum: [i64; WORDS],
     snapshot: Snapshot,
@@ -181,6 +183,7 @@ impl Table {
             broadcast: None,
             trunk: summed.then(Trunk::default),
             strangers: BTreeMap::new(),
+            interrupted: false,
             sum: [0; WORDS],
             snapshot,
             counters: Counters::default(),
@@ -508,6 +511,7 @@ impl Table {
             *newest = Some(epoch);
         }
         self.close_epoch();
+        self.let_go_of_what_is_over(epoch);
         let frames = self.comparing.then(|| self.central.frames(&joints.positions));
         let exact = frames.map(|_| {
             self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians)))
@@ -575,6 +579,23 @@ impl Table {
         self.counters.epoch(before.due > 0, before.in_time == before.due);
         if self.comparing && before.due > 0 && before.in_time == before.due {
             self.accuracy.whole_skin(&before.error);
+        }
+    }
+
+    /// The bus is lost: what was on its way is in doubt, and half packets will not become whole. The torques stay as
+    /// they are, and the loop lets them go.
+    pub fn interrupt(&mut self) {
+        self.interrupted = true;
+        self.halves.fill(Half::NONE);
+        self.cells.iter_mut().for_each(Cell::interrupt);
+    }
+
+    /// What the loop has let go while the bus carried no joints does not come back with the next ones that it carries.
+    fn let_go_of_what_is_over(&mut self, epoch: Epoch) {
+        let gap = self.broadcast.map_or(0, |before| epoch.since(before.epoch));
+        let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
+        if core::mem::take(&mut self.interrupted) || over {
+            self.each_cell(Cell::let_go);
         }
     }
 
@@ -661,6 +682,7 @@ mod tests_sums;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::fixed::Q3_12;
     use protocol::id::CellId;
     use protocol::message::Heard;
     use protocol::packet::Packet;
@@ -675,6 +697,33 @@ mod tests {
             }
         }
         table
+    }
+
+    #[test]
+    fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
+        let cell = CellId::new(1).unwrap();
+        let joints = |epoch| Message::Joints {
+            epoch: Epoch(epoch),
+            joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
+        };
+        let torque = |epoch| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [Q3_12::MAX; WORDS] };
+        let hear = |table: &mut Table, own, message: Message| {
+            for frame in message.encode().frames(Format::Fd) {
+                table.handle_frame(Micros(0), own, &frame, &mut |_| None);
+            }
+            table.snapshot().sums.contributing
+        };
+        for (interrupted, next, contributing) in [(false, 2, 1), (true, 2, 0), (false, 8, 1), (false, 9, 0)] {
+            let mut table = table(&[(true, joints(1)), (false, torque(1))]);
+            assert_eq!(table.snapshot().sums.contributing, 1);
+            if interrupted {
+                table.interrupt();
+                assert_eq!(table.snapshot().sums.contributing, 1, "the loop lets it go");
+            }
+            let after = hear(&mut table, true, joints(next));
+            assert_eq!(after, contributing, "{interrupted}, joints {next} after joints 1");
+            assert_eq!(hear(&mut table, false, torque(next)), 1, "new ones count again");
+        }
     }
 
     #[test]

@@ -3,7 +3,8 @@
 use std::collections::{HashMap, HashSet};
 
 use super::{
-    Bus, Cell, Controller, ControllerKind, DenavitHartenberg, Reply, Robot, Safety, Skin, Timing, raw,
+    Bus, Cell, Controller, ControllerKind, DenavitHartenberg, LostBus, Reply, Robot, Safety, Skin, Timing,
+    raw,
 };
 use crate::can::Format;
 use crate::document::Fault;
@@ -332,10 +333,19 @@ fn safety(raw: &raw::Safety) -> Checked<Safety> {
         Ok(value) if (least..=10_000).contains(&value) => Ok(value),
         _ => Err(Fault::new(&[Key("safety"), Key(key)], got, format_args!("{least} to 10000 are possible"))),
     };
+    let lost_bus = match raw.lost_bus.as_str() {
+        "go-on" => LostBus::GoOn,
+        "halt" => LostBus::Halt,
+        got => {
+            let path = [Key("safety"), Key("lost_bus")];
+            return Err(Fault::new(&path, format!("{got:?}"), "\"go-on\" or \"halt\""));
+        }
+    };
     Ok(Safety {
         hold_epochs: bounded("hold_epochs", raw.hold_epochs, 0)?,
         decay_epochs: bounded("decay_epochs", raw.decay_epochs, 0)?,
         bad_cycles: bounded("bad_cycles", raw.bad_cycles, 1)?,
+        lost_bus,
     })
 }
 

@@ -148,6 +148,30 @@ pub struct Safety {
     pub decay_epochs: u32,
     /// Bad cycles in a row that halt the robot.
     pub bad_cycles: u32,
+    /// What is done while some of several buses are lost.
+    pub lost_bus: LostBus,
+}
+
+/// What is done while some buses are lost and others are not. When all are lost the torque may not be used,
+/// whatever this says.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum LostBus {
+    /// The torques of a lost bus are let go as those of cells that fell silent, and the robot goes on with the others.
+    #[default]
+    GoOn,
+    /// The torque may not be used: bad cycles, which halt the robot.
+    Halt,
+}
+
+impl LostBus {
+    /// The word in the file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::GoOn => "go-on",
+            Self::Halt => "halt",
+        }
+    }
 }
 
 /// One cell.

@@ -81,12 +81,13 @@ pub(super) struct Safety {
     pub(super) hold_epochs: i64,
     pub(super) decay_epochs: i64,
     pub(super) bad_cycles: i64,
+    pub(super) lost_bus: String,
 }
 
 impl Default for Safety {
     /// Two missed replies are forgotten, four more let go; a twentieth of a second of bad cycles halts.
     fn default() -> Self {
-        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25 }
+        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: "go-on".to_owned() }
     }
 }
 

@@ -1,0 +1,202 @@
+//! One bus as the threads of a run share it: lost, and had again, without anybody waiting for it.
+//!
+//! The receiver opens a bus that is gone anew. The loop finds the new one in a triple buffer, where it neither waits nor
+//! frees anything; whoever has more time asks [`Link::send`].
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, BusError, BusKind, Choice, Options, SendError};
+use protocol::can::Frame;
+
+/// One bus.
+#[derive(Debug)]
+pub struct Link {
+    name: String,
+    kind: BusKind,
+    receive_buffer: usize,
+    /// How it was opened, and is again.
+    wanted: Options,
+    bus: Mutex<Arc<Bus>>,
+    works: Arc<AtomicBool>,
+    gone: AtomicBool,
+    commands: Arc<AtomicU64>,
+}
+
+/// Where the loop finds the bus.
+pub type Slot = triple_buffer::Output<Arc<Bus>>;
+
+/// The receiver's end of a link.
+#[derive(Debug)]
+pub struct Ear {
+    /// The link.
+    pub link: Arc<Link>,
+    /// The bus, as it was opened last.
+    pub bus: Arc<Bus>,
+    slot: triple_buffer::Input<Arc<Bus>>,
+}
+
+impl Link {
+    /// A bus that was opened so.
+    #[must_use]
+    pub fn new(bus: Bus, wanted: Options) -> (Arc<Self>, Ear, Slot) {
+        let (name, kind, receive_buffer) = (bus.name().to_owned(), bus.kind(), bus.receive_buffer());
+        let bus = Arc::new(bus);
+        let link = Arc::new(Self {
+            name,
+            kind,
+            receive_buffer,
+            wanted,
+            bus: Mutex::new(Arc::clone(&bus)),
+            works: Arc::new(AtomicBool::new(true)),
+            gone: AtomicBool::new(false),
+            commands: Arc::default(),
+        });
+        let (slot, output) = triple_buffer::triple_buffer(&bus);
+        (Arc::clone(&link), Ear { link, bus, slot }, output)
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What carries its frames.
+    #[must_use]
+    pub const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    /// How many bytes may wait unread, as they were granted when it was first opened.
+    #[must_use]
+    pub const fn receive_buffer(&self) -> usize {
+        self.receive_buffer
+    }
+
+    /// Whether it works, as its receiver sees it.
+    #[must_use]
+    pub const fn works(&self) -> &Arc<AtomicBool> {
+        &self.works
+    }
+
+    /// Whether it works now.
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        self.works.load(Ordering::Relaxed)
+    }
+
+    /// Whether it has to be opened anew.
+    #[must_use]
+    pub fn is_gone(&self) -> bool {
+        self.gone.load(Ordering::Relaxed)
+    }
+
+    /// Commands of this gateway's that it took.
+    #[must_use]
+    pub const fn commands(&self) -> &Arc<AtomicU64> {
+        &self.commands
+    }
+
+    /// Sends frames; not for the loop, for a bus that is being exchanged is waited for.
+    ///
+    /// # Errors
+    /// The reason, and how many were sent before it.
+    pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
+        let bus = Arc::clone(&self.bus.lock().unwrap_or_else(PoisonError::into_inner));
+        bus.send(frames)
+    }
+}
+
+/// Whether a bus that says so may be had again, by waiting or by opening it anew.
+#[must_use]
+pub const fn may_return(error: &BusError) -> bool {
+    error.may_pass() || error.is_closed()
+}
+
+impl Ear {
+    /// Notes that it does not work; `gone` if it has to be opened anew. Whether that is news.
+    pub fn lose(&self, gone: bool) -> bool {
+        let news = gone && !self.link.gone.swap(true, Ordering::Relaxed);
+        self.link.works.swap(false, Ordering::Relaxed) || news
+    }
+
+    /// Notes that it works. Whether that is news.
+    pub fn regain(&self) -> bool {
+        !self.link.works.swap(true, Ordering::Relaxed)
+    }
+
+    /// Opens a bus that is gone anew, and hands it to everybody.
+    ///
+    /// # Errors
+    /// When it does not open yet.
+    pub fn reopen(&mut self) -> Result<(), BusError> {
+        let Link { name, kind, wanted, .. } = &*self.link;
+        self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), wanted)?);
+        *self.link.bus.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(&self.bus);
+        self.slot.write(Arc::clone(&self.bus));
+        self.link.gone.store(false, Ordering::Relaxed);
+        Ok(())
+    }
+}
+
+/// How often a bus was lost, and for how long.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Outages {
+    /// How often.
+    pub times: u64,
+    /// For how long, all times together, but for the one that lasts.
+    lost: Duration,
+    /// Since when it is lost.
+    since: Option<Instant>,
+}
+
+impl Outages {
+    /// It is lost from now on, if it was not.
+    pub fn begin(&mut self, now: Instant) {
+        if self.since.is_none() {
+            self.times += 1;
+            self.since = Some(now);
+        }
+    }
+
+    /// It is there again.
+    pub fn end(&mut self, now: Instant) {
+        self.lost += self.since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
+    }
+
+    /// For how long it was lost until now.
+    #[must_use]
+    pub fn lost(&self, now: Instant) -> Duration {
+        let mut until_now = *self;
+        until_now.end(now);
+        until_now.lost
+    }
+
+    /// Whether it is lost.
+    #[must_use]
+    pub const fn lasts(&self) -> bool {
+        self.since.is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn outages_are_counted_and_add_up_also_one_that_lasts() {
+        let (start, second) = (Instant::now(), Duration::from_secs(1));
+        let mut outages = Outages::default();
+        outages.end(start);
+        assert_eq!(outages, Outages::default());
+        outages.begin(start);
+        outages.begin(start + second);
+        outages.end(start + 2 * second);
+        outages.begin(start + 5 * second);
+        assert_eq!((outages.times, outages.lost(start + 6 * second), outages.lasts()), (2, 3 * second, true));
+        outages.end(start + 9 * second);
+        assert_eq!((outages.lost(start + 99 * second), outages.lasts()), (6 * second, false));
+    }
+}
