@@ -242,7 +242,8 @@ fn adds_up(place: &Place) -> Log {
     let all_was_heard = cells_that_heard_all(&log).len() == CELLS && !halves.contains_key(&0x001);
     assert!(summary.of_bus("/replies/unknown") == 0 || !all_was_heard, "{:#}", summary.0);
     let of = |pointer: &str| summary.of_bus(pointer);
-    let lost = of("/uplink/dropped") + of("/uplink/backlog") + of("/uplink/unknown");
+    let reasons = ["dropped", "backlog", "outage", "unknown"];
+    let lost: u64 = reasons.map(|reason| of(&format!("/uplink/{reason}"))).iter().sum();
     let arrived = of("/uplink/delivered") + of("/uplink/rejected");
     assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", summary.0);
     log

@@ -165,7 +165,7 @@ impl Bench<'_> {
         match (before, measured.halted()) {
             (None, Some(why)) => {
                 // One bus is enough: what is heard on it is said on the others.
-                let lane = self.lanes.iter().find(|lane| lane.link.is_there()).or(self.lanes.first());
+                let lane = self.lanes.iter().find(|lane| lane.link.is_there()).or_else(|| self.lanes.first());
                 let lane = lane.map(|lane| (lane.link.name(), lane.link.kind()));
                 let (bus, kind) = lane.unwrap_or(("BUS", BusKind::SocketCan));
                 let remedy = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");

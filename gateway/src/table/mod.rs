@@ -582,11 +582,9 @@ impl Table {
         }
     }
 
-    /// The bus is lost: what was on its way is in doubt, and half packets will not become whole. The torques stay as
-    /// they are, and the loop lets them go.
+    /// The bus is lost: what was on its way is in doubt. The torques stay as they are, and the loop lets them go.
     pub fn interrupt(&mut self) {
         self.interrupted = true;
-        self.halves.fill(Half::NONE);
         self.cells.iter_mut().for_each(Cell::interrupt);
     }
 
