@@ -45,8 +45,8 @@ mod inbox;
 #[expect(unsafe_code, reason = "recvmmsg, sendmmsg and two ioctls have no safe wrapper")]
 mod io;
 mod kernel;
-mod link;
 mod kinds;
+mod link;
 
 pub use error::{BusError, SendError};
 pub use filter::Filter;

@@ -293,6 +293,8 @@ impl Plan<'_> {
             arguments.extend(["--nodes".to_owned(), format!("{first}-{last}")]);
         }
         arguments.extend(["--skin".to_owned(), self.skin_file.display().to_string()]);
+        // A bus that is lost is served or made again, and the cells on it are the same.
+        arguments.push("--reconnect".to_owned());
         arguments.extend(["--bus-kind".to_owned(), self.kinds.of(bus).to_string()]);
         arguments.extend(["--with-parent".to_owned(), std::process::id().to_string()]);
         if let Some(flash) = self.flash {

@@ -558,14 +558,9 @@ impl Summary {
                 ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
             let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
             assert_eq!(replies, of("/replies/due"), "{:#}", self.0);
-<<<<<<< HEAD
             let arrived = of("/uplink/delivered") + of("/uplink/rejected") + of("/uplink/unheard");
-            let lost = of("/uplink/dropped") + of("/uplink/backlog") + of("/uplink/unknown");
-=======
-            let arrived = of("/uplink/delivered") + of("/uplink/rejected");
             let reasons = ["dropped", "backlog", "outage", "unknown"];
             let lost: u64 = reasons.map(|reason| of(&format!("/uplink/{reason}"))).iter().sum();
->>>>>>> d4a415f (What becomes of a robot that loses a bus is written down; accounts of an outage; kinds of buses one by one)
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);
             if !self.0["buses"][bus]["sums"].is_null() {
