@@ -42,7 +42,7 @@ const SHOWING: Span = Span::from_millis(3_000);
 /// Cells that are asked by themselves at the same time.
 const WINDOW: usize = 16;
 /// How long nobody may answer a request to everyone before it is over, and what remains is asked of each.
-const QUIET: Span = Span::from_millis(100);
+const QUIET: Span = Span::from_millis(150);
 /// From one sync to the next while heartbeats are awaited.
 const SYNC: Span = Span::from_millis(300);
 /// How often a gateway says that it is there: nobody begins beside it.
@@ -71,7 +71,6 @@ enum Phase {
 #[derive(Clone, Copy, Debug)]
 struct Call {
     ask: Ask,
-    tag: u8,
     /// When it is over, unless somebody answers before that.
     due: Micros,
 }
@@ -144,7 +143,8 @@ pub struct Commission {
     phase: Phase,
     calls: VecDeque<Ask>,
     call: Option<Call>,
-    call_tag: u8,
+    /// All requests to everyone so far, with their tags: who is late has answered all the same.
+    called: Vec<(Ask, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
     requests: u64,
@@ -173,7 +173,7 @@ impl Commission {
             phase: Phase::Listen(now + LISTEN),
             calls: VecDeque::new(),
             call: None,
-            call_tag: 0,
+            called: Vec::new(),
             outbox: VecDeque::new(),
             announced: None,
             requests: 0,
@@ -207,12 +207,11 @@ impl Commission {
                 self.hear(now, number, &heartbeat);
             }
             Message::Configured { from, tag, answer } => {
-                let call = self.call.map(|call| (call.ask, call.tag));
+                let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
                 let wish = self.wish;
                 let Some(task) = self.holder(from) else { return };
-                let before = call.is_some_and(|(ask, _)| task.needs(ask));
-                task.answer(now, tag, answer, call, wish);
-                if let Some(call) = self.call.as_mut().filter(|call| before && call.tag == tag) {
+                task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
+                if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
                     call.due = now + QUIET;
                 }
             }
@@ -406,9 +405,11 @@ impl Commission {
             if !self.may_call(ask) {
                 continue;
             }
-            self.call_tag = self.call_tag.wrapping_add(1) | EVERYONE;
-            self.call = Some(Call { ask, tag: self.call_tag, due: now + QUIET });
-            self.request(place, Node::Everyone, ask, self.call_tag);
+            // There are fewer of them than tags.
+            let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
+            self.called.push((ask, tag));
+            self.call = Some(Call { ask, due: now + QUIET });
+            self.request(place, Node::Everyone, ask, tag);
         }
     }
 

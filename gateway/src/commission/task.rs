@@ -258,17 +258,10 @@ impl Task {
         [self.asked.map(|asked| asked.due), settled, beat].into_iter().flatten().min()
     }
 
-    /// Takes an answer: to what it was asked itself, or to `call`, which everyone was.
-    pub(super) fn answer(
-        &mut self,
-        now: Micros,
-        tag: u8,
-        answer: Answer,
-        call: Option<(Ask, u8)>,
-        wish: Wish,
-    ) {
+    /// Takes an answer: to what it was asked itself, or to `call`, which everyone was asked with this tag.
+    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Ask>, wish: Wish) {
         let own = self.asked.filter(|asked| asked.tag == tag).map(|asked| asked.ask);
-        let called = call.filter(|&(ask, called)| called == tag && self.needs(ask)).map(|(ask, _)| ask);
+        let called = call.filter(|&ask| self.needs(ask));
         let Some(ask) = own.or(called) else { return };
         let parameter = ask.parameter();
         let is_write = !matches!(ask, Ask::Read(_));
