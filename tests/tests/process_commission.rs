@@ -8,8 +8,9 @@ use std::fs;
 
 use cell_node::flash;
 use cell_node::node::Identity;
-use gateway::generate::Format;
+use gateway::generate::{Format, Reply, Wanted, generate};
 use process::{Ended, Place, Running, skin, skin_of, until};
+use protocol::id::CellId;
 use protocol::parameters::Parameters;
 use protocol::skin::Skin;
 use rustix::process::Signal;
@@ -243,6 +244,82 @@ fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
     // A bench of the copy runs with the cells that are there.
     let run = "run as-is.toml --no-spawn --bus-kind embedded --duration 0.5 --quiet";
     workshop.place.start("gateway", run).end().well();
+}
+
+#[test]
+fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters() {
+    let place = Place::new();
+    let text = generate(&Wanted { cells: 8, reply: Reply::Sum, ..Wanted::default() }).unwrap();
+    place.write("skin.toml", &text);
+    fs::create_dir(place.path("flash")).unwrap();
+    let bus = place.start("vcan-setup", "serve vcan0");
+    bus.prints("serving ");
+    let cell = |node: u8| {
+        let fresh = format!("--node {node} --skin skin.toml --fresh --flash flash");
+        place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded {fresh}"))
+    };
+    let _cells: Vec<_> = (1..=8).rev().map(cell).collect();
+    let commission = |more: &str| {
+        place.start("gateway", &format!("commission skin.toml --bus-kind embedded {more}")).end()
+    };
+    // A slow machine may not have started all of them before the first one ends.
+    until("all of them", || (commission("--quiet --numbers as-is.toml").code() == Some(0)).then_some(()));
+    let skin = Skin::read(&place.path("skin.toml")).unwrap();
+    let copy = Skin::read(&place.path("as-is.toml")).unwrap();
+    let mut numbers: Vec<_> = copy.cells.iter().map(|cell| cell.node.get()).collect();
+    numbers.sort_unstable();
+    assert_eq!(numbers, (1..=8).collect::<Vec<_>>(), "dense and unique");
+    for (described, there) in skin.cells.iter().zip(&copy.cells) {
+        let file = fs::read(place.path(&format!("flash/vcan0-s{}.flash", described.serial))).unwrap();
+        let kept = flash::decode(Identity { cell: None, serial: described.serial }, &file).unwrap();
+        assert_eq!((kept.number, kept.parameters), (Some(there.node), Some(skin.parameters(described))));
+        // What is wired to what is the same, by other names.
+        let renamed =
+            |node: CellId| skin.cells.iter().position(|cell| cell.node == node).map(|at| copy.cells[at].node);
+        assert_eq!(described.neighbors.map(|it| it.and_then(renamed)), there.neighbors);
+    }
+    let again = commission("--json").well();
+    assert_eq!(json(&again).pointer("/buses/0/already_so"), Some(&8.into()), "{again:#?}");
+}
+
+#[test]
+fn several_buses_are_commissioned_at_the_same_time_or_one_alone() {
+    let place = Place::new();
+    let text = skin_of(10, 2, Format::Fd);
+    place.write("skin.toml", &text);
+    place.write("had.toml", &older(&text));
+    let buses = ["vcan0", "vcan1"].map(|bus| {
+        let served = place.start("vcan-setup", &format!("serve {bus}"));
+        served.prints("serving ");
+        let cells = format!("--bus {bus} --nodes 1-5 --skin had.toml --bus-kind embedded");
+        (served, place.start("cell-node", &cells))
+    });
+    let commission = |more: &str| {
+        place
+            .start("gateway", &format!("commission skin.toml --bus-kind embedded --json --quiet {more}"))
+            .end()
+    };
+    until("the second bus", || (commission("--bus vcan1").code() == Some(0)).then_some(()));
+    let both = until("both", || Some(commission("")).filter(|ended| ended.code() == Some(0)));
+    let both = json(&both);
+    let parts = |bus: &Value| (bus["name"].clone(), bus["written"].clone(), bus["already_so"].clone());
+    let expected = [("vcan0".into(), 5.into(), 0.into()), ("vcan1".into(), 0.into(), 5.into())];
+    assert_eq!(both["buses"].as_array().unwrap().iter().map(parts).collect::<Vec<_>>(), expected);
+    drop(buses);
+}
+
+#[test]
+fn a_list_is_drawn_anew_while_it_is_watched() {
+    let workshop = Workshop::new(&skin(3));
+    let watched = workshop
+        .place
+        .start("gateway", "cells vcan0 --bus-kind embedded --watch --json --for 2.2")
+        .end()
+        .well();
+    let lines: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let last = lines.last().unwrap()["cells"].as_array().unwrap();
+    assert!(lines.len() >= 2 && last.len() == 3, "{watched:#?}");
+    assert!(last.iter().all(|cell| cell["heard"].is_object() && cell["tree"].is_null()), "{last:#?}");
 }
 
 #[test]
