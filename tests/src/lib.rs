@@ -17,6 +17,7 @@ pub mod accounts;
 pub mod bench;
 pub mod fault;
 pub mod gateway;
+pub mod network;
 pub mod seat;
 pub mod skins;
 pub mod witness;

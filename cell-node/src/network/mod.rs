@@ -82,7 +82,7 @@ pub struct Network {
     last_walk: Option<u8>,
     given: Option<u8>,
     was_unnumbered: bool,
-    reported: [PortState; PORTS],
+    reported: Option<[PortState; PORTS]>,
     changes: u16,
     tree_changed: bool,
     next_hello: Micros,
@@ -109,7 +109,7 @@ impl Network {
             last_walk: None,
             given: None,
             was_unnumbered: false,
-            reported: [PortState::default(); PORTS],
+            reported: None,
             changes: 0,
             tree_changed: false,
             next_hello: now,
@@ -234,7 +234,7 @@ impl Network {
     /// Whether the ports lead to something else than when this was asked last.
     pub fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
-        core::mem::replace(&mut self.reported, states) != states
+        self.reported.replace(states) != Some(states)
     }
 
     /// Whether the place in the tree is another than when this was asked last.
@@ -523,6 +523,10 @@ impl Network {
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
+            if self.up() == Some(UPLINK) {
+                // The gateway's side may notice it later, and takes sums until then.
+                self.joining = Some((UPLINK, now + HELLO));
+            }
             self.lose_parent(now, Lost::Gone);
         }
         if let Some((since, false)) = self.orphan

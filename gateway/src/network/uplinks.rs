@@ -88,6 +88,13 @@ impl Uplinks {
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
+    /// Whether the sums of a root are for the gateway. A root may also be the child of another cell: then its sums
+    /// are in that one's.
+    #[must_use]
+    pub fn takes(&self, root: usize) -> bool {
+        self.wires.get(root).is_some_and(|wire| wire.is_child)
+    }
+
     /// The round of exploration.
     #[must_use]
     pub const fn round(&self) -> u8 {
@@ -166,6 +173,9 @@ impl Uplinks {
         if now >= self.next_hello {
             let missed = now.since(self.next_hello).0 / HELLO.0;
             self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
+            for wire in &mut self.wires {
+                wire.is_child &= wire.heard.is_some_and(|(_, at)| now.since(at) <= SILENT);
+            }
             self.hello_to_all(now);
         }
         if self.walking.is_some_and(|walking| now.since(walking.since) >= LOST) {

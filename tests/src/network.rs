@@ -1,0 +1,704 @@
+//! Cells wired to each other at random, in virtual time: whether they become a tree, stay one, and never count a
+//! cell twice.
+//!
+//! Every cell has a torque of its own, drawn at random, so that a sum tells which cells are in it: what a cell says
+//! must be its own torque and some of the sums that its neighbours said in that epoch, and only one choice fits.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+
+use cell_node::contact::{Force, Torque};
+use cell_node::kernel::{Kernel, Wrench};
+use cell_node::node::{Flash, Identity, Node};
+use cell_node::sum::Words;
+use gateway::network::Uplinks;
+use protocol::can::{Format, Frame};
+use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
+use protocol::id::CellId;
+use protocol::message::{
+    From, Joints, Message, NetworkPage, Ports, Request, SensorPage, SkinSensors, Tree,
+};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::{Contact, Cuts, Parameter, Parameters, Pose, Reply, Row, Slots};
+use protocol::time::{Micros, Span};
+use protocol::wire::{PORTS, PortMessage, UPLINK};
+use rand::seq::{IndexedRandom, SliceRandom};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+/// From one broadcast to the next.
+pub const PERIOD: Span = Span(16_000);
+/// From saying something to hearing it, at least and at most.
+const LATENCY: (u64, u64) = (10, 60);
+/// From hearing something to answering it.
+const THINKS: Span = Span(30);
+/// Joints' positions, the same in every epoch.
+const POSITIONS: [f64; WORDS] = [0.1, -0.7, 0.6, -0.4, 0.3, 0.2];
+
+/// The far end of a port.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum End {
+    /// A cell's port.
+    Cell(usize, usize),
+    /// The gateway's side; the root with this place.
+    Gateway(usize),
+}
+
+/// How a cell is.
+#[derive(Debug)]
+enum Life {
+    Off,
+    Runs(Box<Node>),
+    Hangs(Box<Node>, VecDeque<(Micros, Inlet)>),
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Inlet {
+    Frame(Frame),
+    Port(usize, PortMessage),
+}
+
+/// One cell.
+#[derive(Debug)]
+pub struct Place {
+    /// Its number, once it has one; kept over restarts as in flash.
+    pub number: Option<CellId>,
+    /// What its ports lead to.
+    pub wires: [Option<End>; PORTS + 1],
+    /// Port p hears nothing.
+    pub deaf: [bool; PORTS + 1],
+    /// The last page of its place in the tree.
+    pub tree: Option<Tree>,
+    /// The last page of its ports.
+    pub ports: Option<Ports>,
+    /// Its own torque, as it enters sums.
+    own: [i32; WORDS],
+    serial: u32,
+    parameters: Parameters,
+    force: Force,
+    life: Life,
+    wake: Option<Micros>,
+    newest: Micros,
+    /// What it said in each of the last epochs: words, and who is in it.
+    said: HashMap<u8, Vec<(Words, u128)>>,
+}
+
+#[derive(Debug)]
+enum Event {
+    Wake(usize),
+    Deliver(usize, Inlet),
+    ToGateway(usize, PortMessage),
+    GatewayWake,
+    Joints,
+}
+
+/// What the gateway took of one epoch.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Took {
+    /// Bit i: cell i is in it.
+    pub cells: u128,
+    /// Sums that came.
+    pub frames: u32,
+}
+
+/// A skin of wired cells.
+#[derive(Debug)]
+pub struct Wiring {
+    /// The cells.
+    pub cells: Vec<Place>,
+    /// Which cells are wired to the gateway's side.
+    pub roots: Vec<usize>,
+    /// What came of each broadcast.
+    pub took: Vec<Took>,
+    /// Part of all messages over wires that are lost.
+    pub loss: f64,
+    /// The depth for which cells have slots.
+    pub deepest: u8,
+    uplinks: Uplinks,
+    root_sums: HashMap<usize, (Words, u128)>,
+    now: Micros,
+    events: BTreeMap<(Micros, u64), Event>,
+    scheduled: u64,
+    gateway_newest: Micros,
+    epoch: Option<Epoch>,
+    ticking: bool,
+    dice: Pcg64Mcg,
+}
+
+impl Wiring {
+    /// Cells without wires; each is switched on by [`Wiring::start`].
+    #[must_use]
+    pub fn new(cells: usize, seed: u64) -> Self {
+        let mut dice = Pcg64Mcg::seed_from_u64(seed);
+        let cells = (0..cells).map(|index| Place::new(index, &mut dice)).collect();
+        let mut wiring = Self {
+            cells,
+            roots: Vec::new(),
+            took: Vec::new(),
+            loss: 0.0,
+            deepest: 0,
+            uplinks: Uplinks::new(0, 0, Micros(0)),
+            root_sums: HashMap::new(),
+            now: Micros(0),
+            events: BTreeMap::new(),
+            scheduled: 0,
+            gateway_newest: Micros(0),
+            epoch: None,
+            ticking: false,
+            dice,
+        };
+        wiring.schedule(Micros(0), Event::GatewayWake);
+        wiring
+    }
+
+    /// Cells wired at random: mostly one piece, with more wires than a tree needs.
+    #[must_use]
+    pub fn random(seed: u64) -> Self {
+        let mut dice = Pcg64Mcg::seed_from_u64(seed ^ 0xA11);
+        let count = dice.random_range(2..=20);
+        let mut wiring = Self::new(count, seed);
+        let mut order: Vec<usize> = (0..count).collect();
+        order.shuffle(&mut dice);
+        for (at, &cell) in order.iter().enumerate().skip(1) {
+            // Now and then a cell is left apart.
+            if dice.random_bool(0.95) {
+                let other = order[dice.random_range(0..at)];
+                wiring.wire_some(cell, other, &mut dice);
+            }
+        }
+        for _ in 0..dice.random_range(0..=count) {
+            let (a, b) = (dice.random_range(0..count), dice.random_range(0..count));
+            if a != b {
+                wiring.wire_some(a, b, &mut dice);
+            }
+        }
+        for _ in 0..dice.random_range(1..=2) {
+            let root = *order.choose(&mut dice).expect("there are cells");
+            if !wiring.roots.contains(&root) {
+                wiring.add_root(root);
+            }
+        }
+        wiring
+    }
+
+    fn wire_some(&mut self, a: usize, b: usize, dice: &mut Pcg64Mcg) {
+        let mut free = |cell: &Place| {
+            let free: Vec<usize> = (0..PORTS).filter(|&port| cell.wires[port].is_none()).collect();
+            free.choose(dice).copied()
+        };
+        if let (Some(p), Some(q)) = (free(&self.cells[a]), free(&self.cells[b])) {
+            self.wire(a, p, b, q);
+        }
+    }
+
+    /// A wire between two ports.
+    pub fn wire(&mut self, a: usize, p: usize, b: usize, q: usize) {
+        self.cells[a].wires[p] = Some(End::Cell(b, q));
+        self.cells[b].wires[q] = Some(End::Cell(a, p));
+    }
+
+    /// A wire to the gateway's side.
+    pub fn add_root(&mut self, cell: usize) {
+        self.cells[cell].wires[UPLINK] = Some(End::Gateway(self.roots.len()));
+        self.roots.push(cell);
+        self.uplinks = Uplinks::new(self.roots.len(), 0, self.now);
+    }
+
+    /// A broken direction of a wire: what `cell` says through `port` is not heard.
+    pub fn cut(&mut self, cell: usize, port: usize, is_cut: bool) {
+        if let Some(End::Cell(other, at)) = self.cells[cell].wires[port] {
+            self.cells[other].deaf[at] = is_cut;
+            self.tell_cuts(other);
+        }
+    }
+
+    /// As the gateway tells a cell which of its ports are cut.
+    pub fn tell_cuts(&mut self, cell: usize) {
+        let place = &self.cells[cell];
+        let Some(number) = place.number else { return };
+        let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
+        let request =
+            Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
+        let message = Message::Configure { to: protocol::id::Node::Cell(number), tag: 0, request };
+        let frame = message.encode().frames(Format::Fd).next().expect("one frame");
+        self.hand(cell, self.now, Inlet::Frame(frame));
+    }
+
+    /// What time it is.
+    #[must_use]
+    pub const fn now(&self) -> Micros {
+        self.now
+    }
+
+    /// Whether a cell works.
+    #[must_use]
+    pub fn runs(&self, cell: usize) -> bool {
+        matches!(self.cells[cell].life, Life::Runs(_))
+    }
+
+    /// A cell is switched on, or off and on.
+    pub fn start(&mut self, cell: usize) {
+        let (now, place) = (self.now, &mut self.cells[cell]);
+        let identity = Identity { cell: place.number, serial: place.serial };
+        let wired = place.wires.iter().enumerate().filter(|(_, wire)| wire.is_some());
+        let wired = wired.map(|(port, _)| 1 << port).sum();
+        let node = Node::new(identity, Format::Fd, &Flash::Sound(place.parameters), true, now);
+        place.life = Life::Runs(Box::new(node.with_ports(wired)));
+        place.wake = None;
+        (place.tree, place.ports) = (None, None);
+        self.after(cell);
+    }
+
+    /// A cell loses its power.
+    pub fn kill(&mut self, cell: usize) {
+        self.cells[cell].life = Life::Off;
+        self.cells[cell].wake = None;
+    }
+
+    /// A cell hangs.
+    pub fn hang(&mut self, cell: usize) {
+        let place = &mut self.cells[cell];
+        place.life = match std::mem::replace(&mut place.life, Life::Off) {
+            Life::Runs(node) => Life::Hangs(node, VecDeque::new()),
+            other @ (Life::Off | Life::Hangs(..)) => other,
+        };
+    }
+
+    /// A cell that hung goes on with what has gathered.
+    pub fn go_on(&mut self, cell: usize) {
+        let place = &mut self.cells[cell];
+        match std::mem::replace(&mut place.life, Life::Off) {
+            Life::Hangs(node, waiting) => {
+                place.life = Life::Runs(node);
+                self.pass(cell);
+                for (stood, inlet) in waiting {
+                    self.hand(cell, stood, inlet);
+                }
+            }
+            other @ (Life::Off | Life::Runs(_)) => place.life = other,
+        }
+    }
+
+    fn schedule(&mut self, at: Micros, event: Event) {
+        self.scheduled += 1;
+        self.events.insert((at.max(self.now), self.scheduled), event);
+    }
+
+    /// Runs for some time.
+    pub fn run(&mut self, span: Span) {
+        let until = self.now + span;
+        while let Some(entry) = self.events.first_entry() {
+            if entry.key().0 > until {
+                break;
+            }
+            let ((at, _), event) = entry.remove_entry();
+            self.now = at;
+            self.happen(event);
+        }
+        self.now = until;
+    }
+
+    fn happen(&mut self, event: Event) {
+        match event {
+            Event::Wake(cell) => {
+                if self.cells[cell].wake == Some(self.now) {
+                    self.cells[cell].wake = None;
+                    self.pass(cell);
+                }
+            }
+            Event::Deliver(cell, inlet) => {
+                let now = self.now;
+                if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
+                    waiting.push_back((now, inlet));
+                } else {
+                    self.hand(cell, now, inlet);
+                }
+            }
+            Event::ToGateway(root, message) => {
+                self.uplinks.handle(self.now, root, message);
+                self.gateway_says();
+            }
+            Event::GatewayWake => {
+                self.uplinks.handle_time(self.now);
+                self.gateway_says();
+                let next = self.uplinks.poll_timeout().max(self.now + Span(500));
+                self.schedule(next, Event::GatewayWake);
+            }
+            Event::Joints if self.ticking => self.broadcast(),
+            Event::Joints => {}
+        }
+    }
+
+    fn pass(&mut self, cell: usize) {
+        let now = self.now;
+        if let Life::Runs(node) = &mut self.cells[cell].life {
+            node.handle_timeout(now);
+        }
+        self.after(cell);
+    }
+
+    fn hand(&mut self, cell: usize, stood: Micros, inlet: Inlet) {
+        let now = self.now;
+        let place = &mut self.cells[cell];
+        if let Life::Runs(node) = &mut place.life {
+            match inlet {
+                Inlet::Frame(frame) => node.handle_frame(now, now.since(stood), &frame),
+                Inlet::Port(port, _) if place.deaf[port] => {}
+                Inlet::Port(port, message) => node.handle_port(now, port, message),
+            }
+        }
+        self.after(cell);
+    }
+
+    /// Takes what a cell has to say, and when it wants to be woken.
+    fn after(&mut self, cell: usize) {
+        let place = &mut self.cells[cell];
+        let Life::Runs(node) = &mut place.life else { return };
+        if let Some(kept) = node.poll_store() {
+            place.number = kept.number;
+            node.handle_stored(true);
+        }
+        assert_eq!(node.taken(), None, "cell {cell} gave up its number {:?}", place.number);
+        let mut messages = Vec::new();
+        while let Some(message) = node.poll_port_transmit() {
+            messages.push(message);
+        }
+        let mut packets = Vec::new();
+        while let Some(packet) = node.poll_transmit() {
+            packets.push(packet);
+        }
+        let timeout = node.poll_timeout().max(self.now + Span(1));
+        if place.wake != Some(timeout) {
+            place.wake = Some(timeout);
+            self.schedule(timeout, Event::Wake(cell));
+        }
+        for (port, message) in messages {
+            let end = self.cells[cell].wires[port].expect("a wired port");
+            if self.loss > 0.0 && self.dice.random_bool(self.loss) {
+                continue;
+            }
+            match end {
+                End::Cell(other, at) => {
+                    let at_time = self.arrival(Some(other));
+                    self.schedule(at_time, Event::Deliver(other, Inlet::Port(at, message)));
+                }
+                End::Gateway(root) => {
+                    let at = self.arrival(None);
+                    self.schedule(at, Event::ToGateway(root, message));
+                }
+            }
+        }
+        for packet in packets {
+            let message = Message::decode(&packet).expect("cells say what has a meaning");
+            match message {
+                Message::Sum { from, epoch, torque, count } => {
+                    self.hear_sum(cell, from, epoch, Words { torque, count });
+                }
+                Message::Network { page: NetworkPage::Tree(tree), .. } => self.cells[cell].tree = Some(tree),
+                Message::Network { page: NetworkPage::Ports(ports), .. } => {
+                    self.cells[cell].ports = Some(ports);
+                }
+                Message::Network { page: NetworkPage::Heartbeat(_), .. } => {
+                    self.uplinks.claimed(self.cells[cell].number.expect("who speaks has a number"));
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// When something that is said now comes in; what was said before comes in before.
+    fn arrival(&mut self, at: Option<usize>) -> Micros {
+        let arrives = self.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
+        *newest = arrives.max(*newest);
+        *newest
+    }
+
+    /// A cell says a sum: who is in it, and who hears it.
+    fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
+        let cells = self.decode(cell, epoch, words);
+        let said = &mut self.cells[cell].said;
+        if said.len() > 8 {
+            said.retain(|of, _| Epoch(*of).since(epoch) >= -4);
+        }
+        said.entry(epoch.0).or_default().push((words, cells));
+        let frame = Message::Sum { from, epoch, torque: words.torque, count: words.count }.encode();
+        let frame = frame.frames(Format::Fd).next().expect("one frame");
+        let neighbours: BTreeSet<usize> = self.cells[cell]
+            .wires
+            .iter()
+            .filter_map(|end| match end {
+                Some(End::Cell(other, _)) => Some(*other),
+                Some(End::Gateway(_)) | None => None,
+            })
+            .collect();
+        for other in neighbours {
+            let hears = match &self.cells[other].life {
+                Life::Runs(node) | Life::Hangs(node, _) => node.hears().any(|id| id == frame_id(from)),
+                Life::Off => false,
+            };
+            if hears {
+                let at = self.arrival(Some(other));
+                self.schedule(at, Event::Deliver(other, Inlet::Frame(frame)));
+            }
+        }
+        let root = self.roots.iter().position(|&root| root == cell);
+        if root.is_some_and(|root| self.uplinks.takes(root)) && self.epoch == Some(epoch) {
+            let best = self.root_sums.entry(cell).or_insert((words, cells));
+            if words.count >= best.0.count {
+                *best = (words, cells);
+            }
+            if let Some(took) = self.took.last_mut() {
+                took.frames += 1;
+                took.cells = 0;
+                for (root, (_, cells)) in &self.root_sums {
+                    assert_eq!(
+                        took.cells & cells,
+                        0,
+                        "root {root} counts cells of another one in {epoch:?}: {:?}; {}",
+                        self.root_sums,
+                        self.ways()
+                    );
+                    took.cells |= cells;
+                }
+            }
+        }
+    }
+
+    /// Which cells are in a sum: its own torque or not, and some of the sums that its neighbours said.
+    fn decode(&self, cell: usize, epoch: Epoch, words: Words) -> u128 {
+        let place = &self.cells[cell];
+        let mut heard: Vec<Vec<(Words, u128)>> = Vec::new();
+        let mut seen = BTreeSet::new();
+        for end in place.wires.iter().flatten() {
+            if let End::Cell(other, _) = end
+                && seen.insert(*other)
+                && let Some(said) = self.cells[*other].said.get(&epoch.0)
+            {
+                heard.push(said.clone());
+            }
+        }
+        let wanted = words.torque.map(|word| i32::from(word.to_bits()));
+        let mut found = None;
+        for own in [1_u32, 0] {
+            let sum = if own == 1 { place.own } else { [0; WORDS] };
+            choose(&heard, sum, own, u128::from(own) << cell, (&wanted, words.count.into()), &mut found);
+        }
+        // The end of a contact: zeros of its own, and no torque.
+        if found.is_none() && words.is_end() && words.count == 1 {
+            return 0;
+        }
+        let cells =
+            found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));
+        assert_ne!(
+            cells,
+            TWICE,
+            "cell {cell} counts a cell twice in {epoch:?} at {:?}: {words:?} of {heard:?}; {}",
+            self.now,
+            self.ways()
+        );
+        cells
+    }
+
+    fn gateway_says(&mut self) {
+        while let Some((root, message)) = self.uplinks.poll_transmit() {
+            if self.loss > 0.0 && self.dice.random_bool(self.loss) {
+                continue;
+            }
+            let cell = self.roots[root];
+            let at = self.arrival(Some(cell));
+            self.schedule(at, Event::Deliver(cell, Inlet::Port(UPLINK, message)));
+        }
+    }
+
+    /// The gateway says something to every cell that hears it.
+    pub fn say(&mut self, message: &Message) {
+        let frame = message.encode().frames(Format::Fd).next().expect("one frame");
+        for cell in 0..self.cells.len() {
+            let at = self.arrival(Some(cell));
+            self.schedule(at, Event::Deliver(cell, Inlet::Frame(frame)));
+        }
+    }
+
+    fn broadcast(&mut self) {
+        let epoch = self.epoch.map_or(Epoch(0), Epoch::next);
+        self.epoch = Some(epoch);
+        self.root_sums.clear();
+        self.took.push(Took::default());
+        let joints = Joints { positions: POSITIONS.map(Q1_14::nearest), in_use: 6 };
+        self.say(&Message::Joints { epoch, joints });
+        self.schedule(self.now + PERIOD, Event::Joints);
+    }
+
+    /// Joints are sent from now on.
+    pub fn begin(&mut self) {
+        self.ticking = true;
+        self.schedule(self.now, Event::Joints);
+    }
+
+    /// Every cell is told to answer with sums.
+    pub fn switch(&mut self, deepest: u8, carry: bool) {
+        self.deepest = deepest;
+        let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");
+        let reply = Reply::Sum(Slots { slot_us, deepest, carry });
+        let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
+        self.say(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
+    }
+
+    /// A cell is pressed, or let go, from the next joints on.
+    pub fn press(&mut self, cell: usize, pressed: bool) {
+        let Some(number) = self.cells[cell].number else { return };
+        let word = Q5_10::from_bits(i16::try_from(self.cells[cell].force.steps() >> 6).expect("a word"));
+        let contact = if pressed { [word, Q5_10::ZERO, Q5_10::ZERO] } else { [Q5_10::ZERO; 3] };
+        let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(number), from: From::Next, page });
+    }
+
+    /// Cells that have a way to the gateway, by wires that work in both directions and cells that run.
+    #[must_use]
+    pub fn reachable(&self) -> BTreeSet<usize> {
+        let mut reached = BTreeSet::new();
+        let mut next: Vec<usize> = self.roots.iter().copied().filter(|&root| self.runs(root)).collect();
+        while let Some(cell) = next.pop() {
+            if !reached.insert(cell) {
+                continue;
+            }
+            for (port, end) in self.cells[cell].wires.iter().enumerate() {
+                if let Some(End::Cell(other, at)) = *end {
+                    let works = !self.cells[cell].deaf[port] && !self.cells[other].deaf[at];
+                    if works && self.runs(other) {
+                        next.push(other);
+                    }
+                }
+            }
+        }
+        reached
+    }
+
+    /// The way of a cell's sums to a root, by what the cells report; `None` without one, or in a circle.
+    #[must_use]
+    pub fn way(&self, cell: usize) -> Option<Vec<usize>> {
+        let mut way = vec![cell];
+        loop {
+            let at = *way.last()?;
+            let tree = self.cells[at].tree?;
+            match tree.parent? {
+                0 => return Some(way),
+                parent => {
+                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else { return None };
+                    if self.cells[other].number.map(CellId::get) != Some(parent) || way.contains(&other) {
+                        return None;
+                    }
+                    way.push(other);
+                }
+            }
+        }
+    }
+
+    /// All ways, for people.
+    #[must_use]
+    pub fn ways(&self) -> String {
+        let way = |cell: usize| {
+            let place = &self.cells[cell];
+            let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
+            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.way(cell))
+        };
+        (0..self.cells.len()).map(way).collect::<Vec<_>>().join("; ")
+    }
+
+    /// The bits of some cells.
+    #[must_use]
+    pub fn bits(cells: &BTreeSet<usize>) -> u128 {
+        cells.iter().map(|cell| 1 << cell).sum()
+    }
+}
+
+/// Instead of the cells in a sum: one of them is in it twice.
+const TWICE: u128 = u128::MAX;
+
+fn frame_id(from: CellId) -> protocol::id::Id {
+    protocol::id::Id::new(protocol::id::Kind::Sum, protocol::id::Node::Cell(from))
+}
+
+/// Tries every choice of one sum, or none, of each neighbour.
+fn choose(
+    heard: &[Vec<(Words, u128)>],
+    sum: [i32; WORDS],
+    count: u32,
+    cells: u128,
+    wanted: (&[i32; WORDS], u32),
+    found: &mut Option<u128>,
+) {
+    if count == wanted.1 && sum == *wanted.0 && found.is_none_or(|before| before == TWICE) {
+        *found = Some(cells);
+    }
+    let Some((first, rest)) = heard.split_first() else { return };
+    if count > wanted.1 {
+        return;
+    }
+    for (words, of) in first {
+        let mut with = sum;
+        for (sum, word) in with.iter_mut().zip(words.torque) {
+            *sum += i32::from(word.to_bits());
+        }
+        // Where a cell is in it twice, all the bits are set that nobody has.
+        let both = if cells & of == 0 { cells | of } else { TWICE };
+        choose(rest, with, count + u32::from(words.count), both, wanted, found);
+    }
+    choose(rest, sum, count, cells, wanted, found);
+}
+
+impl Place {
+    fn new(index: usize, dice: &mut Pcg64Mcg) -> Self {
+        let mut normal = [0.0_f64; 3].map(|_| dice.random_range(-1.0..1.0_f64));
+        let length = normal.iter().map(|n| n * n).sum::<f64>().sqrt().max(1e-3);
+        normal.iter_mut().for_each(|n| *n /= length);
+        if (normal.iter().map(|n| n * n).sum::<f64>() - 1.0).abs() > 1e-3 {
+            normal = [0.0, 0.0, 1.0];
+        }
+        let row = |a, alpha, d| Row {
+            a: Q1_14::nearest(a),
+            d: Q1_14::nearest(d),
+            alpha: Q1_14::nearest(alpha),
+            theta_offset: Q1_14::ZERO,
+        };
+        let parameters = Parameters {
+            joint: 6,
+            joints: 6,
+            pose: Pose {
+                position: [0.0; 3].map(|_: f64| Q1_14::nearest(dice.random_range(-0.2..0.2))),
+                normal: normal.map(Q1_14::nearest),
+            },
+            contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
+            period_us: 16_000,
+            rows: [
+                row(0.0, 1.0, 0.09),
+                row(-0.425, 0.0, 0.0),
+                row(-0.392, 0.0, 0.0),
+                row(0.0, 1.0, 0.11),
+                row(0.0, -1.0, 0.095),
+                row(0.0, 0.0, 0.08),
+            ],
+        };
+        let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
+        let jacobian = Wrench::new(&parameters).jacobian(&POSITIONS.map(Q1_14::nearest));
+        let own = Torque::new(&jacobian, force).exact().map(|exact| {
+            let word: Q7_8 = exact.round();
+            i32::from(word.to_bits())
+        });
+        Self {
+            number: None,
+            wires: [None; PORTS + 1],
+            deaf: [false; PORTS + 1],
+            tree: None,
+            ports: None,
+            own,
+            serial: 1_000 + u32::try_from(index).expect("few cells"),
+            parameters,
+            force,
+            life: Life::Off,
+            wake: None,
+            newest: Micros(0),
+            said: HashMap::new(),
+        }
+    }
+}
