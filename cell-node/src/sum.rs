@@ -16,6 +16,8 @@ use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
 
+/// A child whose sum did not come is told so in so many epochs: what it says to that may be lost too.
+const MISSING: u8 = 4;
 /// Fraction bits that rounding takes away.
 const SHORTENED: u32 = 30 - 8;
 
@@ -45,6 +47,8 @@ struct Child {
     taken: Option<Words>,
     /// One that came before its child said that it is for this cell.
     waiting: Option<(Epoch, Words)>,
+    /// For so many epochs more it is told that nothing came, unless something does.
+    missing: u8,
 }
 
 /// What one cell adds up.
@@ -124,7 +128,7 @@ impl Sum {
             // Who was silent for an epoch has to say again whom its sums are for.
             let next = (is_child && goes_on).then_some(begin.epoch);
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
-            *child = Child { next, taken: None, waiting };
+            *child = Child { next, taken: None, waiting, missing: child.missing };
         }
         self.period = begin.period;
         self.began = begin.at;
@@ -184,6 +188,7 @@ impl Sum {
             return;
         }
         child.taken = Some(words);
+        child.missing = 0;
         self.taken = self.taken.wrapping_add(1);
         self.plan(now);
     }
@@ -206,6 +211,7 @@ impl Sum {
             // What was taken in this epoch stays: its sender sends no other for it.
             child.next = None;
             child.waiting = None;
+            child.missing = 0;
         }
     }
 
@@ -305,6 +311,10 @@ impl Sum {
         for (port, child) in self.children.iter_mut().enumerate() {
             if child.next.is_some() && child.taken.is_none() {
                 child.next = None;
+                child.missing = MISSING;
+            }
+            if child.missing > 0 {
+                child.missing -= 1;
                 missed |= 1 << port;
             }
         }

@@ -155,6 +155,7 @@ fn random_wirings_organise_themselves_and_never_count_a_cell_twice() {
         for _ in 0..4 {
             let what = break_something(&mut wiring, &mut dice);
 
+            let before = wiring.ways();
             let after = incomplete(&mut wiring, 80);
             let after = after.unwrap_or_else(|| {
                 wiring.say(&protocol::message::Message::Report);
@@ -168,6 +169,9 @@ fn random_wirings_organise_themselves_and_never_count_a_cell_twice() {
                     wiring.ways()
                 )
             });
+            if after > 20 && std::env::var("TRACE").is_ok() {
+                panic!("seed {seed} {what}: {after}, before: {before}; now {}", wiring.ways());
+            }
             *repairs.entry(format!("{after:3} {}", what.split(' ').next().unwrap())).or_default() += 1;
         }
     }

@@ -163,7 +163,8 @@ impl Node {
     /// The parent says that it did not take a sum: it has to be told anew whom they are for.
     fn was_missed(&mut self, now: Micros, epoch: Epoch) {
         self.sums.break_off();
-        if self.sums.epoch() != Some(epoch) {
+        let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
+        if self.sums.epoch() != Some(epoch) || !said {
             return;
         }
         self.heard_parent = false;
