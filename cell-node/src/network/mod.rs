@@ -29,7 +29,7 @@ const JOIN_PATIENCE: Span = Span::from_millis(5);
 /// From one search for a way to the next, at first and at most.
 const SEEK: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
 /// So long a cell without a way looks for another before it tells those below it.
-const GRACE: Span = Span::from_millis(8);
+const GRACE: Span = Span::from_millis(3);
 /// Ports, and a root's wire to the gateway's side.
 const ALL: usize = PORTS + 1;
 /// Messages that wait for ports; a shell takes them after every call.
@@ -370,9 +370,17 @@ impl Network {
 
     fn let_in(&mut self, now: Micros, port: usize) {
         let label = self.parent.filter(|parent| parent.port != port).map(|parent| parent.label.below());
-        match label.zip(self.ports.get_mut(port)) {
-            Some((label, child)) => {
-                child.adopt(now);
+        let number = self.number_at(port);
+        match label {
+            Some(label) => {
+                // Two wires may lead to the same cell, whose sums come by one of them.
+                for (other, there) in self.ports.iter_mut().enumerate() {
+                    if other == port {
+                        there.adopt(now);
+                    } else if number.is_some() && there.number() == number {
+                        there.disown();
+                    }
+                }
                 self.tree_changed = true;
                 self.say(port, PortMessage::Grant(label));
             }
