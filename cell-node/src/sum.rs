@@ -8,7 +8,7 @@
 //!
 //! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell,
 //! epoch by epoch without a gap. So a child that fell silent for one epoch is free to send its sums to another.
-//! A sum of zeros ends the lease: nothing is to come.
+//! A sum of no cells, count 0, ends the lease: nothing is to come.
 
 use protocol::fixed::{Acc, Q7_8};
 use protocol::packet::{Epoch, WORDS};
@@ -26,15 +26,18 @@ const SHORTENED: u32 = 30 - 8;
 pub struct Words {
     /// Nm.
     pub torque: [Q7_8; WORDS],
-    /// Cells in it that feel something.
+    /// Cells in it.
     pub count: u8,
 }
 
 impl Words {
+    /// Nothing is to come any more.
+    const END: Self = Self { torque: [Q7_8::ZERO; WORDS], count: 0 };
+
     /// Whether it says that nothing more is to come.
     #[must_use]
-    pub fn is_end(&self) -> bool {
-        self.torque == [Q7_8::ZERO; WORDS]
+    pub const fn is_end(&self) -> bool {
+        self.count == 0
     }
 }
 
@@ -60,10 +63,10 @@ pub struct Sum {
     began: Micros,
     period: Span,
     depth: u8,
-    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum; zeros to end what was said before.
+    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
     own: Option<[i32; WORDS]>,
-    /// Whether this cell feels something, and so is counted.
-    feels: bool,
+    /// It spoke in the epoch before: without anything to add it says so once.
+    ends: bool,
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
@@ -134,18 +137,18 @@ impl Sum {
         self.began = begin.at;
         self.depth = begin.depth.unwrap_or(slots.deepest);
         self.speaks = begin.speaks && begin.depth.is_some();
-        self.feels = own.is_some();
         self.own = match own {
             Some(exact) => Some(self.round(exact, slots.carry)),
             None => {
                 self.carry = [0; WORDS];
-                // What was said last is not to be held for ever.
-                let ends = self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
-                ends.then_some([0; WORDS])
+                None
             }
         };
+        // What was said last is not to be held for ever.
+        self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         let slot = slots.deepest.saturating_sub(self.depth);
-        self.due = self.own.is_some().then(|| self.began + Span(u64::from(slot) * u64::from(slots.slot_us)));
+        self.due = (self.own.is_some() || self.ends)
+            .then(|| self.began + Span(u64::from(slot) * u64::from(slots.slot_us)));
         let settled = Span(u64::from(slots.slot_us) * (u64::from(slots.deepest) + 2));
         self.check = Some(self.began + settled.min(Span(begin.period.0 * 7 / 8)));
     }
@@ -235,7 +238,7 @@ impl Sum {
         if !self.speaks {
             return None;
         }
-        let words = self.words();
+        let words = self.words()?;
         if self.said == Some((epoch, words)) {
             return None;
         }
@@ -246,9 +249,10 @@ impl Sum {
         Some((epoch, words, !goes_on))
     }
 
-    fn words(&self) -> Words {
+    /// All that is known of this epoch; `None` when there is nothing to say.
+    fn words(&self) -> Option<Words> {
         let mut sum = self.own.map_or([0; WORDS], |own| own.map(i64::from));
-        let mut count = u32::from(self.feels);
+        let mut count = u32::from(self.own.is_some());
         let mut saturated = [false; WORDS];
         for words in self.children.iter().filter_map(|child| child.taken) {
             count += u32::from(words.count);
@@ -257,6 +261,9 @@ impl Sum {
                 *sum += i64::from(word.to_bits());
             }
         }
+        if count == 0 {
+            return self.ends.then_some(Words::END);
+        }
         let mut torque = [Q7_8::ZERO; WORDS];
         for ((word, sum), saturated) in torque.iter_mut().zip(sum).zip(saturated) {
             let least = i64::from(i16::MIN);
@@ -264,7 +271,7 @@ impl Sum {
             let fits = held.clamp(least, i16::MAX.into());
             *word = Q7_8::from_bits(i16::try_from(fits).unwrap_or(i16::MAX));
         }
-        Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) }
+        Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
     /// The last sum that was sent, and its epoch.

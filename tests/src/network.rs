@@ -14,9 +14,7 @@ use gateway::network::Uplinks;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use protocol::id::CellId;
-use protocol::message::{
-    From, Joints, Message, NetworkPage, Ports, Request, SensorPage, SkinSensors, Tree,
-};
+use protocol::message::{From, Joints, Message, NetworkPage, Ports, Request, SensorPage, SkinSensors, Tree};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Contact, Cuts, Parameter, Parameters, Pose, Reply, Row, Slots};
 use protocol::time::{Micros, Span};
@@ -216,8 +214,7 @@ impl Wiring {
         let place = &self.cells[cell];
         let Some(number) = place.number else { return };
         let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
-        let request =
-            Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
+        let request = Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
         let message = Message::Configure { to: protocol::id::Node::Cell(number), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         self.hand(cell, self.now, Inlet::Frame(frame));
@@ -484,11 +481,10 @@ impl Wiring {
             choose(&heard, sum, own, u128::from(own) << cell, (&wanted, words.count.into()), &mut found);
         }
         // The end of a contact: zeros of its own, and no torque.
-        if found.is_none() && words.is_end() && words.count == 1 {
+        if words.is_end() {
             return 0;
         }
-        let cells =
-            found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));
+        let cells = found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));
         assert_ne!(
             cells,
             TWICE,
@@ -584,7 +580,9 @@ impl Wiring {
             match tree.parent? {
                 0 => return Some(way),
                 parent => {
-                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else { return None };
+                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
+                        return None;
+                    };
                     if self.cells[other].number.map(CellId::get) != Some(parent) || way.contains(&other) {
                         return None;
                     }
