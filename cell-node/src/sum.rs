@@ -127,7 +127,8 @@ impl Sum {
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
         for (port, child) in self.children.iter_mut().enumerate() {
             let is_child = begin.children >> port & 1 == 1;
-            let goes_on = follows && child.taken.is_some_and(|words| !words.is_end());
+            // Nor does a child go on that left in the meantime and came back.
+            let goes_on = follows && child.next.is_some() && child.taken.is_some_and(|words| !words.is_end());
             // Who was silent for an epoch has to say again whom its sums are for.
             let next = (is_child && goes_on).then_some(begin.epoch);
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
@@ -316,7 +317,9 @@ impl Sum {
         self.check.take_if(|check| *check <= now)?;
         let mut missed = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
-            if child.next.is_some() && child.taken.is_none() {
+            // It did not come, or came without a word whom it is for.
+            let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
+            if child.taken.is_none() && (child.next.is_some() || unsaid) {
                 child.next = None;
                 child.missing = MISSING;
             }

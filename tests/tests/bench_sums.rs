@@ -1,6 +1,7 @@
 //! How far sums along a tree are from the central computation: rounding, carrying, and what the paper did.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
+#![allow(clippy::print_stdout, reason = "the figures are worth a look")]
 
 use std::path::Path;
 
@@ -23,13 +24,16 @@ const ACTIVE: usize = 20;
 /// Epochs over which a constant touch is averaged.
 const AVERAGED: usize = 32;
 
+/// A cell, its depth, and its children with their ports.
+type Branch = (usize, u8, Vec<(usize, usize)>);
+
 /// A skin whose cells add up along the shortest ways to the root.
 struct Tree {
     skin: Skin,
     central: Central,
     sums: Vec<Sum>,
-    /// From the leaves to the root: each cell, its depth, and its children by port.
-    order: Vec<(usize, u8, Vec<(usize, usize)>)>,
+    /// From the leaves to the root.
+    order: Vec<Branch>,
     kernels: Vec<Wrench>,
     epoch: Epoch,
 }

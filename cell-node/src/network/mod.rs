@@ -38,10 +38,11 @@ const OUTBOX: usize = 32;
 /// How a parent was lost, and so whether it may still take a sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Lost {
-    /// It says nothing, hears nothing, or will not have this child: it takes no more sums.
-    Gone,
-    /// It has no way itself: until it says that it let this child go, it may take sums.
-    NoWay,
+    /// It did not take the last sums, or will not have this child: it takes no more.
+    Done,
+    /// It is not heard, does not hear, or has no way itself: it may take sums until it says that it let this child
+    /// go.
+    Unsure,
 }
 
 /// Who hears this cell's sums.
@@ -306,7 +307,7 @@ impl Network {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
             PortMessage::Join => self.let_in(now, port),
             PortMessage::Grant(label) => self.join(now, port, label),
-            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Gone),
+            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Done),
             PortMessage::Refuse => {
                 if self.joining.is_some_and(|(asked, _)| asked == port) {
                     self.distrust(now, port);
@@ -346,11 +347,11 @@ impl Network {
         }
         match self.parent {
             Some(parent) if parent.port == port => match hello.label {
-                _ if !hello.hears => self.lose_parent(now, Lost::Gone),
+                _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
                 // It is as near as it was, or nearer, or of a later round.
                 Some(label) if !parent.label.is_better_than(label) => self.follow(now, port, label),
                 // It started anew, or has no way itself.
-                Some(_) | None => self.lose_parent(now, Lost::NoWay),
+                Some(_) | None => self.lose_parent(now, Lost::Unsure),
             },
             Some(_) => {}
             None => self.search(now),
@@ -411,7 +412,7 @@ impl Network {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
         self.orphan = Some((now, false));
-        self.left = Some((parent.port, how == Lost::Gone));
+        self.left = Some((parent.port, how == Lost::Done));
         self.say(parent.port, PortMessage::Leave);
         self.distrust(now, parent.port);
         self.search(now);
@@ -535,7 +536,7 @@ impl Network {
                 // The gateway's side may notice it later, and takes sums until then.
                 self.joining = Some((UPLINK, now + HELLO));
             }
-            self.lose_parent(now, Lost::Gone);
+            self.lose_parent(now, Lost::Unsure);
         }
         if let Some((since, false)) = self.orphan
             && now.since(since) >= GRACE

@@ -180,7 +180,7 @@ impl Node {
         if self.misses.1 >= MISSES {
             self.misses = (0, 0);
             self.sums.fall_silent();
-            self.network.lose_parent(now, Lost::Gone);
+            self.network.lose_parent(now, Lost::Done);
             self.after_network(now);
         }
     }
