@@ -1,0 +1,368 @@
+//! What is wrong with a network of cells: what they report, compared with how they are described.
+//!
+//! Every difference is named once, by what is at its root: of a cell that is missing nobody is told that its wires do
+//! not work.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+
+use protocol::id::CellId;
+use protocol::message::{Heartbeat, Ports, State, Tree, VERSION};
+use protocol::skin::Wires;
+use protocol::wire::{PORTS, UPLINK};
+
+use super::tree::{Places, places};
+
+/// What is known of one cell.
+#[derive(Clone, Copy, Debug)]
+pub struct Seen {
+    /// Its number.
+    pub node: CellId,
+    /// The serial number that the cell of this number is described with; `None` of a number that is not described.
+    pub serial: Option<u32>,
+    /// The hash that its configuration must have.
+    pub configuration: u16,
+    /// Its last heartbeat.
+    pub heartbeat: Option<Heartbeat>,
+    /// Whether it speaks now.
+    pub alive: bool,
+    /// Its place in the tree, as it says.
+    pub tree: Option<Tree>,
+    /// What its ports lead to, as it says.
+    pub ports: Option<Ports>,
+}
+
+/// A port of a cell.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub struct End {
+    /// The cell.
+    pub cell: CellId,
+    /// Its port, from 0.
+    pub port: usize,
+}
+
+impl fmt::Display for End {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "port {} of cell {}", self.port, self.cell)
+    }
+}
+
+/// In which direction a wire carries something.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub enum Carries {
+    /// In neither, or nobody says in which.
+    Nothing,
+    /// From the first end to the second.
+    There,
+    /// From the second end to the first.
+    Back,
+}
+
+/// One difference between a network and its description.
+#[derive(Clone, Debug, Eq, Ord, PartialEq, PartialOrd)]
+pub enum Difference {
+    /// A described cell does not speak.
+    MissingCell(CellId),
+    /// A cell speaks that is not described.
+    ExtraCell {
+        /// Its number.
+        cell: CellId,
+        /// Its serial number.
+        serial: u32,
+    },
+    /// A cell of another serial number than described has a number.
+    OtherCell {
+        /// The number.
+        cell: CellId,
+        /// The serial number of who has it.
+        serial: u32,
+        /// The one that is described.
+        described: u32,
+        /// The number with which the one who has it is described, if it is.
+        belongs: Option<CellId>,
+    },
+    /// Two cells have a number.
+    Duplicate(CellId),
+    /// A cell speaks another version of the protocol.
+    Version {
+        /// The cell.
+        cell: CellId,
+        /// Its version; `None` when only its neighbours say that it is another one.
+        version: Option<u16>,
+    },
+    /// A cell computes with other parameters than the skin's.
+    OtherSkin(CellId),
+    /// A described wire does not work.
+    MissingWire {
+        /// The end with the lesser number.
+        first: End,
+        /// The other end.
+        second: End,
+        /// What it still carries.
+        carries: Carries,
+    },
+    /// A wire that is not described.
+    ExtraWire(End, End),
+    /// A port leads elsewhere than described.
+    SwappedWire {
+        /// The port.
+        end: End,
+        /// Where it leads.
+        leads: End,
+        /// Where it should lead.
+        described: End,
+    },
+    /// A cell without a number is at a port.
+    Unnumbered(End),
+    /// Cells that are each other's parents, in order.
+    Circle(Vec<CellId>),
+    /// Cells without a way to the gateway's side.
+    NoWay(Vec<CellId>),
+}
+
+/// Some cells, for people: at most six of them, and how many more.
+#[must_use]
+pub fn names(cells: &[CellId]) -> String {
+    let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
+    let (word, first) = (if cells.len() == 1 { "cell" } else { "cells" }, first.join(", "));
+    match cells.len().saturating_sub(6) {
+        0 => format!("{word} {first}"),
+        more => format!("{word} {first} (and {more} more)"),
+    }
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::MissingCell(cell) => {
+                write!(f, "cell {cell} does not speak: start it, or take it out of the description")
+            }
+            Self::ExtraCell { cell, serial } => write!(
+                f,
+                "cell {cell} with serial number {serial} is not described: describe it, or take it off the bus"
+            ),
+            Self::OtherCell { cell, serial, described, belongs: Some(belongs) } => write!(
+                f,
+                "number {cell} is that of the cell with serial number {serial}, which is described as cell {belongs}; \
+                 {described} is described there: exchange the cells, or their serial numbers in the description"
+            ),
+            Self::OtherCell { cell, serial, described, belongs: None } => write!(
+                f,
+                "cell {cell} has serial number {serial} and is described with {described}: write {serial} into the \
+                 description, or put the other cell back"
+            ),
+            Self::Duplicate(cell) => write!(f, "two cells have number {cell}: stop one of the two"),
+            Self::Version { cell, version: Some(version) } => write!(
+                f,
+                "cell {cell} speaks version {version} of the protocol, and this gateway version {VERSION}: give both \
+                 the same firmware"
+            ),
+            Self::Version { cell, version: None } => write!(
+                f,
+                "cell {cell} speaks another version of the protocol than its neighbours: give them the same firmware"
+            ),
+            Self::OtherSkin(cell) => {
+                write!(f, "cell {cell} is configured for another skin: configure it with `gateway commission`")
+            }
+            Self::MissingWire { first, second, carries } => {
+                let how = match carries {
+                    Carries::Nothing => "does not work".to_owned(),
+                    Carries::There => format!("works only from cell {} to cell {}", first.cell, second.cell),
+                    Carries::Back => format!("works only from cell {} to cell {}", second.cell, first.cell),
+                };
+                write!(f, "the wire from {first} to {second} {how}: look at its plugs")
+            }
+            Self::ExtraWire(first, second) => {
+                write!(f, "a wire leads from {first} to {second} and is not described: describe it, or unplug it")
+            }
+            Self::SwappedWire { end, leads, described } => write!(
+                f,
+                "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
+            ),
+            Self::Unnumbered(end) => {
+                write!(f, "a cell without a number is at {end}: it gets one from the network, unless all are used")
+            }
+            Self::Circle(cells) => write!(
+                f,
+                "{} are each other's parents, in a circle that would count twice: start them anew",
+                names(cells)
+            ),
+            Self::NoWay(cells) => {
+                let has = if cells.len() == 1 { "has" } else { "have" };
+                write!(f, "{} {has} no way to a root: no sum holds what they feel; look at their wires", names(cells))
+            }
+        }
+    }
+}
+
+impl Difference {
+    /// Whether some cell's torque is in no sum.
+    #[must_use]
+    pub const fn breaks_the_tree(&self) -> bool {
+        match self {
+            Self::MissingCell(_) | Self::Circle(_) | Self::NoWay(_) | Self::Version { .. } => true,
+            Self::ExtraCell { .. }
+            | Self::OtherCell { .. }
+            | Self::Duplicate(_)
+            | Self::OtherSkin(_)
+            | Self::MissingWire { .. }
+            | Self::ExtraWire(..)
+            | Self::SwappedWire { .. }
+            | Self::Unnumbered(_) => false,
+        }
+    }
+}
+
+/// All differences, each once.
+#[must_use]
+pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
+    let mut found: Vec<_> = cells.iter().flat_map(|cell| of_cell(cell, cells)).collect();
+    let versions = other_versions(wires, cells);
+    found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
+    let network = Network::new(wires, cells, &versions);
+    network.wires(&mut found);
+    let Places { circles, without_way, .. } = places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
+    let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
+    found.extend(circles.into_iter().map(Difference::Circle));
+    let described = |node: &CellId| cells.iter().any(|cell| cell.node == *node && cell.serial.is_some());
+    let named = |cell: &CellId| circling.contains(cell) || versions.contains_key(cell);
+    let without: Vec<_> = without_way.into_iter().filter(|cell| !named(cell) && described(cell)).collect();
+    if !without.is_empty() {
+        found.push(Difference::NoWay(without));
+    }
+    found
+}
+
+/// What is wrong with a cell by itself.
+fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
+    let node = cell.node;
+    let heartbeat = cell.heartbeat.filter(|_| cell.alive);
+    let Some(described) = cell.serial else {
+        let extra = heartbeat.map(|heartbeat| Difference::ExtraCell { cell: node, serial: heartbeat.serial });
+        return extra.into_iter().collect();
+    };
+    let Some(heartbeat) = heartbeat else { return vec![Difference::MissingCell(node)] };
+    let mut found = Vec::new();
+    if heartbeat.serial != described {
+        let belongs = all.iter().find(|cell| cell.serial == Some(heartbeat.serial)).map(|cell| cell.node);
+        found.push(Difference::OtherCell { cell: node, serial: heartbeat.serial, described, belongs });
+    }
+    if heartbeat.state.has(State::DUPLICATE) {
+        found.push(Difference::Duplicate(node));
+    }
+    if heartbeat.state.has(State::CONFIGURED) && heartbeat.configuration != cell.configuration {
+        found.push(Difference::OtherSkin(node));
+    }
+    found
+}
+
+/// The cells that speak another version, by themselves or by their neighbours' word.
+fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>> {
+    let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
+    let mut versions = BTreeMap::new();
+    for cell in alive() {
+        let version = cell.heartbeat.map(|heartbeat| heartbeat.state.version());
+        if let Some(version) = version.filter(|&version| version != u16::from(VERSION)) {
+            versions.insert(cell.node, Some(version));
+        }
+    }
+    let mut told = BTreeSet::new();
+    for cell in alive().filter(|cell| !versions.contains_key(&cell.node)) {
+        let ports = cell.ports.iter().flat_map(|ports| ports.ports.iter().enumerate());
+        for (port, state) in ports.filter(|(_, state)| state.other_version) {
+            let number = CellId::new(state.number.into()).ok();
+            told.extend(number.or_else(|| Some(wires.other_end(cell.node, port)?.0)));
+        }
+    }
+    for cell in told {
+        versions.entry(cell).or_insert(None);
+    }
+    versions
+}
+
+/// What ports lead to.
+struct Network<'a> {
+    wires: &'a Wires,
+    /// The cells whose ports can be judged: there, with one number each, and of this version.
+    sound: BTreeMap<CellId, &'a Ports>,
+}
+
+impl<'a> Network<'a> {
+    fn new(wires: &'a Wires, cells: &'a [Seen], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
+        let sound = |cell: &&Seen| {
+            let single = cell.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(State::DUPLICATE));
+            cell.alive && single && !versions.contains_key(&cell.node)
+        };
+        let sound = cells.iter().filter(sound).filter_map(|cell| Some((cell.node, cell.ports.as_ref()?)));
+        Self { wires, sound: sound.collect() }
+    }
+
+    /// Where a port should lead.
+    fn described(&self, end: End) -> Option<End> {
+        self.wires.other_end(end.cell, end.port).map(|(cell, port)| End { cell, port })
+    }
+
+    fn state(&self, end: End) -> Option<protocol::message::PortState> {
+        self.sound.get(&end.cell)?.ports.get(end.port).copied()
+    }
+
+    /// Where a port leads, as far as its cell hears.
+    fn leads(&self, end: End) -> Option<End> {
+        let state = self.state(end).filter(|state| state.hears)?;
+        let cell = CellId::new(state.number.into()).ok()?;
+        Some(End { cell, port: state.port.into() })
+    }
+
+    fn ends(&self) -> impl Iterator<Item = End> {
+        self.sound.keys().flat_map(|&cell| (0..PORTS).map(move |port| End { cell, port }))
+    }
+
+    fn wires(&self, found: &mut Vec<Difference>) {
+        let mut named = BTreeSet::new();
+        let mut elsewhere = BTreeSet::new();
+        for end in self.ends() {
+            let described = self.described(end);
+            let state = self.state(end).filter(|state| state.hears);
+            if state.is_some_and(|state| state.number == 0 && !state.other_version) {
+                found.push(Difference::Unnumbered(end));
+                elsewhere.insert(end);
+                continue;
+            }
+            // Of a cell that cannot be judged, its ends are not judged by others either.
+            let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else { continue };
+            if described == Some(leads) {
+                continue;
+            }
+            elsewhere.extend([end, leads]);
+            if !named.insert((end.min(leads), end.max(leads))) {
+                continue;
+            }
+            found.push(match (described, self.described(leads)) {
+                (Some(described), _) => Difference::SwappedWire { end, leads, described },
+                (None, Some(described)) => Difference::SwappedWire { end: leads, leads: end, described },
+                (None, None) => Difference::ExtraWire(end.min(leads), end.max(leads)),
+            });
+        }
+        for first in self.ends() {
+            let Some(second) = self.described(first).filter(|&second| first < second) else { continue };
+            let (Some(here), Some(there)) = (self.state(first), self.state(second)) else { continue };
+            if elsewhere.contains(&first) || elsewhere.contains(&second) || (here.works && there.works) {
+                continue;
+            }
+            let carries = match (here.hears, there.hears) {
+                (true, false) => Carries::Back,
+                (false, true) => Carries::There,
+                (false, false) | (true, true) => Carries::Nothing,
+            };
+            found.push(Difference::MissingWire { first, second, carries });
+        }
+    }
+}
+
+/// Whether a page says that a cell is wired to the gateway's side and uses it.
+pub(super) fn is_root(tree: &Tree) -> bool {
+    tree.parent == Some(0) && usize::from(tree.up) == UPLINK
+}
+
+#[cfg(test)]
+mod tests;

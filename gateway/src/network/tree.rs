@@ -1,0 +1,118 @@
+//! The tree that cells say they are: who is how deep, who has no way, and who goes in a circle.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use protocol::id::CellId;
+use protocol::message::Tree;
+
+use super::check::is_root;
+
+/// Where cells are in their tree.
+#[derive(Clone, Debug, Default, Eq, PartialEq)]
+pub struct Places {
+    /// Wires to the root of each cell that has a way: 0 is a root.
+    pub depths: BTreeMap<CellId, u8>,
+    /// Whether each of them says the same of itself.
+    pub agree: bool,
+    /// Cells that speak and have no way, those of circles among them.
+    pub without_way: Vec<CellId>,
+    /// Parents in a circle.
+    pub circles: Vec<Vec<CellId>>,
+}
+
+impl Places {
+    /// The depth of the deepest cell.
+    #[must_use]
+    pub fn deepest(&self) -> Option<u8> {
+        self.depths.values().copied().max()
+    }
+}
+
+/// The places of cells, of which each is known by its number, whether it speaks, and what it says.
+pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Places {
+    let alive: BTreeMap<_, _> =
+        cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
+    let parent = |node: &CellId| {
+        let tree = alive.get(node).copied().flatten()?;
+        Some((tree, tree.parent.and_then(|parent| CellId::new(parent.into()).ok())))
+    };
+    let mut places = Places { agree: true, ..Places::default() };
+    let mut circling = BTreeSet::new();
+    for &node in alive.keys() {
+        let (mut way, mut at, mut steps) = (Vec::new(), node, 0_u8);
+        loop {
+            if way.contains(&at) {
+                let circle: Vec<_> = way.iter().copied().skip_while(|&cell| cell != at).collect();
+                if circle.iter().all(|&cell| circling.insert(cell)) {
+                    places.circles.push(from_the_least(circle));
+                }
+                break places.without_way.push(node);
+            }
+            way.push(at);
+            match parent(&at) {
+                Some((tree, _)) if is_root(&tree) => {
+                    let says = alive.get(&node).copied().flatten().map(|tree| tree.depth);
+                    places.agree &= says == Some(steps);
+                    places.depths.insert(node, steps);
+                    break;
+                }
+                Some((_, Some(next))) => (at, steps) = (next, steps.saturating_add(1)),
+                Some((_, None)) | None => break places.without_way.push(node),
+            }
+        }
+    }
+    places
+}
+
+fn from_the_least(mut circle: Vec<CellId>) -> Vec<CellId> {
+    let least = circle.iter().enumerate().min_by_key(|(_, cell)| **cell).map_or(0, |(place, _)| place);
+    circle.rotate_left(least);
+    circle
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(number: i64) -> CellId {
+        CellId::new(number).unwrap()
+    }
+
+    fn says(node: i64, parent: Option<u8>, up: u8, depth: u8) -> (CellId, bool, Option<Tree>) {
+        (cell(node), true, Some(Tree { parent, up, depth, ..Tree::default() }))
+    }
+
+    #[test]
+    fn depths_are_counted_along_parents() {
+        let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 1), says(3, Some(2), 1, 2)];
+        let found = places(cells.into_iter());
+        assert_eq!((found.deepest(), found.agree), (Some(2), true));
+        assert_eq!((found.without_way, found.circles), (vec![], vec![]));
+        // One that says another depth has old news.
+        let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
+        assert!(!places(cells.into_iter()).agree);
+    }
+
+    #[test]
+    fn who_has_no_parent_or_one_that_does_not_speak_or_a_circle_above_it_has_no_way() {
+        let cells = [
+            says(1, Some(0), 4, 0),
+            says(2, None, 0, 0),
+            says(3, Some(2), 0, 1),
+            says(4, Some(9), 0, 1),
+            (cell(5), false, Some(Tree { parent: Some(0), up: 4, ..Tree::default() })),
+            says(6, Some(5), 0, 1),
+            (cell(7), true, None),
+            says(8, Some(0), 2, 0),
+            says(12, Some(11), 0, 1),
+            says(11, Some(10), 0, 1),
+            says(10, Some(12), 0, 1),
+            says(13, Some(12), 0, 2),
+        ];
+        let found = places(cells.into_iter());
+        let without: Vec<_> = found.without_way.iter().map(|cell| cell.get()).collect();
+        assert_eq!(without, [2, 3, 4, 6, 7, 8, 10, 11, 12, 13]);
+        assert_eq!(found.circles, [vec![cell(10), cell(12), cell(11)]]);
+        assert_eq!(found.depths.keys().collect::<Vec<_>>(), [&cell(1)]);
+    }
+}
