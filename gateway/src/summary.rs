@@ -289,6 +289,23 @@ pub struct OutagesSummary {
     pub ticks: u64,
 }
 
+/// The network of a bus' cells.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct NetworkSummary {
+    /// From the time when all cells were ready until all had a way to a root, in s; none when some never had.
+    pub organised_s: Option<f64>,
+    /// The depth of the deepest cell that there was a slot for; a root's is 0.
+    pub deepest: u8,
+    /// What was different from the description at the start.
+    pub differences: Vec<String>,
+    /// Cells that spoke and had no way to a root at the end.
+    pub without_way: Vec<u8>,
+    /// The longest time that a cell spoke and had none while the loop ran, in s.
+    pub longest_without_way_s: f64,
+    /// How often a cell's parent changed, by the cells' own count.
+    pub parent_changes: u64,
+}
+
 /// One bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusSummary {
@@ -310,6 +327,8 @@ pub struct BusSummary {
     pub replies: RepliesSummary,
     /// Sums, where cells answer with them.
     pub sums: Option<SumsSummary>,
+    /// The network that they go along.
+    pub network: Option<NetworkSummary>,
     /// Epochs that somebody had to answer, and those that everybody answered in time.
     pub epochs_due: u64,
     /// See above.
@@ -364,6 +383,7 @@ impl BusSummary {
             uplink: uplink(table, dropped),
             replies: replies(table),
             sums: sums(table),
+            network: None,
             epochs_due: counters.epochs_due,
             epochs_complete: counters.epochs_complete,
             received: kinds(&|kind| counters.received(kind)),

@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gateway::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Loop, Processor, Quantiles, Recording, RepliesSummary,
-    Summary, SumsSummary, Written, histogram,
+    AccuracySummary, BusSummary, ErrorsSummary, Loop, NetworkSummary, Processor, Quantiles, Recording,
+    RepliesSummary, Summary, SumsSummary, Written, histogram,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
@@ -81,7 +81,7 @@ fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<
         Value::Array(all) if all.iter().any(Value::is_object) => {
             return all.iter().for_each(|value| keys(&format!("{path}[]"), value, maps, into));
         }
-        Value::Array(_) if path == "recording.errors" => "texts",
+        Value::Array(_) if path == "recording.errors" || path == "buses[].network.differences" => "texts",
         Value::Array(_) => "numbers",
         Value::Object(object) if object.contains_key("p50") => "quantiles",
         Value::Object(object) if object.contains_key("mean_nm") => "errors",
@@ -126,7 +126,15 @@ fn serialised(summary: &Summary) -> Value {
 #[test]
 fn every_key_is_documented_with_its_type_and_no_other() {
     let bus = BusSummary::new("vcan0", "embedded", 0, &Table::new(&skin(), 0), 0, Micros(0));
-    let bus = BusSummary { sums: Some(SumsSummary::default()), ..bus };
+    let bus = BusSummary {
+        sums: Some(SumsSummary::default()),
+        network: Some(NetworkSummary {
+            differences: vec!["cell 2 does not speak".to_owned()],
+            without_way: vec![2],
+            ..NetworkSummary::default()
+        }),
+        ..bus
+    };
     let mut found = BTreeMap::new();
     keys("", &serialised(&summary(bus)), &maps(), &mut found);
     assert_eq!(documented(|heading| !["Quantiles", "Errors"].contains(&heading)), found);

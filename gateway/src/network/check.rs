@@ -162,7 +162,10 @@ impl fmt::Display for Difference {
                 "cell {cell} speaks another version of the protocol than its neighbours: give them the same firmware"
             ),
             Self::OtherSkin(cell) => {
-                write!(f, "cell {cell} is configured for another skin: configure it with `gateway commission`")
+                write!(
+                    f,
+                    "cell {cell} is configured for another skin: configure it with `gateway commission`"
+                )
             }
             Self::MissingWire { first, second, carries } => {
                 let how = match carries {
@@ -173,14 +176,20 @@ impl fmt::Display for Difference {
                 write!(f, "the wire from {first} to {second} {how}: look at its plugs")
             }
             Self::ExtraWire(first, second) => {
-                write!(f, "a wire leads from {first} to {second} and is not described: describe it, or unplug it")
+                write!(
+                    f,
+                    "a wire leads from {first} to {second} and is not described: describe it, or unplug it"
+                )
             }
             Self::SwappedWire { end, leads, described } => write!(
                 f,
                 "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
             ),
             Self::Unnumbered(end) => {
-                write!(f, "a cell without a number is at {end}: it gets one from the network, unless all are used")
+                write!(
+                    f,
+                    "a cell without a number is at {end}: it gets one from the network, unless all are used"
+                )
             }
             Self::Circle(cells) => write!(
                 f,
@@ -189,7 +198,11 @@ impl fmt::Display for Difference {
             ),
             Self::NoWay(cells) => {
                 let has = if cells.len() == 1 { "has" } else { "have" };
-                write!(f, "{} {has} no way to a root: no sum holds what they feel; look at their wires", names(cells))
+                write!(
+                    f,
+                    "{} {has} no way to a root: no sum holds what they feel; look at their wires",
+                    names(cells)
+                )
             }
         }
     }
@@ -221,7 +234,8 @@ pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
     let network = Network::new(wires, cells, &versions);
     network.wires(&mut found);
-    let Places { circles, without_way, .. } = places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
+    let Places { circles, without_way, .. } =
+        places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
     let described = |node: &CellId| cells.iter().any(|cell| cell.node == *node && cell.serial.is_some());
@@ -329,7 +343,9 @@ impl<'a> Network<'a> {
                 continue;
             }
             // Of a cell that cannot be judged, its ends are not judged by others either.
-            let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else { continue };
+            let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else {
+                continue;
+            };
             if described == Some(leads) {
                 continue;
             }

@@ -13,7 +13,9 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
 use super::link::{Ear, Outages};
+use super::roots::Roots;
 use super::turn::Shared;
+use crate::network::check::Seen as SeenCell;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;
 use crate::table::{Notice, Said, Snapshot, Status, Table};
@@ -47,6 +49,9 @@ pub struct View {
     pub cells: Vec<CellView>,
     /// Commands of our own that were read back from the bus, or were lost with it.
     pub commands: u64,
+    /// What is known of the network's cells, those that are not described among them; nobody where cells answer
+    /// with their own torques.
+    pub network: Vec<SeenCell>,
 }
 
 /// The state of one cell.
@@ -70,6 +75,8 @@ pub struct CellView {
     pub last_joints: Epoch,
     /// What it has said since it was asked.
     pub said: Said,
+    /// What it answers joints with, as it said last.
+    pub reply: Option<[i16; WORDS]>,
 }
 
 /// One bus, as its receiver sees it.
@@ -83,6 +90,8 @@ pub struct Receiver {
     pub gather: Duration,
     /// What is known of it.
     pub table: Table,
+    /// The wires to its roots, where cells answer with sums.
+    pub roots: Option<Roots>,
     /// Where snapshots go.
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
@@ -151,6 +160,9 @@ impl Receiver {
                 self.tell(News::Up);
             }
             self.hear(&inbox);
+            if let Some(roots) = &mut self.roots {
+                roots.speak(&self.ear.bus);
+            }
             self.record(&inbox, &mut account);
             if count == 0 || looked.elapsed() >= LOOK {
                 looked = Instant::now();
@@ -173,7 +185,8 @@ impl Receiver {
     fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
         let bus = &self.ear.bus;
         inbox.clear();
-        let came = bus.wait(Some(LOOK)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
+        let patience = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
+        let came = bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
         came.unwrap_or_else(|error| {
             self.lose(inbox, account, &error);
             0
@@ -234,6 +247,9 @@ impl Receiver {
     fn hear(&mut self, inbox: &Inbox) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         for received in inbox.frames() {
+            if self.roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
+                continue;
+            }
             let at = Micros(received.at_nanos / 1_000);
             let queue = &mut self.positions;
             let mut positions = |epoch| positions_of(queue, epoch);
@@ -289,6 +305,7 @@ impl Receiver {
                 other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
                 last_joints: cell.last_joints,
                 said: cell.said(),
+                reply: cell.reply,
             }
         });
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
@@ -297,8 +314,9 @@ impl Receiver {
             account.unread = self.ear.link.commands().load(Ordering::Relaxed).saturating_sub(read);
         }
         let commands = read + account.unread;
+        let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
         if let Ok(mut view) = self.view.lock() {
-            *view = View { cells, commands };
+            *view = View { cells, commands, network };
         }
     }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
-use protocol::id::{CellId, Id, Kind, Node};
+use protocol::id::{Id, Kind, Node};
 use protocol::packet;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
@@ -50,15 +50,15 @@ impl Ears {
             // All kinds but that of sums, remote frames of any, and each root's.
             let kinds = [standard(0x000, 0x700), standard(0x200, 0x600), standard(0x400, 0x400)];
             let remote = Filter { id: REMOTE, mask: EXTENDED | REMOTE };
-            let roots = skin.wires(bus).roots().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(root))));
-            kinds.into_iter().chain([remote]).chain(roots.collect::<Vec<_>>()).collect::<Vec<_>>()
+            let wires = skin.wires(bus);
+            let roots = wires.roots().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(root))));
+            kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
         };
         // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
-        let wires = lanes.iter().map(|lane| Filter {
-            id: lane.reversed().raw_id(),
-            mask: EXTENDED | REMOTE | EXTENDED_MASK,
-        });
+        let wires = lanes
+            .iter()
+            .map(|lane| Filter { id: lane.reversed().raw_id(), mask: EXTENDED | REMOTE | EXTENDED_MASK });
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
         let all_sums = everything || few.len() + others.len() > Filter::MAX;
@@ -122,16 +122,11 @@ impl Roots {
     }
 }
 
-/// Whether a cell can be meant by a number that a page names.
-#[must_use]
-pub fn cell(number: u8) -> Option<CellId> {
-    CellId::new(number.into()).ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use protocol::can::Format;
+    use protocol::id::CellId;
     use protocol::message::Message;
     use protocol::packet::Epoch;
 

@@ -12,13 +12,14 @@ use protocol::bus::{BusError, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
-use protocol::skin::Reply;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
 use super::link::{Ear, Link, Slot, may_return};
+use super::network::Network;
 use super::progress::say;
 use super::receiver::{CellView, Left, News, Receiver, View};
+use super::roots::{Ears, Roots};
 use super::turn::{Line, Shared, Timed};
 use super::{Options, RunError, backlog, realtime};
 use crate::controller;
@@ -40,7 +41,7 @@ const GATHER: Duration = Duration::from_millis(10);
 /// Said when a receive buffer is smaller than it should be.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 /// Cells that were there before are given so long to show up.
-const SHOWING: Duration = Duration::from_secs(2);
+pub(super) const SHOWING: Duration = Duration::from_secs(2);
 /// Wake-ups of the idle machine that are measured, at the loop's period.
 const IDLE_WAKEUPS: u32 = 100;
 /// Records that wait for the main thread: more than a second of ticks.
@@ -70,6 +71,8 @@ pub(super) struct Bench<'a> {
     pub(super) news: Inlet<(usize, News)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
+    /// Each bus' network, where cells answer with sums.
+    pub(super) networks: Vec<Option<Network>>,
     /// The epoch of the first broadcast.
     pub(super) first_epoch: Epoch,
     pub(super) recorder: Option<Recorder>,
@@ -99,8 +102,9 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let backlog_dropped = backlog::dropped();
     let mut served = Vec::new();
     let mut buses = Vec::new();
-    for described in &options.skin.buses {
-        let (link, ear, slot) = open(options, &described.name, &mut served)?;
+    for (index, described) in options.skin.buses.iter().enumerate() {
+        let ears = Ears::of(&options.skin, index, !outputs.is_empty());
+        let (link, ear, slot) = open(options, &described.name, ears.filters, &mut served)?;
         if !options.quiet {
             let kib = link.receive_buffer() / 1_024;
             let (name, kind) = (link.name(), link.kind());
@@ -137,6 +141,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         news,
         signalled,
         cycle,
+        networks: (0..options.skin.buses.len()).map(|bus| Network::of(&options.skin, bus)).collect(),
         first_epoch,
         recorder,
         recorded,
@@ -173,14 +178,6 @@ fn refuse(options: &Options) -> Result<(), RunError> {
         let flash = flash.display();
         return Err(RunError::Usage(format!("--flash {flash}: there is no such directory; make it first")));
     }
-    for bus in &options.skin.buses {
-        if bus.reply != Reply::Torque {
-            let name = &bus.name;
-            return Err(RunError::Usage(format!(
-                "bus {name} has reply = \"sum\", which this version cannot run; \"torque\" can"
-            )));
-        }
-    }
     if options.scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
         return Err(RunError::Usage(
             "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, \
@@ -204,11 +201,12 @@ fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 fn open(
     options: &Options,
     name: &str,
+    filters: Vec<Filter>,
     served: &mut Vec<ServedBus>,
 ) -> Result<(Arc<Link>, Ear, Slot), RunError> {
     let wanted = BusOptions {
         fd: options.skin.buses.iter().any(|bus| bus.name == name && bus.format == Format::Fd),
-        filters: vec![Filter::ALL],
+        filters,
         own_frames: true,
         error_mask: u32::MAX,
         receive_buffer: options.receive_buffer,
@@ -288,7 +286,10 @@ fn listen(
 ) -> Result<(Lane, Line), RunError> {
     let Seat { index, ear, slot, view, outlet } = seat;
     let link = Arc::clone(&ear.link);
-    let table = Table::new(&options.skin, index);
+    let mut table = Table::new(&options.skin, index);
+    if !Ears::of(&options.skin, index, outlet.is_some()).all_sums {
+        table.hear_sums_of_roots_only();
+    }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
     let format = options.skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
@@ -299,6 +300,7 @@ fn listen(
         ear,
         gather: Duration::from_nanos(options.skin.timing.tick_nanos()).min(GATHER),
         table,
+        roots: Roots::of(&options.skin, index),
         snapshots,
         positions: of_broadcasts,
         outlet,
@@ -351,8 +353,9 @@ impl Bench<'_> {
         self.judge_start()?;
         self.wake_up()?;
         self.go_on_after_others();
-        // What they have counted and feel.
-        self.say(&Message::Report)
+        // What they have counted and feel, and where they are in their networks.
+        self.say(&Message::Report)?;
+        self.organise()
     }
 
     /// Cells that a gateway before this one has halted go on.
@@ -439,7 +442,7 @@ impl Bench<'_> {
     }
 
     /// Another gateway, a process that ends or a bus that is gone end the start.
-    fn hear_while_starting(&mut self) -> Result<(), RunError> {
+    pub(super) fn hear_while_starting(&mut self) -> Result<(), RunError> {
         if self.signalled.load(Ordering::Relaxed) {
             return Err(RunError::Failed("interrupted while starting".to_owned()));
         }

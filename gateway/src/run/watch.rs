@@ -17,6 +17,7 @@ use protocol::time::Micros;
 use super::launch::{ServedBus, program};
 use super::link::{Slot, may_return};
 use super::measured::Measured;
+use super::organise::lines;
 use super::progress::Progress;
 use super::realtime::{self, Granted};
 use super::receiver::{Left, News, View};
@@ -25,7 +26,9 @@ use super::turn::{Timed, Turn};
 use super::{RunError, backlog, usage};
 use crate::record::Recorder;
 use crate::scenario::{FaultKind, Stimulus, Touches};
-use crate::summary::{AccuracySummary, BusSummary, Loop, OutagesSummary, Processor, Quantiles, Summary};
+use crate::summary::{
+    AccuracySummary, BusSummary, Loop, NetworkSummary, OutagesSummary, Processor, Quantiles, Summary,
+};
 use crate::table::{Accuracy, Notice, Said};
 
 /// What a controller counted, by name.
@@ -160,6 +163,9 @@ impl Bench<'_> {
         self.break_things(script, progress, started)?;
         self.hear(script, progress)?;
         self.serve_again(progress);
+        for note in self.watch_networks()? {
+            progress.note(&note);
+        }
         let before = measured.halted();
         measured.take(records, self.began);
         match (before, measured.halted()) {
@@ -438,6 +444,15 @@ impl Bench<'_> {
                 at_end: outages.lasts(),
                 ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
             };
+            summary.network =
+                self.networks.get(index).and_then(Option::as_ref).map(|network| NetworkSummary {
+                    organised_s: network.organised.map(|organised| organised.as_secs_f64()),
+                    deepest: network.deepest(),
+                    differences: lines(&network.differences),
+                    without_way: network.without_way().collect(),
+                    longest_without_way_s: network.longest.as_secs_f64(),
+                    parent_changes: received.table.parent_changes(),
+                });
             Some(summary)
         };
         let mut summaries: Vec<_> = pairs.filter_map(summary).collect();

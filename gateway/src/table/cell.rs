@@ -105,10 +105,12 @@ pub struct Cell {
     pub heard: Option<(Heard, Heard)>,
     /// The last page of what it refused.
     pub refused: Option<Refused>,
-    /// The last page of its place in the tree since it started, and when it came.
-    pub tree: Option<(Tree, Micros)>,
+    /// The last page of its place in the tree since it started.
+    pub tree: Option<Tree>,
     /// The last page of what its ports lead to since it started.
     pub ports: Option<Ports>,
+    /// What it answers joints with, as it said last since it started.
+    pub reply: Option<[i16; WORDS]>,
     /// Packets sent and arrived.
     pub uplink: Uplink,
     /// Replies due and come.
@@ -157,6 +159,7 @@ impl Cell {
             refused: None,
             tree: None,
             ports: None,
+            reply: None,
             uplink: Uplink::default(),
             replies: Replies::default(),
             said: Said::default(),
@@ -230,7 +233,7 @@ impl Cell {
         if speaker == Speaker::Anew || is_first(heartbeat) {
             self.felt.restart();
             self.doubt();
-            (self.tree, self.ports) = (None, None);
+            (self.tree, self.ports, self.reply) = (None, None, None);
             // It counts from zero; what we did not hear from the beginning we compare from the next page on.
             self.heard = is_first(heartbeat).then(Default::default);
             self.told = 0;

@@ -22,12 +22,14 @@ use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q1_14};
 use protocol::id::{CellId, Id, Node};
-use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
+use protocol::parameters::Parameter;
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::{Micros, Span};
 
 use crate::central::Central;
+use crate::network::check::Seen;
 use crate::summary::histogram;
 use cell::Speaker;
 use trunk::{Expected, Sum, Taken, Trunk};
@@ -240,6 +242,12 @@ impl Table {
         self.trunk.as_ref().map(|trunk| (trunk.counts, trunk.contributions))
     }
 
+    /// How often parents of cells changed, by the cells' own count.
+    #[must_use]
+    pub fn parent_changes(&self) -> u64 {
+        self.cells.iter().filter_map(|cell| cell.ports).map(|ports| u64::from(ports.changes)).sum()
+    }
+
     /// Nodes that speak and that the skin does not have, each with its last heartbeat.
     pub fn strangers(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
         self.strangers.iter().map(|(node, heartbeat)| (*node, heartbeat))
@@ -392,11 +400,17 @@ impl Table {
             }
             Message::Network { page: NetworkPage::Refused(refused), .. } => cell.refuses(refused),
             Message::Network { page: NetworkPage::Tree(tree), .. } => {
-                cell.tree = Some((tree, at));
+                cell.tree = Some(tree);
                 cell.uplink.sums_sent(tree.sent, joints);
             }
             Message::Network { page: NetworkPage::Ports(ports), .. } => cell.ports = Some(ports),
             Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
+            Message::Configured { answer: Answer::Value { number, written: true, words }, .. } => {
+                if number == Parameter::Reply.number() {
+                    cell.reply = Some(words);
+                }
+            }
+            Message::Torque { .. } if self.trunk.is_some() => self.counters.count(Event::Stranger),
             Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
             Message::Sum { epoch, count, torque, .. } => {
                 self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) })
@@ -648,6 +662,29 @@ impl Table {
         }
         self.snapshot.sums.contributing =
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
+    }
+
+    /// What is known of the network's cells, in the skin's order, and of those that it does not describe.
+    pub fn network(&self, now: Micros) -> impl Iterator<Item = Seen> {
+        let described = self.statuses(now).map(|(cell, status)| Seen {
+            node: cell.node,
+            serial: Some(cell.serial),
+            configuration: cell.configuration,
+            heartbeat: cell.heartbeat,
+            alive: !matches!(status, Status::Dead | Status::Unknown),
+            tree: cell.tree,
+            ports: cell.ports,
+        });
+        let strangers = self.strangers().map(|(node, heartbeat)| Seen {
+            node,
+            serial: None,
+            configuration: heartbeat.configuration,
+            heartbeat: Some(*heartbeat),
+            alive: true,
+            tree: None,
+            ports: None,
+        });
+        described.chain(strangers)
     }
 
     /// The joints that cells are answering: their number, their epoch, and when they stood on the bus.

@@ -246,12 +246,14 @@ impl Skin {
         Some(parameters)
     }
 
+    /// From one broadcast of joints to the next, in µs; `None` for more than a word holds.
+    #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
         reason = "positive; u16 decides what fits"
     )]
-    fn period_us(&self) -> Option<u16> {
+    pub fn period_us(&self) -> Option<u16> {
         u16::try_from((1e6 / self.timing.broadcast_hz()).round() as u64).ok()
     }
 

@@ -26,7 +26,8 @@ fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
     let (head, one) = head.split_at(head.find("[[cell]]").unwrap());
     let cells = neighbors.iter().enumerate().map(|(at, ports)| {
         let (node, root) = (at + 1, at == 0);
-        let keys = format!("node = {node}\nserial = {}\nroot = {root}\nneighbors = {ports:?}", serial(cell(node)));
+        let keys =
+            format!("node = {node}\nserial = {}\nroot = {root}\nneighbors = {ports:?}", serial(cell(node)));
         one.replace("node = 1", &keys)
     });
     let text = format!("{head}{}", cells.collect::<String>());
@@ -91,11 +92,14 @@ impl Truth {
 
     fn damage(&mut self, kind: u8, at: &Index, other: &Index) {
         let node = cell(at.index(self.cells) + 1);
-        let wires: Vec<(End, End)> = self.leads.iter().map(|(a, b)| (*a, *b)).filter(|(a, b)| a < b).collect();
+        let wires: Vec<(End, End)> =
+            self.leads.iter().map(|(a, b)| (*a, *b)).filter(|(a, b)| a < b).collect();
         let wire = |index: &Index| wires.get(index.index(wires.len().max(1))).copied();
         match kind {
             0..=2 => {
-                let Some((first, second)) = wire(at).filter(|(a, b)| self.touch(&[a.cell, b.cell])) else { return };
+                let Some((first, second)) = wire(at).filter(|(a, b)| self.touch(&[a.cell, b.cell])) else {
+                    return;
+                };
                 let carries = match kind {
                     0 => Carries::Nothing,
                     1 => Carries::There,
@@ -111,7 +115,8 @@ impl Truth {
             }
             3 => {
                 let second = cell(other.index(self.cells) + 1);
-                let Some((a, b)) = self.free_port(node).zip(self.free_port(second)).filter(|(a, b)| a != b) else {
+                let Some((a, b)) = self.free_port(node).zip(self.free_port(second)).filter(|(a, b)| a != b)
+                else {
                     return;
                 };
                 if node != second && self.touch(&[node, second]) {
@@ -174,7 +179,12 @@ impl Truth {
                 if self.touch(&[node]) {
                     self.beats.get_mut(&node).unwrap().serial = 9;
                     let described = serial(node);
-                    self.expected.insert(Difference::OtherCell { cell: node, serial: 9, described, belongs: None });
+                    self.expected.insert(Difference::OtherCell {
+                        cell: node,
+                        serial: 9,
+                        described,
+                        belongs: None,
+                    });
                 }
             }
             _ => {
@@ -227,7 +237,8 @@ impl Truth {
                     port: u8::try_from(from.port).unwrap(),
                     hears: true,
                     works: self.leads.contains_key(&end),
-                    other_version: self.versions.contains_key(&from.cell) || self.versions.contains_key(&cell),
+                    other_version: self.versions.contains_key(&from.cell)
+                        || self.versions.contains_key(&cell),
                 };
             }
             Ports { ports, changes: 0 }
@@ -322,7 +333,10 @@ fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_has_no_way() {
     parent(3, 4);
     parent(4, 2);
     let found = differences(&truth.wires, &seen);
-    assert_eq!(found, [Difference::Circle(vec![cell(2), cell(3), cell(4)]), Difference::NoWay(vec![cell(5)])]);
+    assert_eq!(
+        found,
+        [Difference::Circle(vec![cell(2), cell(3), cell(4)]), Difference::NoWay(vec![cell(5)])]
+    );
     assert!(found.iter().all(Difference::breaks_the_tree));
 }
 
