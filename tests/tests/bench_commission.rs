@@ -149,7 +149,7 @@ fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
     // More than are asked at the same time.
     const MANY: u8 = 50;
     let mut halfway = 0;
-    for seed in 0..SEEDS / 2 {
+    for seed in 0..SEEDS / 4 {
         let (skin, old, new) = skin_of(MANY, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
         let flash = |place| if place % 4 == 3 { Flash::Empty } else { Flash::Sound(old(place)) };
         let mut workshop = Workshop::of(&skin, seed, flash);
@@ -169,7 +169,7 @@ fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
         assert_eq!(workshop.holding(&new), usize::from(MANY), "seed {seed}: {report:#?}");
         nothing_is_mixed(&workshop, flash, new);
     }
-    assert!(halfway > 8, "some of the runs must end in the middle of the cells: {halfway}");
+    assert!(halfway > 4, "some of the runs must end in the middle of the cells: {halfway}");
 }
 
 #[test]
