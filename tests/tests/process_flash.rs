@@ -68,8 +68,8 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
              delete the file",
             image.len()
         ),
-        "gateway: cells without parameters: 3, 5 on vcan0; configure them, or delete their flash files if \
-         these are damaged"
+        "gateway: cells without parameters: 3, 5 on vcan0; write them with `gateway commission`, or delete \
+         their flash files if these are damaged"
             .to_owned(),
     ];
     assert_eq!(said, expected);
@@ -120,7 +120,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let other = text.replace("alpha_c = 1.0", "alpha_c = 1.5");
     place.write("skin.toml", &other);
     let said = "gateway: cells that are configured for another skin than skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
-                vcan0; configure them for it, or delete their flash files";
+                vcan0; write it into them with `gateway commission`, or delete their flash files";
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
 

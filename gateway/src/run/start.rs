@@ -411,8 +411,8 @@ impl Bench<'_> {
         let ready = self.count(|cell| cell.ready);
         if !unconfigured.is_empty() && (ready == 0 || self.options.spawn) {
             return Err(RunError::Failed(format!(
-                "cells without parameters: {unconfigured}; configure them, or delete their flash files if \
-                 these are damaged"
+                "cells without parameters: {unconfigured}; write them with `gateway commission`, or delete \
+                 their flash files if these are damaged"
             )));
         }
         if ready == 0 || (self.options.spawn && !silent.is_empty()) {
@@ -425,7 +425,7 @@ impl Bench<'_> {
         }
         let other = self.names(|cell| cell.ready && cell.other);
         if !other.is_empty() {
-            let remedy = "configure them for it, or delete their flash files";
+            let remedy = "write it into them with `gateway commission`, or delete their flash files";
             return Err(RunError::Failed(format!(
                 "cells that are configured for another skin than {}: {other}; {remedy}",
                 self.options.skin_file.display()
