@@ -6,8 +6,9 @@ use std::time::{Duration, Instant};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
-use protocol::parameters::{Parameter, Reply as Words, Slots};
+use protocol::parameters::{Cuts, Parameter, Reply as Words, Slots};
 use protocol::skin::{Reply, Skin, Wires};
+use protocol::wire::PORTS;
 
 use super::receiver::View;
 use crate::network::check::{self, Difference};
@@ -27,6 +28,8 @@ pub(super) struct Network {
     period_us: u16,
     /// When each cell was told last.
     told: BTreeMap<CellId, Instant>,
+    /// Ports that are to hear nothing, a bit each, and when their cell was told last.
+    deaf: BTreeMap<CellId, (u8, Option<Instant>)>,
     /// Cells that speak and have no way, and since when.
     without: BTreeMap<CellId, Instant>,
     /// Of these, the ones that people have heard of.
@@ -60,6 +63,7 @@ impl Network {
             slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
             told: BTreeMap::new(),
+            deaf: BTreeMap::new(),
             without: BTreeMap::new(),
             said: BTreeSet::new(),
             said_too_deep: false,
@@ -152,6 +156,35 @@ impl Network {
         due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
     }
 
+    /// Cuts the wires from one cell to another, or mends them.
+    pub(super) fn set_cut(&mut self, cut: bool, from: CellId, to: CellId) {
+        let ends = (0_u8..)
+            .zip(0..PORTS)
+            .filter(|&(_, port)| self.wires.other_end(to, port).is_some_and(|(other, _)| other == from));
+        let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
+        let (deaf, told) = self.deaf.entry(to).or_insert((0, None));
+        *deaf = if cut { *deaf | bits } else { *deaf & !bits };
+        *told = None;
+    }
+
+    /// What is to be said to those whose ports are to hear nothing, or to hear again.
+    fn tell_cuts(&mut self, now: Instant, view: &View) -> Vec<Message> {
+        let mut messages = Vec::new();
+        for (&cell, (deaf, told)) in &mut self.deaf {
+            let Some(known) = view.cells.iter().find(|it| it.node == cell.get() && it.ready) else {
+                continue;
+            };
+            let waits = told.is_some_and(|at| now.duration_since(at) < AGAIN);
+            if known.deaf != *deaf && !waits {
+                *told = Some(now);
+                let words = Cuts { deaf: *deaf }.words();
+                let request = Request::Write { number: Parameter::Cuts.number(), words };
+                messages.push(Message::Configure { to: Node::Cell(cell), tag: *deaf, request });
+            }
+        }
+        messages
+    }
+
     /// Looks at the network while the loop runs.
     pub(super) fn look(&mut self, now: Instant, view: &View) -> Look {
         let mut look = Look::default();
@@ -167,6 +200,7 @@ impl Network {
             }
         }
         look.messages.extend(self.tell_again(now, view));
+        look.messages.extend(self.tell_cuts(now, view));
         let without: BTreeSet<_> = places.without_way.into_iter().collect();
         let mut back = Vec::new();
         self.without.retain(|cell, since| {
@@ -243,6 +277,7 @@ mod tests {
             last_joints: Epoch(0),
             said: Said::default(),
             reply,
+            deaf: 0,
         });
         let network = trees.iter().enumerate().map(|(at, tree)| Seen {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
@@ -286,6 +321,43 @@ mod tests {
         let look = network.look(now + AGAIN * 3, &view(&deeper, new));
         let [note] = look.notes.as_slice() else { panic!("{look:?}") };
         assert!(note.contains("slot_us = 4000 would") && note.contains("deeper than 2"), "{note}");
+    }
+
+    #[test]
+    fn a_cut_is_told_to_the_end_that_is_to_hear_nothing_until_it_says_so_and_again_after_a_start() {
+        let mut network = network();
+        let trees = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
+        network.fit(&view(&trees, None)).unwrap();
+        let words = Some(network.words());
+        let cell = |number| CellId::new(number).unwrap();
+        let mut now = Instant::now();
+        let mut look = |network: &mut Network, deaf| {
+            now += AGAIN;
+            let mut view = view(&trees, words);
+            view.cells[1].deaf = deaf;
+            let told = |message: &Message| {
+                let Message::Configure {
+                    to: Node::Cell(to),
+                    request: Request::Write { number: 9, words },
+                    ..
+                } = *message
+                else {
+                    panic!("{message:?}")
+                };
+                (to.get(), Cuts::from_words(words).deaf)
+            };
+            network.look(now, &view).messages.iter().map(told).collect::<Vec<_>>()
+        };
+        network.set_cut(true, cell(3), cell(2));
+        assert_eq!(look(&mut network, 0), [(2, 0b10)]);
+        assert_eq!(look(&mut network, 0), [(2, 0b10)], "it did not answer");
+        assert_eq!(look(&mut network, 0b10), []);
+        network.set_cut(true, cell(1), cell(2));
+        assert_eq!(look(&mut network, 0b10), [(2, 0b11)]);
+        network.set_cut(false, cell(3), cell(2));
+        assert_eq!(look(&mut network, 0b11), [(2, 0b01)]);
+        assert_eq!(look(&mut network, 0b01), []);
+        assert_eq!(look(&mut network, 0), [(2, 0b01)], "it started anew");
     }
 
     #[test]

@@ -77,6 +77,8 @@ pub struct CellView {
     pub said: Said,
     /// What it answers joints with, as it said last.
     pub reply: Option<[i16; WORDS]>,
+    /// Ports that hear nothing because it was told so, as it said last.
+    pub deaf: u8,
 }
 
 /// One bus, as its receiver sees it.
@@ -306,6 +308,7 @@ impl Receiver {
                 last_joints: cell.last_joints,
                 said: cell.said(),
                 reply: cell.reply,
+                deaf: cell.deaf,
             }
         });
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));

@@ -181,7 +181,7 @@ fn refuse(options: &Options) -> Result<(), RunError> {
     if options.scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
         return Err(RunError::Usage(
             "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, \
-             restart, stuck and drift it can"
+             restart, cut, mend, stuck and drift it can"
                 .to_owned(),
         ));
     }

@@ -256,6 +256,9 @@ impl Bench<'_> {
                 break;
             }
             script.fault += 1;
+            if let FaultKind::Wire { cut, from, to, both_ways } = fault.kind {
+                self.break_wire(cut, (from, to), both_ways, progress);
+            }
             let FaultKind::Process { action, cells } = &fault.kind else { continue };
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
                 let done = self.processes.act(cell.bus, cell.node.get(), *action)?;
@@ -265,6 +268,27 @@ impl Bench<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Cuts the wires between two cells, or mends them; the next look at their network tells them.
+    fn break_wire(
+        &mut self,
+        cut: bool,
+        (from, to): (usize, usize),
+        both_ways: bool,
+        progress: &mut Progress,
+    ) {
+        let cells = &self.options.skin.cells;
+        let (Some(from), Some(to)) = (cells.get(from), cells.get(to)) else { return };
+        let Some(Some(network)) = self.networks.get_mut(from.bus) else { return };
+        network.set_cut(cut, from.node, to.node);
+        if both_ways {
+            network.set_cut(cut, to.node, from.node);
+        }
+        let what = if cut { "Cut" } else { "Mend" };
+        let way = if both_ways { "between" } else { "one way, from" };
+        let (from, to, bus) = (from.node, to.node, network.name());
+        progress.note(&format!("scenario: {what} the wires {way} cell {from} and cell {to} on {bus}"));
     }
 
     /// What the receivers and the processes have to say.

@@ -7,8 +7,9 @@ use protocol::document::Fault as Wrong;
 use protocol::document::Step::{self, Index, Key};
 use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
+use protocol::skin::{Reply, Skin};
 use protocol::time::{Micros, Span};
+use protocol::wire::PORTS;
 
 use super::touches::GREATEST_FORCE_N;
 use super::{Mode, ModeChange, Motion, MotionKind, Profile, Scenario, Touch, faults, raw};
@@ -265,6 +266,37 @@ impl<'a> Names<'a> {
             None if self.skin.buses.len() == 1 => Ok(0),
             None => Err(Wrong::new(&path, "", format_args!("which bus? {}", there_is()))),
         }
+    }
+
+    /// The two cells of one bus that the keys `bus` and `cells` of the table at `at` name, in the file's order; wires
+    /// lead from one to the other.
+    pub(super) fn wired(
+        &self,
+        at: &[Step],
+        bus: Option<&str>,
+        nodes: Option<&[i64]>,
+    ) -> Checked<(usize, usize)> {
+        let path = [at, &[Key("cells")]].concat();
+        self.cells(at, bus, nodes, false)?;
+        let &[from, to] = nodes.unwrap_or_default() else {
+            let got = format!("{} cells", nodes.unwrap_or_default().len());
+            return Err(Wrong::new(&path, got, "a wire is between two"));
+        };
+        let bus = self.bus(at, bus)?;
+        let described = self.skin.buses.get(bus);
+        if described.is_some_and(|bus| bus.reply == Reply::Torque) {
+            return Err(Wrong::new(&path, "", "wires are used on a bus with reply = \"sum\" only"));
+        }
+        let find = |node: i64| self.index.get(&(bus, node)).copied();
+        let wires = self.skin.wires(bus);
+        let node = |cell: usize| self.skin.cells.get(cell).map(|cell| cell.node);
+        let leads = |(from, to): &(usize, usize)| {
+            let (Some(from), Some(to)) = (node(*from), node(*to)) else { return false };
+            (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
+        };
+        let why = "no wire is between them";
+        let pair = find(from).zip(find(to)).filter(leads);
+        pair.ok_or_else(|| Wrong::new(&path, format!("[{from}, {to}]"), why))
     }
 
     /// The cells that the keys `bus` and `cells` of the table at `at` name, or all of them; sorted.

@@ -7,14 +7,17 @@ use protocol::time::Span;
 use super::check::{Checked, EndS, Names, length, quoted};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
-const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of sensors \"stuck\", \
+const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"cut\", \"mend\"; of sensors \"stuck\", \
      \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// The faults, in the order of time.
 pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
     let mut faults = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        faults.push(Entry { index, raw, names }.fault(end)?);
+        let entry = Entry { index, raw, names };
+        let fault = entry.fault(end)?;
+        faults.extend(entry.end_of(&fault)?);
+        faults.push(fault);
     }
     faults.sort_by_key(|fault| fault.at);
     Ok(faults)
@@ -40,6 +43,8 @@ impl Entry<'_> {
             "stop" => self.process(ProcessAction::Stop)?,
             "continue" => self.process(ProcessAction::Continue)?,
             "restart" => self.process(ProcessAction::Restart)?,
+            "cut" => self.wire(true, &["for_s", "one_way"])?,
+            "mend" => self.wire(false, &["one_way"])?,
             "stuck" => self.sensor(SensorFault::Stuck, &["for_s"])?,
             "drift" => {
                 let n_per_s = self.given("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
@@ -72,6 +77,26 @@ impl Entry<'_> {
     fn process(&self, action: ProcessAction) -> Checked<FaultKind> {
         self.only(&[])?;
         Ok(FaultKind::Process { action, cells: self.cells()? })
+    }
+
+    fn wire(&self, cut: bool, keys: &[&str]) -> Checked<FaultKind> {
+        self.only(keys)?;
+        let at = [Key("fault"), Index(self.index)];
+        if self.raw.all {
+            return Err(self.wrong("all", true, "the two cells of a wire are needed"));
+        }
+        let (from, to) = self.names.wired(&at, self.raw.bus.as_deref(), self.raw.cells.as_deref())?;
+        Ok(FaultKind::Wire { cut, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
+    }
+
+    /// A cut that lasts for some time ends with a mend.
+    fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
+        let FaultKind::Wire { cut: true, from, to, both_ways } = fault.kind else { return Ok(None) };
+        if self.raw.for_s.is_none() {
+            return Ok(None);
+        }
+        let kind = FaultKind::Wire { cut: false, from, to, both_ways };
+        Ok(Some(Fault { at: fault.at + self.length()?, kind }))
     }
 
     fn sensor(&self, fault: SensorFault, keys: &[&str]) -> Checked<FaultKind> {
@@ -130,6 +155,7 @@ impl Entry<'_> {
         let raw = self.raw;
         let given = [
             ("for_s", raw.for_s.is_some()),
+            ("one_way", raw.one_way.is_some()),
             ("probability", raw.probability.is_some()),
             ("delay_us", raw.delay_us.is_some()),
             ("n_per_s", raw.n_per_s.is_some()),

@@ -138,6 +138,17 @@ pub enum FaultKind {
         /// Which.
         cells: Vec<usize>,
     },
+    /// Something is done to the wires between two cells.
+    Wire {
+        /// Whether they are cut; else they work again.
+        cut: bool,
+        /// The cell that is not heard any more.
+        from: usize,
+        /// The cell that does not hear it.
+        to: usize,
+        /// Whether that goes for the other way too.
+        both_ways: bool,
+    },
     /// A bus carries frames wrongly.
     Bus {
         /// How.

@@ -71,6 +71,7 @@ pub(super) struct Fault {
     pub(super) cells: Option<Vec<i64>>,
     #[serde(default)]
     pub(super) all: bool,
+    pub(super) one_way: Option<bool>,
     pub(super) probability: Option<f64>,
     pub(super) delay_us: Option<i64>,
     pub(super) n_per_s: Option<f64>,

@@ -314,3 +314,53 @@ fn words_saturate_beyond_what_they_can_say() {
     assert_eq!(contact_words(-200.0).map(|word| word.to_bits()), [i16::MIN; 3]);
     assert_eq!(contact_words(1.0).map(|word| word.to_bits()), [342, 341, 341]);
 }
+
+#[test]
+fn a_wire_is_cut_between_two_cells_that_it_leads_between_and_mended_in_time() {
+    let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
+    let cell = cell.split("[[cell]]").nth(1).unwrap();
+    let described = |reply: &str, neighbors: [&str; 3]| {
+        let cells = (1..).zip(neighbors).map(|(node, neighbors)| {
+            let more = format!("node = {node}\nroot = {}\nneighbors = {neighbors}", node == 1);
+            format!("[[cell]]{}", cell.replacen("node = 1", &more, 1))
+        });
+        let text = format!("{}{}", head.replace("reply = \"torque\"", reply), cells.collect::<String>());
+        Skin::parse("skin.toml", &text).unwrap()
+    };
+    let line = ["[2, 0, 0, 0]", "[1, 3, 0, 0]", "[2, 0, 0, 0]"];
+    let sums = described("reply = \"sum\"\nslot_us = 1500", line);
+    let fault = |skin: &Skin, text: &str| {
+        let text = format!("version = 1\nduration_s = 9.0\n[[fault]]\nat_s = 0.5\n{text}\n");
+        Scenario::parse("s.toml", &text, skin)
+            .map(|scenario| scenario.faults)
+            .map_err(|error| error.to_string())
+    };
+    let wire = |at, cut, from, to, both_ways| Fault {
+        at: Micros(at),
+        kind: FaultKind::Wire { cut, from, to, both_ways },
+    };
+    assert_eq!(
+        fault(&sums, "kind = \"cut\"\ncells = [3, 2]\none_way = true\nfor_s = 1.0").unwrap(),
+        [wire(500_000, true, 2, 1, false), wire(1_500_000, false, 2, 1, false)]
+    );
+    assert_eq!(fault(&sums, "kind = \"cut\"\ncells = [1, 2]").unwrap(), [wire(500_000, true, 0, 1, true)]);
+    assert_eq!(fault(&sums, "kind = \"mend\"\ncells = [1, 2]").unwrap(), [wire(500_000, false, 0, 1, true)]);
+    let wrong = |skin, text| fault(skin, text).unwrap_err();
+    assert_eq!(
+        wrong(&sums, "kind = \"cut\"\ncells = [3, 1]"),
+        "s.toml:6: fault[0].cells = [3, 1]: no wire is between them"
+    );
+    assert_eq!(
+        wrong(&sums, "kind = \"cut\"\ncells = [1]"),
+        "s.toml:6: fault[0].cells = 1 cells: a wire is between two"
+    );
+    assert_eq!(
+        wrong(&sums, "kind = \"mend\"\nfor_s = 1.0\ncells = [1, 2]"),
+        "s.toml:6: fault[0].for_s: means nothing with kind = \"mend\""
+    );
+    let torques = described("reply = \"torque\"", line);
+    assert_eq!(
+        wrong(&torques, "kind = \"cut\"\ncells = [1, 2]"),
+        "s.toml:6: fault[0].cells: wires are used on a bus with reply = \"sum\" only"
+    );
+}

@@ -111,6 +111,8 @@ pub struct Cell {
     pub ports: Option<Ports>,
     /// What it answers joints with, as it said last since it started.
     pub reply: Option<[i16; WORDS]>,
+    /// Ports that hear nothing because it was told so, a bit each.
+    pub deaf: u8,
     /// Packets sent and arrived.
     pub uplink: Uplink,
     /// Replies due and come.
@@ -160,6 +162,7 @@ impl Cell {
             tree: None,
             ports: None,
             reply: None,
+            deaf: 0,
             uplink: Uplink::default(),
             replies: Replies::default(),
             said: Said::default(),
@@ -233,7 +236,7 @@ impl Cell {
         if speaker == Speaker::Anew || is_first(heartbeat) {
             self.felt.restart();
             self.doubt();
-            (self.tree, self.ports, self.reply) = (None, None, None);
+            (self.tree, self.ports, self.reply, self.deaf) = (None, None, None, 0);
             // It counts from zero; what we did not hear from the beginning we compare from the next page on.
             self.heard = is_first(heartbeat).then(Default::default);
             self.told = 0;

@@ -24,7 +24,7 @@ use protocol::fixed::{Q, Q1_14};
 use protocol::id::{CellId, Id, Node};
 use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
-use protocol::parameters::Parameter;
+use protocol::parameters::{Cuts, Parameter};
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::{Micros, Span};
 
@@ -408,6 +408,8 @@ impl Table {
             Message::Configured { answer: Answer::Value { number, written: true, words }, .. } => {
                 if number == Parameter::Reply.number() {
                     cell.reply = Some(words);
+                } else if number == Parameter::Cuts.number() {
+                    cell.deaf = Cuts::from_words(words).deaf;
                 }
             }
             Message::Torque { .. } if self.trunk.is_some() => self.counters.count(Event::Stranger),
