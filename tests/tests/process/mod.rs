@@ -11,6 +11,7 @@
     reason = "each test file uses its part of it, and a test may stop"
 )]
 
+pub(crate) mod buses;
 pub(crate) mod log;
 pub(crate) mod replay;
 pub(crate) mod vcan;
@@ -314,9 +315,15 @@ impl Guest {
 
 /// Whether a bench has said of a cell, alone or with others, that it has done something.
 pub(crate) fn tells(text: &str, cell: u8, what: &str) -> bool {
+    tells_on(text, "vcan0", cell, what)
+}
+
+/// The same on another bus.
+pub(crate) fn tells_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
+    let on_bus = format!(" on {bus} ha");
     let names = |line: &str| {
         let cells = line.strip_prefix("cell ").or_else(|| line.strip_prefix("cells "))?;
-        let (cells, rest) = cells.split_once(" on vcan0 ha")?;
+        let (cells, rest) = cells.split_once(&on_bus)?;
         rest.ends_with(what).then(|| cells.split(", ").any(|name| name == cell.to_string()))
     };
     text.lines().any(|line| names(line) == Some(true))
@@ -388,6 +395,11 @@ impl Running {
     /// Waits until a bench has said of a cell that it has done something.
     pub(crate) fn tells(&self, cell: u8, what: &str) {
         self.err.wait_until(what, |text| tells(text, cell, what));
+    }
+
+    /// The same on another bus.
+    pub(crate) fn tells_on(&self, bus: &str, cell: u8, what: &str) {
+        self.err.wait_until(what, |text| tells_on(text, bus, cell, what));
     }
 
     /// Waits until a bench's loop runs: then come the lines that say how it goes.
