@@ -43,6 +43,8 @@ const SHOWING: Span = Span::from_millis(3_000);
 const WINDOW: usize = 16;
 /// How long nobody may answer a request to everyone before it is over, and what remains is asked of each.
 const QUIET: Span = Span::from_millis(150);
+/// How often everyone is asked the same, when most do not answer.
+const CALLS: u8 = 3;
 /// From one sync to the next while heartbeats are awaited.
 const SYNC: Span = Span::from_millis(300);
 /// How often a gateway says that it is there: nobody begins beside it.
@@ -71,6 +73,10 @@ enum Phase {
 #[derive(Clone, Copy, Debug)]
 struct Call {
     ask: Ask,
+    tag: u8,
+    /// Cells that needed it at first.
+    needed: usize,
+    tries: u8,
     /// When it is over, unless somebody answers before that.
     due: Micros,
 }
@@ -392,8 +398,17 @@ impl Commission {
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = self.call {
-                let waits = self.tasks.iter().any(|task| task.needs(call.ask));
-                if waits && now < call.due {
+                let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.ask));
+                let first = waiting.next().map(|(place, _)| place);
+                if first.is_some() && now < call.due {
+                    return true;
+                }
+                // When most have not heard it, to say it again costs less than to ask each.
+                let lost = first.filter(|_| 2 * (waiting.count() + 1) > call.needed && call.tries < CALLS);
+                if let Some(place) = lost {
+                    self.call = Some(Call { due: now + QUIET, tries: call.tries + 1, ..call });
+                    self.repeated += 1;
+                    self.request(place, Node::Everyone, call.ask, call.tag);
                     return true;
                 }
                 self.call = None;
@@ -402,13 +417,14 @@ impl Commission {
             let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(ask));
             // What one cell needs is asked of that cell.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
+            let needed = needing.count() + 2;
             if !self.may_call(ask) {
                 continue;
             }
             // There are fewer of them than tags.
             let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
             self.called.push((ask, tag));
-            self.call = Some(Call { ask, due: now + QUIET });
+            self.call = Some(Call { ask, tag, needed, tries: 1, due: now + QUIET });
             self.request(place, Node::Everyone, ask, tag);
         }
     }
