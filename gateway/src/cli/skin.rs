@@ -88,7 +88,7 @@ impl Check {
 }
 
 fn describe(out: &mut String, skin: &Description) -> fmt::Result {
-    let Description { name, robot, timing, buses, controller, safety: _, cells } = skin;
+    let Description { name, robot, timing, events: _, buses, controller, safety: _, cells } = skin;
     let joints = robot.joints.len();
     writeln!(out, "{name}: {}, {}", count(cells.len(), "cell"), count(buses.len(), "bus"))?;
     writeln!(out, "robot: {}, {}", robot.name, count(joints, "joint"))?;

@@ -74,7 +74,12 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
         ("decay_epochs", skin.safety.decay_epochs.to_string()),
         ("bad_cycles", skin.safety.bad_cycles.to_string()),
         ("lost_bus", skin.safety.lost_bus.name().to_owned()),
+        ("events", Words(Parameter::Events.number(), skin.events.words()).to_string()),
     ]);
+    for bus in &skin.buses {
+        let sensing = Words(Parameter::Sensing.number(), bus.sensing.words());
+        all.insert(format!("sensing/{}", bus.name), sensing.to_string());
+    }
     all.extend(run);
     all
 }

@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 
 use super::{
     Bus, Cell, Controller, ControllerKind, DenavitHartenberg, LostBus, Reply, Robot, Safety, Skin, Timing,
-    raw,
+    raw, sensing,
 };
 use crate::can::Format;
 use crate::document::Fault;
@@ -27,11 +27,12 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     let robot = robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
     let contact = contact(&[Key("contact")], raw.contact, plain_contact())?;
+    let events = sensing::events(raw.events)?;
     let buses = buses(&raw.bus)?;
     let controller = controller(raw.controller, robot.joints.len())?;
     let safety = safety(&raw.safety)?;
     let cells = cells(&raw.cell, &robot, &buses, contact)?;
-    let skin = Skin { name: raw.name, robot, timing, buses, controller, safety, cells };
+    let skin = Skin { name: raw.name, robot, timing, events, buses, controller, safety, cells };
     let Some(period_us) = skin.period_us() else {
         let path = [Key("timing"), Key("joint_broadcast_hz")];
         return Err(Fault::new(&path, raw.timing.joint_broadcast_hz, "at least 15.3 Hz are possible"));
@@ -246,7 +247,8 @@ fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
                 got => return Err(Fault::new(&at("format"), format!("{got:?}"), "\"fd\" or \"classic\"")),
             };
             let (bitrate, data_bitrate) = bit_rates(index, bus, format)?;
-            Ok(Bus { name: bus.name.clone(), reply, format, bitrate, data_bitrate })
+            let sensing = sensing::of_bus(index, bus)?;
+            Ok(Bus { name: bus.name.clone(), reply, format, bitrate, data_bitrate, sensing })
         })
         .collect()
 }

@@ -5,6 +5,7 @@
 
 mod check;
 mod raw;
+pub mod sensing;
 mod wires;
 
 use std::path::Path;
@@ -13,7 +14,7 @@ use crate::can::Format;
 use crate::document::{self, DocumentError};
 use crate::fixed::Q1_14;
 use crate::id::CellId;
-use crate::parameters::{Contact, Parameters, Pose, Row};
+use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
 
 pub use wires::Wires;
 
@@ -26,6 +27,8 @@ pub struct Skin {
     pub robot: Robot,
     /// How often things happen.
     pub timing: Timing,
+    /// Which changes of what cells measure are events.
+    pub events: Events,
     /// The buses, in the file's order.
     pub buses: Vec<Bus>,
     /// What turns torques into motion.
@@ -111,6 +114,8 @@ pub struct Bus {
     pub bitrate: Option<u32>,
     /// Bits in a second of an FD frame's data, of hardware.
     pub data_bitrate: Option<u32>,
+    /// When its cells say what they measure.
+    pub sensing: Sensing,
 }
 
 /// What turns torques into motion.

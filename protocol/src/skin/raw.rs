@@ -11,6 +11,8 @@ pub(super) struct Skin {
     pub(super) timing: Timing,
     #[serde(default)]
     pub(super) contact: Contact,
+    #[serde(default)]
+    pub(super) events: Events,
     pub(super) bus: Vec<Bus>,
     pub(super) controller: Controller,
     #[serde(default)]
@@ -63,6 +65,19 @@ pub(super) struct Bus {
     pub(super) carry: Option<bool>,
     pub(super) bitrate: Option<i64>,
     pub(super) data_bitrate: Option<i64>,
+    pub(super) sensing: Option<String>,
+    pub(super) sensing_hz: Option<f64>,
+}
+
+/// Which changes of what cells measure are events.
+#[derive(Clone, Copy, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Events {
+    pub(super) contact_n: Option<f64>,
+    pub(super) proximity: Option<f64>,
+    pub(super) temperature_c: Option<f64>,
+    pub(super) acceleration_g: Option<f64>,
+    pub(super) hysteresis: Option<f64>,
 }
 
 #[derive(Debug, Deserialize)]

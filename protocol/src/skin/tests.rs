@@ -272,3 +272,57 @@ fn a_broken_file_says_where_in_one_line() {
             .contains("/nonexistent/skin.toml")
     );
 }
+
+#[test]
+fn sensing_is_off_unless_said_and_its_keys_are_checked() {
+    let format = "format = \"fd\"";
+    let with = |lines: &str| GOOD.replacen(format, &format!("{format}\n{lines}"), 1);
+    let sensing = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap().buses[0].sensing;
+    assert_eq!(sensing(""), Sensing::Off);
+    assert_eq!(sensing("sensing = \"off\""), Sensing::Off);
+    assert_eq!(sensing("sensing = \"event\""), Sensing::Event);
+    let at = |period_ms| Sensing::Continuous { period_ms };
+    assert_eq!(sensing("sensing = \"continuous\"\nsensing_hz = 62.5"), at(16));
+
+    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    assert_eq!(
+        fault("sensing = \"always\""),
+        "skin.toml:23: bus[0].sensing = \"always\": \"off\", \"continuous\" or \"event\""
+    );
+    assert_eq!(
+        fault("sensing = \"continuous\""),
+        "skin.toml:23: bus[0].sensing = \"continuous\": sensing_hz is needed with it"
+    );
+    assert_eq!(
+        fault("sensing = \"event\"\nsensing_hz = 10"),
+        "skin.toml:24: bus[0].sensing_hz = 10: only with sensing = \"continuous\""
+    );
+    assert_eq!(
+        fault("sensing = \"continuous\"\nsensing_hz = 60.0"),
+        "skin.toml:24: bus[0].sensing_hz = 60: its period must be a whole number of ms; the nearest are \
+         58.8235 and 62.5000 Hz"
+    );
+}
+
+#[test]
+fn thresholds_of_events_have_defaults_and_fit_their_words() {
+    let with = |lines: &str| GOOD.replacen("[controller]", &format!("[events]\n{lines}\n[controller]"), 1);
+    let events = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap().events;
+    assert_eq!(Skin::parse("skin.toml", GOOD).unwrap().events, Events::default());
+    assert_eq!(events("contact_n = 0.25").contact.to_bits(), 256);
+    assert_eq!(events("hysteresis = 1.0").hysteresis.to_bits(), 1 << 14);
+    assert_eq!(events("temperature_c = 0.0").temperature.to_bits(), 0, "every change");
+
+    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    assert_eq!(fault("contact_n = -1.0"), "skin.toml:25: events.contact_n = -1: must not be negative");
+    assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: its word holds [0, 32)");
+    assert_eq!(
+        fault("hysteresis = 1.5"),
+        "skin.toml:25: events.hysteresis = 1.5: a part of a threshold: 0 to 1 is possible"
+    );
+    assert_eq!(
+        fault("force_n = 1.0"),
+        "skin.toml:25: unknown field `force_n`, expected one of `contact_n`, `proximity`, `temperature_c`, \
+         `acceleration_g`, `hysteresis`"
+    );
+}
