@@ -306,6 +306,23 @@ pub struct NetworkSummary {
     pub parent_changes: u64,
 }
 
+/// What the cells of a bus told of what they feel.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct SensorsSummary {
+    /// Frames, of either page.
+    pub frames: u64,
+    /// Touches in them.
+    pub touches: u64,
+    /// Releases in them.
+    pub releases: u64,
+    /// Frames a second of the cell with the fewest, of those that sent at least two.
+    pub least_hz: Option<f64>,
+    /// The mean over these cells.
+    pub mean_hz: Option<f64>,
+    /// Of the cell with the most.
+    pub greatest_hz: Option<f64>,
+}
+
 /// One bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusSummary {
@@ -329,6 +346,8 @@ pub struct BusSummary {
     pub sums: Option<SumsSummary>,
     /// The network that they go along.
     pub network: Option<NetworkSummary>,
+    /// What cells told of what they feel.
+    pub sensors: SensorsSummary,
     /// Epochs that somebody had to answer, and those that everybody answered in time.
     pub epochs_due: u64,
     /// See above.
@@ -384,6 +403,7 @@ impl BusSummary {
             replies: replies(table),
             sums: sums(table),
             network: None,
+            sensors: sensors(table),
             epochs_due: counters.epochs_due,
             epochs_complete: counters.epochs_complete,
             received: kinds(&|kind| counters.received(kind)),
@@ -392,6 +412,20 @@ impl BusSummary {
             dropped_by_bus: dropped,
             last_reply_us: Quantiles::of(table.last_reply(), 1.0),
         }
+    }
+}
+
+fn sensors(table: &Table) -> SensorsSummary {
+    let told = || table.cells().iter().map(|cell| cell.sensed);
+    let rates: Vec<f64> = told().filter_map(|sensed| sensed.rate_hz()).collect();
+    let cells = u32::try_from(rates.len()).ok().filter(|&cells| cells > 0);
+    SensorsSummary {
+        frames: told().map(|sensed| sensed.frames).sum(),
+        touches: told().map(|sensed| sensed.touches).sum(),
+        releases: told().map(|sensed| sensed.releases).sum(),
+        least_hz: rates.iter().copied().reduce(f64::min),
+        mean_hz: cells.map(|cells| rates.iter().sum::<f64>() / f64::from(cells)),
+        greatest_hz: rates.iter().copied().reduce(f64::max),
     }
 }
 

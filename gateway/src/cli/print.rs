@@ -196,6 +196,17 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
         kinds.iter().map(|(kind, count)| format!("{count} {kind}")).collect::<Vec<_>>().join(", ")
     };
     rows.row("received", list(&bus.received), "");
+    let sensors = &bus.sensors;
+    if let (Some(least), Some(mean), Some(greatest)) =
+        (sensors.least_hz, sensors.mean_hz, sensors.greatest_hz)
+    {
+        let touches = format!("{} touches, {} releases", sensors.touches, sensors.releases);
+        rows.row(
+            "  sensors frames a second and cell",
+            format!("{least:.1} / {mean:.1} / {greatest:.1}"),
+            touches,
+        );
+    }
     rows.row("sent", list(&bus.sent), "");
     if !bus.events.is_empty() {
         rows.row("odd", list(&bus.events), "");

@@ -3,10 +3,13 @@
 use std::collections::BTreeMap;
 use std::fs;
 
+use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use rustix::system::uname;
 use rustix::thread::ClockId;
 use rustix::time::{clock_getres, clock_gettime};
+
+use crate::decode::parameter::Words;
 
 /// Facts by name.
 pub type Facts = BTreeMap<String, String>;

@@ -25,6 +25,7 @@ pub mod realtime;
 pub mod receiver;
 pub mod roots;
 mod start;
+mod switching;
 pub mod turn;
 mod usage;
 mod watch;

@@ -18,7 +18,7 @@ use super::turn::Shared;
 use crate::network::check::Seen as SeenCell;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;
-use crate::table::{Notice, Said, Snapshot, Status, Table};
+use crate::table::{Notice, SWITCHES, Said, Snapshot, Status, Switch, Table};
 
 /// How often time is let pass when nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
@@ -79,6 +79,8 @@ pub struct CellView {
     pub reply: Option<[i16; WORDS]>,
     /// Ports that hear nothing because it was told so, as it said last.
     pub deaf: u8,
+    /// What it is to be switched to and has not confirmed.
+    pub lacks: [Option<Switch>; SWITCHES],
 }
 
 /// One bus, as its receiver sees it.
@@ -309,6 +311,7 @@ impl Receiver {
                 said: cell.said(),
                 reply: cell.reply,
                 deaf: cell.deaf,
+                lacks: cell.lacks(),
             }
         });
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));

@@ -353,6 +353,7 @@ impl Bench<'_> {
         self.judge_start()?;
         self.wake_up()?;
         self.go_on_after_others();
+        self.switch_cells()?;
         // What they have counted and feel, and where they are in their networks.
         self.say(&Message::Report)?;
         self.organise()

@@ -22,6 +22,7 @@ use super::progress::Progress;
 use super::realtime::{self, Granted};
 use super::receiver::{Left, News, View};
 use super::start::{Bench, Lane, rival};
+use super::switching::Told;
 use super::turn::{Timed, Turn};
 use super::{RunError, backlog, usage};
 use crate::record::Recorder;
@@ -48,6 +49,8 @@ struct Script {
     epoch: u64,
     /// The next fault.
     fault: usize,
+    /// Cells that were switched again.
+    told: Told,
 }
 
 impl Bench<'_> {
@@ -71,8 +74,8 @@ impl Bench<'_> {
             records,
         )
         .recorded(self.recorded.take());
-        let mut script =
-            Script { touches: Touches::new(&options.scenario, &options.skin), epoch: 0, fault: 0 };
+        let touches = Touches::new(&options.scenario, &options.skin);
+        let mut script = Script { touches, epoch: 0, fault: 0, told: Told::new() };
         self.press(&mut script)?;
 
         let before = self.spent();
@@ -166,6 +169,7 @@ impl Bench<'_> {
         for note in self.watch_networks()? {
             progress.note(&note);
         }
+        self.switch_again(&mut script.told)?;
         let before = measured.halted();
         measured.take(records, self.began);
         match (before, measured.halted()) {

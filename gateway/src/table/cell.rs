@@ -1,15 +1,17 @@
 //! One cell, as the gateway sees it.
 
 use protocol::id::CellId;
-use protocol::message::{Heard, Heartbeat, Ports, Refused, SkinSensors, State, Tree};
+use protocol::message::{Heard, Heartbeat, Ports, Refused, SensorPage, SkinSensors, State, Tree};
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::Parameters;
+use protocol::parameters::{Events, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
 use super::DEAD_AFTER;
 use super::felt::Felt;
 use super::ledger::{Replies, Uplink};
+use super::sensed::Sensed;
+use super::switched::{SWITCHES, Switch, Switched};
 use super::trunk::Sum;
 
 /// A torque may answer the newest epoch, or one of so many before it.
@@ -120,6 +122,10 @@ pub struct Cell {
     /// Whether it has said a heartbeat since the last sync, and its counters since the last report.
     pub(super) said: Said,
     pub(super) felt: Felt,
+    /// What it told of what it feels.
+    pub sensed: Sensed,
+    /// What it shall be switched to, and has confirmed.
+    pub(super) switched: Switched,
     /// By its last heartbeat, or a command that the bus carried since.
     halted: bool,
     /// Whether the bus carried a halt or a resume since its last heartbeat.
@@ -148,7 +154,12 @@ pub struct Cell {
 }
 
 impl Cell {
-    pub(super) fn new(described: &skin::Cell, parameters: &Parameters, summed: bool) -> Self {
+    pub(super) fn new(
+        described: &skin::Cell,
+        parameters: &Parameters,
+        summed: bool,
+        switched: Switched,
+    ) -> Self {
         Self {
             node: described.node,
             serial: described.serial,
@@ -167,6 +178,8 @@ impl Cell {
             replies: Replies::default(),
             said: Said::default(),
             felt: Felt::default(),
+            sensed: Sensed::default(),
+            switched,
             halted: false,
             commanded: false,
             last_word: None,
@@ -235,6 +248,8 @@ impl Cell {
         }
         if speaker == Speaker::Anew || is_first(heartbeat) {
             self.felt.restart();
+            self.sensed.restart();
+            self.switched.restart();
             self.doubt();
             (self.tree, self.ports, self.reply, self.deaf) = (None, None, None, 0);
             // It counts from zero; what we did not hear from the beginning we compare from the next page on.
@@ -285,8 +300,17 @@ impl Cell {
     }
 
     /// The cell said what it feels.
-    pub(super) fn feels(&mut self, skin: SkinSensors) {
-        self.felt.said(skin);
+    pub(super) fn tells(&mut self, at: Micros, page: &SensorPage, events: &Events) {
+        self.sensed.hear(at, page, events);
+        if let SensorPage::Skin(skin) = *page {
+            self.felt.said(skin);
+        }
+    }
+
+    /// What it is to be switched to and has not confirmed.
+    #[must_use]
+    pub fn lacks(&self) -> [Option<Switch>; SWITCHES] {
+        self.switched.lacks()
     }
 
     /// What it feels; `None` where only the cell knows.
@@ -535,7 +559,8 @@ mod tests {
     fn a_heartbeat_that_was_said_before_a_halt_does_not_end_it() {
         let skin = crate::testing::skin();
         let described = skin.cells.first().unwrap();
-        let mut cell = Cell::new(described, &skin.parameters(described), false);
+        let switched = Switched::new(skin.events, Default::default());
+        let mut cell = Cell::new(described, &skin.parameters(described), false, switched);
         let says = |cell: &mut Cell, sent, state: State| {
             cell.hear(Micros(0));
             cell.take_heartbeat(Speaker::Known, &Heartbeat { sent, state, ..Heartbeat::default() });

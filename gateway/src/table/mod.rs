@@ -14,6 +14,8 @@ mod cell;
 mod counters;
 mod felt;
 mod ledger;
+mod sensed;
+mod switched;
 mod trunk;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -24,7 +26,7 @@ use protocol::fixed::{Q, Q1_14};
 use protocol::id::{CellId, Id, Node};
 use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
-use protocol::parameters::{Cuts, Parameter};
+use protocol::parameters::{Cuts, Events, Parameter, Sensing};
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::{Micros, Span};
 
@@ -32,12 +34,15 @@ use crate::central::Central;
 use crate::network::check::Seen;
 use crate::summary::histogram;
 use cell::Speaker;
+use switched::Switched;
 use trunk::{Expected, Sum, Taken, Trunk};
 
 pub use accuracy::{Accuracy, Errors};
 pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
 pub use ledger::{Replies, Uplink};
+pub use sensed::Sensed;
+pub use switched::{SWITCHES, Switch};
 pub use trunk::{Contributions, SumCounts};
 
 /// A cell that has said nothing for so long is dead: two heartbeats, and the jitter of a busy machine,
@@ -135,6 +140,7 @@ impl Broadcast {
 pub struct Table {
     format: Format,
     safety: Safety,
+    events: Events,
     central: Central,
     unquantised: Central,
     comparing: bool,
@@ -170,12 +176,15 @@ impl Table {
             if let Some(place) = places.get_mut(described.node.index()) {
                 *place = Some(cells.len());
             }
-            cells.push(Cell::new(described, &part.parameters(described), summed));
+            let sensing = skin.buses.get(bus).map_or(Sensing::Off, |bus| bus.sensing);
+            let switched = Switched::new(skin.events, sensing);
+            cells.push(Cell::new(described, &part.parameters(described), summed, switched));
         }
         let snapshot = Snapshot { sums: Sums::default(), felt: vec![SkinSensors::default(); cells.len()] };
         Self {
             format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
             safety: skin.safety,
+            events: skin.events,
             central: Central::new(&part),
             unquantised: Central::unquantised(&part),
             comparing: false,
@@ -404,12 +413,15 @@ impl Table {
                 cell.uplink.sums_sent(tree.sent, joints);
             }
             Message::Network { page: NetworkPage::Ports(ports), .. } => cell.ports = Some(ports),
-            Message::Sensors { page: SensorPage::Skin(skin), .. } => cell.feels(skin),
-            Message::Configured { answer: Answer::Value { number, written: true, words }, .. } => {
-                if number == Parameter::Reply.number() {
-                    cell.reply = Some(words);
-                } else if number == Parameter::Cuts.number() {
-                    cell.deaf = Cuts::from_words(words).deaf;
+            Message::Sensors { page, .. } => cell.tells(at, &page, &self.events),
+            Message::Configured { answer, .. } => {
+                cell.switched.answered(&answer);
+                if let Answer::Value { number, written: true, words } = answer {
+                    if number == Parameter::Reply.number() {
+                        cell.reply = Some(words);
+                    } else if number == Parameter::Cuts.number() {
+                        cell.deaf = Cuts::from_words(words).deaf;
+                    }
                 }
             }
             Message::Torque { .. } if self.trunk.is_some() => self.counters.count(Event::Stranger),
@@ -417,9 +429,7 @@ impl Table {
             Message::Sum { epoch, count, torque, .. } => {
                 self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) })
             }
-            Message::Sensors { .. }
-            | Message::Configured { .. }
-            | Message::Halt
+            Message::Halt
             | Message::Joints { .. }
             | Message::Sync
             | Message::Resume

@@ -1045,6 +1045,9 @@ def document():
     log.title("pressing a cell from a shell")
     log.put(write(CELL, 12, mode(1)), stimulus(CELL, None, PRESSED), stimulus(CELL, None, skin([0, 0, 0])))
     log.put(torque(CELL, 7, answer([1024] * 3)[3]), torque(CELL, 8, [0] * 6))
+    log.title("when a cell says what it feels")
+    log.put(write(EVERYONE, 0, sensing("event")), write(CELL, 0, sensing("continuous", 16)))
+    log.put(sensors(CELL, 7, skin([1024] * 3)), sensors(CELL, 8, skin([0, 0, 0])))
     return log
 
 
