@@ -15,6 +15,7 @@ mod print;
 mod recover;
 mod replay;
 mod run;
+mod sensing;
 mod skin;
 
 use std::process::ExitCode;
@@ -43,6 +44,7 @@ enum Command {
     Commission(commission::Commission),
     Cells(cells::Cells),
     Ack(ack::Ack),
+    Sensing(sensing::Sensing),
     Skin(skin::Skin),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
@@ -61,6 +63,7 @@ impl Command {
             Self::Commission(command) => command.run(),
             Self::Cells(command) => command.run(),
             Self::Ack(command) => command.run(),
+            Self::Sensing(command) => command.run(),
             Self::Skin(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),

@@ -1,0 +1,291 @@
+//! Whole benches on which cells tell what they feel: continuously, on events, or not at all.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::print_stdout,
+    clippy::cast_precision_loss,
+    reason = "a test may stop, and tells its figures"
+)]
+
+use std::collections::BTreeMap;
+
+use gateway::scenario::Scenario;
+use protocol::can::Format;
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::{Message, Request, SensorPage, SkinSensors};
+use protocol::packet::{Half, Packet, Paired, data_id};
+use protocol::parameters::{Parameter, Sensing};
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+use protocol::touch::{Touch, contact};
+use skinbus_tests::accounts;
+use skinbus_tests::bench::{Act, Bench};
+use skinbus_tests::fault::{Fault, Harm, Party};
+use skinbus_tests::skins;
+
+const AT_62_5_HZ: Sensing = Sensing::Continuous { period_ms: 16 };
+/// How long a bench is looked at.
+const LOOK: Span = Span::from_millis(8_000);
+const TOUCHED: usize = 100;
+
+/// Touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N and at
+/// phases that have nothing to do with epochs.
+fn moving(skin: &Skin) -> Scenario {
+    let mut text = String::from(
+        "version = 1\nduration_s = 10.0\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
+         amplitude_rad = [0.2, 0.2, 0.2, 0.2, 0.2, 0.2]\nperiod_s = 4.0\n",
+    );
+    for group in 0..10_usize {
+        let nodes: Vec<_> =
+            skin.cells.iter().skip(10 * group).take(10).map(|cell| cell.node.to_string()).collect();
+        let mut at = 0.013 * group as f64;
+        let mut n = group;
+        while at < 7.0 {
+            let length = 0.5 + 0.31 * (n % 5) as f64;
+            let force = 0.5 + 0.55 * ((3 * n) % 11) as f64;
+            text += &format!(
+                "[[touch]]\nat_s = {at:.3}\nfor_s = {length:.3}\nbus = \"vcan0\"\ncells = [{}]\nforce_n = {force:.2}\n\
+                 profile = \"half-sine\"\n",
+                nodes.join(", ")
+            );
+            // The next one comes at once: the cell is in contact all the time, but for an epoch or two.
+            at += length + 0.03;
+            n += 1;
+        }
+    }
+    Scenario::parse("moving.toml", &text, skin).unwrap()
+}
+
+fn switch(mode: Sensing) -> Message {
+    to(Node::Everyone, mode)
+}
+
+fn to(to: Node, mode: Sensing) -> Message {
+    let request = Request::Write { number: Parameter::Sensing.number(), words: mode.words() };
+    Message::Configure { to, tag: 1, request }
+}
+
+/// The sensors frames that stood on the wire since, by time, with their senders.
+fn told(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
+    let format = bench.skin.buses[0].format;
+    let mut halves = BTreeMap::new();
+    let packet = |frame| match format {
+        Format::Fd => Packet::from_fd(frame).ok(),
+        Format::Classic => {
+            let id = data_id(frame).ok()?;
+            match halves.entry(id).or_insert(Half::NONE).push(Micros(0), id, frame.data()) {
+                Ok(Paired::Whole(packet)) => Some(packet),
+                Ok(Paired::Waiting | Paired::Incomplete) | Err(_) => None,
+            }
+        }
+    };
+    let all = bench.wire.iter();
+    let packets =
+        all.map(|it| (it.at, &it.frame)).scan(packet, |packet, (at, frame)| Some((at, packet(frame))));
+    let mut told = Vec::new();
+    for (at, packet) in packets {
+        let message = packet.and_then(|packet| Message::decode(&packet).ok());
+        if let Some(Message::Sensors { from, page, .. }) = message
+            && at >= since
+        {
+            told.push((at, from, page));
+        }
+    }
+    told
+}
+
+/// A bench whose cells are in this mode, and since when; nothing of the switch is in the count.
+fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros) {
+    let mut bench = Bench::with(skin, scenario, 7, |_| Micros(0));
+    bench.settle();
+    bench.act(Act::Say(switch(mode)));
+    bench.run(Span::from_millis(100));
+    let since = bench.now();
+    bench.begin();
+    bench.run(LOOK);
+    (bench, since)
+}
+
+/// What every touched cell felt at each joints that it took, of stimuli that stood on the wire: each turn of its
+/// contact is a touch or a release, and has its frame before the next joints.
+fn every_turn_was_told(bench: &Bench, since: Micros) -> (usize, usize) {
+    let events = bench.skin.events;
+    let told = told(bench, since);
+    let mut by_cell = BTreeMap::<CellId, Vec<(Micros, SkinSensors)>>::new();
+    for (at, cell, page) in told {
+        if let SensorPage::Skin(skin) = page {
+            by_cell.entry(cell).or_default().push((at, skin));
+        }
+    }
+    let mut stimuli = BTreeMap::<CellId, Vec<(u8, SkinSensors)>>::new();
+    let mut felt = BTreeMap::<CellId, (SkinSensors, Touch)>::new();
+    let (mut touches, mut releases) = (0, 0);
+    let period = bench.epoch();
+    for it in &bench.wire {
+        let message = Packet::from_fd(&it.frame).ok().and_then(|packet| Message::decode(&packet).ok());
+        match message {
+            Some(Message::Stimulus { to: Node::Cell(cell), from, page: SensorPage::Skin(skin) }) => {
+                let protocol::message::From::Epoch(first) = from else { continue };
+                stimuli.entry(cell).or_default().push((first.0, skin));
+            }
+            Some(Message::Joints { epoch, .. }) => {
+                for (cell, waiting) in &mut stimuli {
+                    let (now, touch) = felt.entry(*cell).or_default();
+                    waiting.retain(|&(first, skin)| {
+                        let due = epoch.0.wrapping_sub(first).cast_signed() >= 0;
+                        if due {
+                            *now = skin;
+                        }
+                        !due
+                    });
+                    let next = touch.next(contact(now), events.contact.to_bits(), events.hysteresis);
+                    if next != *touch && it.at + period < since + LOOK {
+                        let within = |&&(at, said): &&(Micros, SkinSensors)| {
+                            at >= it.at && at < it.at + period && said == *now
+                        };
+                        let frames = by_cell.get(cell).into_iter().flatten().filter(within).count();
+                        assert!(frames > 0, "cell {cell} at {:?}: {touch:?} to {next:?} is not told", it.at);
+                        touches += usize::from(next == Touch::Touched);
+                        releases += usize::from(*touch == Touch::Touched);
+                    }
+                    *touch = next;
+                }
+            }
+            Some(_) | None => {}
+        }
+    }
+    (touches, releases)
+}
+
+#[test]
+fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
+    let skin = skins::ur5_253();
+    let idle = Scenario::idle(LOOK);
+    let moving = moving(&skin);
+    let seconds = LOOK.0 as f64 / 1e6;
+    let count = |scenario, mode| {
+        let (bench, since) = looked_at(&skin, scenario, mode);
+        let frames = told(&bench, since).len();
+        (frames, bench, since)
+    };
+    let (continuous, mut bench, _) = count(&idle, AT_62_5_HZ);
+    let rate = continuous as f64 / seconds / 253.0;
+    // 62.5 of the skin and one of the acceleration.
+    assert!((rate - 63.5).abs() < 0.1, "{rate}");
+    bench.finish();
+    accounts::check(&bench);
+    let (at_rest, mut bench, _) = count(&idle, Sensing::Event);
+    bench.finish();
+    accounts::check(&bench);
+    let (in_contact, mut bench, since) = count(&moving, Sensing::Event);
+    let share = |frames: usize| 100.0 * frames as f64 / (62.5 * 253.0 * seconds);
+    println!("sensors frames of 253 cells in a second, and their part of 62.5 Hz:");
+    for (what, frames) in
+        [("continuous", continuous), ("event, idle", at_rest), ("event, 100 in contact", in_contact)]
+    {
+        println!("  {what:<24}{:>8.0}  {:>5.1} %", frames as f64 / seconds, share(frames));
+    }
+    assert!(share(at_rest) <= 16.0 && share(in_contact) <= 48.0);
+
+    // All 100 were in contact at the same time, and almost always.
+    let (touches, releases) = every_turn_was_told(&bench, since);
+    println!("  {touches} touches and {releases} releases, each told before the next joints");
+    assert!(touches > 5 * TOUCHED && releases > 4 * TOUCHED, "{touches} {releases}");
+    let active: usize = bench.wire.iter().filter(|it| it.frame.id() >> 8 == Kind::Torque as u32).count();
+    assert!(active as f64 > 0.85 * 100.0 * 62.5 * 7.0, "{active} torques: 100 cells are in contact");
+    // The gateway counts the same turns from what it hears.
+    bench.finish();
+    accounts::check(&bench);
+    let sensed = || bench.gateway.table.cells().iter().map(|cell| cell.sensed);
+    let total = [sensed().map(|it| it.touches).sum::<u64>(), sensed().map(|it| it.releases).sum()];
+    assert!(total[0] >= touches as u64 && total[0] <= touches as u64 + 100, "{total:?} {touches}");
+    assert!(total[1] >= releases as u64 && total[1] <= releases as u64 + 100, "{total:?} {releases}");
+}
+
+#[test]
+fn cells_of_a_continuous_bus_do_not_speak_at_once() {
+    let skin = skins::ur5_253();
+    let (bench, since) = looked_at(&skin, &Scenario::idle(LOOK), AT_62_5_HZ);
+    let told = told(&bench, since);
+    let skins = told.iter().filter(|(_, _, page)| matches!(page, SensorPage::Skin(_)));
+    let mut busiest = BTreeMap::<u64, usize>::new();
+    skins.for_each(|(at, ..)| *busiest.entry(at.0 / 1_000).or_default() += 1);
+    // 253 in 16 ms are 15.8 in one.
+    assert!(busiest.values().all(|&count| count <= 19), "{:?}", busiest.values().max());
+}
+
+#[test]
+fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
+    for format in [Format::Fd, Format::Classic] {
+        let mut bench = Bench::new(&skins::arm(6, format), 3).started();
+        let from = bench.now();
+        bench.run_epochs(30);
+        assert_eq!(told(&bench, from), [], "off, as every cell at its start");
+        let third = bench.skin.cells[2].node;
+        bench.act(Act::Inject(to(Node::Cell(third), AT_62_5_HZ)));
+        let from = bench.now();
+        bench.run(Span::from_millis(1_000));
+        let alone = told(&bench, from);
+        assert!(alone.iter().all(|&(_, cell, _)| cell == third));
+        assert!((62..=67).contains(&alone.len()), "{}", alone.len());
+
+        bench.act(Act::Inject(switch(Sensing::Event)));
+        bench.run(Span::from_millis(20));
+        let from = bench.now();
+        bench.press(4, 2.0);
+        bench.run_epochs(2);
+        let fifth = bench.skin.cells[4].node;
+        let events: Vec<_> = told(&bench, from);
+        let pressed =
+            |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact(&skin) > 0);
+        assert!(events.iter().filter(pressed).all(|&(_, cell, _)| cell == fifth), "{events:?}");
+        assert!(events.iter().any(|it| pressed(&it)), "{events:?}");
+
+        bench.act(Act::Inject(switch(Sensing::Off)));
+        bench.run(Span::from_millis(20));
+        let from = bench.now();
+        bench.press(4, 0.0);
+        bench.run_epochs(30);
+        assert_eq!(told(&bench, from), []);
+        bench.finish();
+        accounts::check(&bench);
+    }
+}
+
+#[test]
+fn a_lost_event_is_made_good_by_a_heartbeat() {
+    let mut bench = Bench::new(&skins::arm(4, Format::Fd), 5).started();
+    bench.act(Act::Say(switch(Sensing::Event)));
+    bench.run(Span::from_millis(300));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Sensors));
+    bench.press(1, 3.0);
+    bench.run_epochs(2);
+    let touches = |bench: &Bench| bench.gateway.table.cells()[1].sensed.touches;
+    assert_eq!(touches(&bench), 0, "the event is lost");
+    bench.faults.clear();
+    bench.run(Span::from_millis(260));
+    assert_eq!(touches(&bench), 1);
+    bench.finish();
+    accounts::check(&bench);
+}
+
+#[test]
+fn what_cells_tell_changes_nothing_that_the_gateway_expects_of_them() {
+    let course = |mode| {
+        let mut bench = Bench::new(&skins::arm(4, Format::Fd), 11).started();
+        bench.act(Act::Say(switch(mode)));
+        for epoch in 0..40 {
+            bench.press(epoch % 4, 0.3 * (epoch % 7) as f64);
+            bench.run_epochs(1);
+        }
+        bench.finish();
+        accounts::check(&bench);
+        let replies: Vec<_> = bench.gateway.table.cells().iter().map(|cell| cell.replies).collect();
+        (replies, (0..4).map(|place| bench.torques(place)).collect::<Vec<_>>())
+    };
+    let silent = course(Sensing::Off);
+    assert!(silent.0.iter().all(|replies| replies.due > 0 && replies.missing == 0), "{silent:?}");
+    assert_eq!(silent, course(Sensing::Event));
+    assert_eq!(silent, course(Sensing::Continuous { period_ms: 5 }));
+}

@@ -1,0 +1,124 @@
+//! Cells of processes that tell what they feel, as their skin says it and as somebody at a shell does.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod process;
+
+use process::{PRESSED, Place, Running, skin};
+use protocol::id::CellId;
+use protocol::message::{Answer, Message, SensorPage};
+use protocol::touch::contact;
+use rustix::process::Signal;
+
+const CELLS: u8 = 8;
+
+/// A place whose skin says this of its bus.
+fn place(sensing: &str, scenario: &str) -> Place {
+    let place = Place::new();
+    let format = "format = \"fd\"";
+    let text = skin(CELLS.into());
+    assert!(text.contains(format), "{text}");
+    place.write("skin.toml", &text.replacen(format, &format!("{format}\n{sensing}"), 1));
+    place.scenario(scenario);
+    place
+}
+
+fn ends(bench: Running) {
+    bench.signal(Signal::TERM);
+    bench.end().well();
+}
+
+/// What a command in this place prints, when it does what it should.
+fn switches(place: &Place, words: &str) -> String {
+    place.start("gateway", &format!("sensing vcan0 {words} --bus-kind embedded")).end().well().stdout
+}
+
+fn refusal(place: &Place, words: &str, code: i32) -> String {
+    place.start("gateway", &format!("sensing {words} --bus-kind embedded")).end().refusal(code)
+}
+
+#[test]
+fn a_skin_switches_its_cells_to_events_and_the_summary_has_every_touch() {
+    let place = place("sensing = \"event\"", PRESSED);
+    let bench = place.running_bench(60.0, "");
+    place.guest().waits_for_epoch(40);
+    ends(bench);
+    place.is_left_clean();
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
+    let sensors = &summary.0["buses"][0]["sensors"];
+    // Each is pressed from the first joints on, until the end.
+    assert_eq!((sensors["touches"].as_u64(), sensors["releases"].as_u64()), (Some(8), Some(0)), "{sensors}");
+    let frames = summary.count("/buses/0/received", "sensors");
+    assert_eq!(sensors["frames"].as_u64(), Some(frames));
+    assert!(sensors["least_hz"].as_f64().unwrap() > 1.0, "{sensors}");
+    // At its start a cell is told twice, and answers twice: thresholds are those of every cell, so once.
+    assert_eq!(summary.count("/buses/0/received", "configured"), 8, "{:#}", summary.0);
+}
+
+#[test]
+fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
+    let place = place("", PRESSED);
+    let bench = place.running_bench(60.0, "");
+    let guest = place.guest();
+    let tells = |cell: u8| {
+        guest.waits_for(&format!("a sensors frame of cell {cell}"), |message| {
+            matches!(message, Message::Sensors { from, page: SensorPage::Skin(skin), .. }
+                if from.get() == cell && contact(skin) > 0)
+        });
+    };
+    assert_eq!(switches(&place, "event --node 3"), "cell 3 on vcan0 (embedded): event\n");
+    tells(3);
+    let all = "8 cells on vcan0 (embedded): continuous, every 20 ms\n";
+    assert_eq!(switches(&place, "continuous 50"), all);
+    (1..=CELLS).for_each(tells);
+    assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
+
+    let why = "gateway: no cell 99 answers on vcan0: start it, or name the bus' format with --format classic";
+    assert_eq!(refusal(&place, "vcan0 event --node 99", 1), why);
+    ends(bench);
+    place.is_left_clean();
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
+}
+
+#[test]
+fn a_cell_that_starts_anew_is_switched_again_to_what_it_was() {
+    let restart = "\n[[fault]]\nat_s = 1.5\nkind = \"restart\"\ncells = [5]\nbus = \"vcan0\"\n";
+    let place = place("sensing = \"continuous\"\nsensing_hz = 20.0", &format!("{PRESSED}{restart}"));
+    let bench = place.running_bench(60.0, "");
+    let guest = place.guest();
+    let fifth = CellId::new(5).unwrap();
+    bench.hears("cell 5 on vcan0 started anew");
+    guest.waits_for("its confirmation", |message| {
+        matches!(message, Message::Configured { from, answer: Answer::Value { number: 7, written: true, words }, .. }
+            if *from == fifth && words[..2] == [1, 50])
+    });
+    guest.waits_for(
+        "what it feels",
+        |message| matches!(message, Message::Sensors { from, .. } if *from == fifth),
+    );
+    ends(bench);
+    place.is_left_clean();
+    place.summary().adds_up();
+}
+
+#[test]
+fn what_cannot_be_asked_for_is_said_in_a_line() {
+    let place = Place::new();
+    assert_eq!(
+        refusal(&place, "vcan0 continuous", 2),
+        "gateway: continuous needs a rate, such as `continuous 62.5`"
+    );
+    assert_eq!(
+        refusal(&place, "vcan0 event 10", 2),
+        "gateway: HZ = 10: only continuous has a rate; leave it out"
+    );
+    assert_eq!(
+        refusal(&place, "vcan0 continuous 60", 2),
+        "gateway: HZ = 60: its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz"
+    );
+    let nowhere = refusal(&place, "vcan0 event", 2);
+    assert!(nowhere.starts_with("gateway: ") && nowhere.contains("vcan0"), "{nowhere}");
+}
