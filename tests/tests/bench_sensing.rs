@@ -29,9 +29,9 @@ const AT_62_5_HZ: Sensing = Sensing::Continuous { period_ms: 16 };
 const LOOK: Span = Span::from_millis(8_000);
 const TOUCHED: usize = 100;
 
-/// Touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N and at
-/// phases that have nothing to do with epochs.
-fn moving(skin: &Skin) -> Scenario {
+/// Touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N times
+/// `harder`, and at phases that have nothing to do with epochs.
+fn moving(skin: &Skin, harder: f64) -> Scenario {
     let mut text = String::from(
         "version = 1\nduration_s = 10.0\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
          amplitude_rad = [0.2, 0.2, 0.2, 0.2, 0.2, 0.2]\nperiod_s = 4.0\n",
@@ -43,7 +43,7 @@ fn moving(skin: &Skin) -> Scenario {
         let mut n = group;
         while at < 7.0 {
             let length = 0.5 + 0.31 * (n % 5) as f64;
-            let force = 0.5 + 0.55 * ((3 * n) % 11) as f64;
+            let force = harder * (0.5 + 0.55 * ((3 * n) % 11) as f64);
             text += &format!(
                 "[[touch]]\nat_s = {at:.3}\nfor_s = {length:.3}\nbus = \"vcan0\"\ncells = [{}]\nforce_n = {force:.2}\n\
                  profile = \"half-sine\"\n",
@@ -162,7 +162,7 @@ fn every_turn_was_told(bench: &Bench, since: Micros) -> (usize, usize) {
 fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     let skin = skins::ur5_253();
     let idle = Scenario::idle(LOOK);
-    let moving = moving(&skin);
+    let [moving, hard] = [1.0, 15.0].map(|harder| moving(&skin, harder));
     let seconds = LOOK.0 as f64 / 1e6;
     let count = |scenario, mode| {
         let (bench, since) = looked_at(&skin, scenario, mode);
@@ -178,15 +178,22 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     let (at_rest, mut bench, _) = count(&idle, Sensing::Event);
     bench.finish();
     accounts::check(&bench);
+    let (hit, mut bench, _) = count(&hard, Sensing::Event);
+    bench.finish();
+    accounts::check(&bench);
     let (in_contact, mut bench, since) = count(&moving, Sensing::Event);
     let share = |frames: usize| 100.0 * frames as f64 / (62.5 * 253.0 * seconds);
     println!("sensors frames of 253 cells in a second, and their part of 62.5 Hz:");
-    for (what, frames) in
-        [("continuous", continuous), ("event, idle", at_rest), ("event, 100 in contact", in_contact)]
-    {
-        println!("  {what:<24}{:>8.0}  {:>5.1} %", frames as f64 / seconds, share(frames));
+    let figures = [
+        ("continuous", continuous),
+        ("event, idle", at_rest),
+        ("event, 100 in contact, 0.5 to 6 N", in_contact),
+        ("event, 100 in contact, 7.5 to 90 N", hit),
+    ];
+    for (what, frames) in figures {
+        println!("  {what:<36}{:>8.0}  {:>5.1} %", frames as f64 / seconds, share(frames));
     }
-    assert!(share(at_rest) <= 16.0 && share(in_contact) <= 48.0);
+    assert!(share(at_rest) <= 16.0 && share(in_contact) <= 48.0 && share(hit) <= 48.0);
 
     // All 100 were in contact at the same time, and almost always.
     let (touches, releases) = every_turn_was_told(&bench, since);

@@ -33,7 +33,7 @@ fn switches(place: &Place, words: &str) -> String {
 }
 
 fn refusal(place: &Place, words: &str, code: i32) -> String {
-    place.start("gateway", &format!("sensing {words} --bus-kind embedded")).end().refusal(code)
+    place.start("gateway", &format!("sensing {words} --bus-kind embedded")).end().refusal(code).to_owned()
 }
 
 #[test]

@@ -72,6 +72,10 @@ fn the_frames_of_the_document() {
         format!("ok      stimulus 12 from the next joints on: force 0.000 N (0.000 0.000 0.000), {skin}"),
         "ok      torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm".to_owned(),
         "ok      torque 12 epoch 8: 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 Nm".to_owned(),
+        "ok      configure everyone tag 0: write sensing: event".to_owned(),
+        "ok      configure 12 tag 0: write sensing: continuous, every 16 ms".to_owned(),
+        format!("ok      sensors 12 epoch 7: force 3.000 N (1.000 1.000 1.000), {skin}"),
+        format!("ok      sensors 12 epoch 8: force 0.000 N (0.000 0.000 0.000), {skin}"),
     ];
     assert_eq!(texts, expected);
 }
