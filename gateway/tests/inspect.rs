@@ -141,8 +141,8 @@ fn contacts_alone_are_shown_and_json_is_one_object_a_line() {
         let objects = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
         objects.map(|object| object["kind"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
     };
-    assert_eq!(kinds(&all).len(), 21);
-    assert_eq!(kinds(&touches), ["torque", "stimulus", "torque"]);
+    assert_eq!(kinds(&all).len(), 25);
+    assert_eq!(kinds(&touches), ["torque", "stimulus", "torque", "sensors"]);
 }
 
 #[test]
