@@ -248,7 +248,7 @@ mod tests {
     use super::*;
     use crate::network::check::Seen;
     use crate::run::receiver::CellView;
-    use crate::table::Said;
+    use crate::table::{SWITCHES, Said};
     use protocol::message::Tree;
     use protocol::packet::Epoch;
 
@@ -278,6 +278,7 @@ mod tests {
             said: Said::default(),
             reply,
             deaf: 0,
+            lacks: [None; SWITCHES],
         });
         let network = trees.iter().enumerate().map(|(at, tree)| Seen {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
