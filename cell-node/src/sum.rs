@@ -281,6 +281,13 @@ impl Sum {
         self.said
     }
 
+    /// Whether a sum went up in this epoch or the one before, and others are to follow.
+    #[must_use]
+    pub fn is_busy(&self) -> bool {
+        let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
+        self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
+    }
+
     /// The present epoch.
     #[must_use]
     pub const fn epoch(&self) -> Option<Epoch> {

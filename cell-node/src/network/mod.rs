@@ -9,7 +9,8 @@
 //! Whoever has a way to the gateway says so in its hellos, with a [`Label`]: how far it is, and in which round of
 //! exploration. A cell without a parent asks the nearest port whose label is better than every label that it had
 //! itself (join, grant). Labels only improve, and a parent's is better than its child's: so there is never a
-//! circle, whatever is lost or late. Where no label is good enough, the cell asks for a new round (seek), which
+//! circle, whatever is lost or late. While no sums go up, a cell moves to a port that is nearer than its parent, so
+//! that the tree does not stay deeper than it must. Where no label is good enough, the cell asks for a new round (seek), which
 //! goes up to the gateway and comes down as better labels for all.
 
 mod port;
@@ -71,6 +72,8 @@ pub struct Network {
     /// The best label that this cell ever had: only better ones are followed.
     best: Option<Label>,
     joining: Option<(usize, Micros)>,
+    /// Sums go up: a parent is not left without need.
+    busy: bool,
     /// Since when there is no parent, and whether those below know it.
     orphan: Option<(Micros, bool)>,
     /// When a new round is asked for again, and how long after the last time that is.
@@ -102,6 +105,7 @@ impl Network {
             parent: None,
             best: None,
             joining: None,
+            busy: false,
             orphan: None,
             seek: None,
             passed_on: None,
@@ -135,6 +139,11 @@ impl Network {
     /// Ports that hear nothing.
     pub const fn set_deaf(&mut self, deaf: u8) {
         self.deaf = deaf;
+    }
+
+    /// Whether sums go up.
+    pub const fn set_busy(&mut self, busy: bool) {
+        self.busy = busy;
     }
 
     /// Whether a port hears nothing.
@@ -334,8 +343,11 @@ impl Network {
 
     fn take_hello(&mut self, now: Micros, port: usize, hello: Hello) {
         let Some(there) = self.ports.get_mut(port) else { return };
+        let number = there.number();
         let anew = there.take(now, hello);
         let is_child = there.is_child();
+        self.tree_changed |=
+            there.number() != number && (is_child || self.parent.is_some_and(|it| it.port == port));
         if hello.version != VERSION {
             return;
         }
@@ -353,8 +365,18 @@ impl Network {
                 // It started anew, or has no way itself.
                 Some(_) | None => self.lose_parent(now, Lost::Unsure),
             },
-            Some(_) => {}
+            Some(parent) => self.improve(now, port, parent),
             None => self.search(now),
+        }
+    }
+
+    /// A port that is nearer than the parent is asked, when nothing is lost by moving.
+    fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
+        let label = self.ports.get(port).and_then(|port| port.label(now));
+        let nearer = label.is_some_and(|label| label.is_better_than(parent.label));
+        if nearer && !self.busy && self.joining.is_none() {
+            self.joining = Some((port, now));
+            self.say(port, PortMessage::Join);
         }
     }
 
@@ -397,8 +419,13 @@ impl Network {
         if self.up() == Some(port) {
             return;
         }
-        if self.parent.is_some() || !self.is_good(label) {
+        let moves = self.parent.is_none_or(|parent| !self.busy && label.is_better_than(parent.label));
+        if !moves || !self.is_good(label) {
             return self.say(port, PortMessage::Leave);
+        }
+        if let Some(before) = self.parent {
+            self.left = Some((before.port, false));
+            self.say(before.port, PortMessage::Leave);
         }
         self.joining = None;
         self.orphan = None;
@@ -546,6 +573,8 @@ impl Network {
         }
         if self.parent.is_none() {
             self.search(now);
+        } else {
+            self.joining.take_if(|(_, asked)| now.since(*asked) >= JOIN_PATIENCE);
         }
         self.tell_unnumbered(now);
     }

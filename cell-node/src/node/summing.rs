@@ -20,6 +20,7 @@ impl Node {
         if !self.network.exists() || self.network.is_deaf(port) {
             return;
         }
+        self.network.set_busy(self.sums.is_busy());
         match message {
             PortMessage::State(epoch) if self.network.is_child(port) => {
                 self.sums.state(now, port, epoch);
