@@ -36,6 +36,8 @@ pub struct Cells {
     ears: Ears,
     /// What somebody hears may have changed since the filters were set.
     hears_changed: bool,
+    /// What waits in the socket has been heard since a timer was due.
+    heard_first: bool,
     filters: Vec<Filter>,
     outbox: Vec<Frame>,
 }
@@ -88,6 +90,7 @@ impl Cells {
             clock: Clock::new(),
             ears: Ears::default(),
             hears_changed: false,
+            heard_first: false,
             filters: Vec::new(),
             outbox: Vec::new(),
         }
@@ -171,6 +174,13 @@ impl Cells {
     /// Lets time pass, sends, and waits for frames.
     fn turn(&mut self, bus: &Bus, inbox: &mut Inbox, now: Micros) -> Result<(), Stopped> {
         inbox.clear();
+        let due = self.cells.iter().any(|seat| seat.node.poll_timeout() <= now);
+        // What came before a timer was due is heard first, once.
+        if due && !core::mem::replace(&mut self.heard_first, true) && bus.wait(Some(Duration::ZERO))? {
+            bus.receive(inbox)?;
+            return Ok(());
+        }
+        self.heard_first = false;
         let mut next = Micros(u64::MAX);
         for seat in &mut self.cells {
             if seat.node.poll_timeout() <= now {

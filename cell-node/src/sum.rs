@@ -3,7 +3,7 @@
 //! ```text
 //!   joints ──> begin: own torque, exact      ┐                ┌─> due ──> when to speak next
 //!   sum of a child ──> take: largest count ──┼─ [Sum] ────────┼─> say ──> six words and a count
-//!   a child's word ──> state                 ┘                └─> missed: children whose sums did not come
+//!   a child's word ──> state                 ┘                └─> judge: children whose sums did not come
 //! ```
 //!
 //! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell,
@@ -18,6 +18,8 @@ use protocol::wire::PORTS;
 
 /// A child whose sum did not come is told so in so many epochs: what it says to that may be lost too.
 const MISSING: u8 = 4;
+/// Who looks later than this was away, and what it misses may wait to be heard.
+const PUNCTUAL: Span = Span::from_millis(1);
 /// Fraction bits that rounding takes away.
 const SHORTENED: u32 = 30 - 8;
 
@@ -39,6 +41,17 @@ impl Words {
     pub const fn is_end(&self) -> bool {
         self.count == 0
     }
+}
+
+/// Whether it is time to look who is missing.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Check {
+    /// Not yet, or not at all.
+    NotYet,
+    /// Now.
+    Now,
+    /// It was, and this cell was away.
+    Late,
 }
 
 /// What is known of the sums of one child.
@@ -78,7 +91,9 @@ pub struct Sum {
     said: Option<(Epoch, Words)>,
     /// The parent has to be told anew whom the sums are for.
     restate: bool,
-    /// When it is looked who is missing.
+    /// Whether it has been looked who is missing in this epoch.
+    judged: bool,
+    /// When it is looked, if not only at the next joints.
     check: Option<Micros>,
     /// Sums sent, resends among them.
     pub sent: u16,
@@ -150,8 +165,22 @@ impl Sum {
         let slot = slots.deepest.saturating_sub(self.depth);
         self.due = (self.own.is_some() || self.ends)
             .then(|| self.began + Span(u64::from(slot) * u64::from(slots.slot_us)));
-        let settled = Span(u64::from(slots.slot_us) * (u64::from(slots.deepest) + 2));
-        self.check = Some(self.began + settled.min(Span(begin.period.0 * 7 / 8)));
+        (self.judged, self.check) = (false, None);
+        if self.children.iter().any(|child| child.missing > 0) {
+            self.watch();
+        }
+    }
+
+    /// It is looked who is missing before the next joints come, while there is time to do something about it.
+    pub const fn watch(&mut self) {
+        if !self.judged && self.epoch.is_some() {
+            self.check = Some(self.settled_at());
+        }
+    }
+
+    /// By when all has been said that is said in an epoch.
+    const fn settled_at(&self) -> Micros {
+        Micros(self.began.0 + self.period.0 * 7 / 8)
     }
 
     /// Q7.8, to the nearest; what that took away goes into the next one.
@@ -304,24 +333,37 @@ impl Sum {
         self.epoch = None;
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
+        self.judged = true;
     }
 
     /// Whether it has been looked who is missing in this epoch.
     #[must_use]
-    pub const fn is_checked(&self) -> bool {
-        self.check.is_none()
+    pub const fn is_judged(&self) -> bool {
+        self.judged
     }
 
     /// Whether all of this epoch is done.
     #[must_use]
-    pub const fn is_settled(&self) -> bool {
-        self.due.is_none() && self.check.is_none()
+    pub fn is_settled(&self, now: Micros) -> bool {
+        self.epoch.is_none() || now >= self.settled_at()
     }
 
-    /// When the time has come to look: bit p says that the sum of the child at port p should have come and did not.
-    /// Such a sum is not taken any more.
-    pub fn check(&mut self, now: Micros) -> Option<(Epoch, u8)> {
-        self.check.take_if(|check| *check <= now)?;
+    /// Whether the time has come to look before the next joints; who looks late looks then, when all that came
+    /// before them has been heard.
+    pub fn check(&mut self, now: Micros) -> Check {
+        match self.check.take_if(|check| *check <= now) {
+            None => Check::NotYet,
+            Some(check) if now.since(check) > PUNCTUAL => Check::Late,
+            Some(_) => Check::Now,
+        }
+    }
+
+    /// Looks once in an epoch: bit p says that the sum of the child at port p should have come and did not. Such a
+    /// sum is not taken any more.
+    pub fn judge(&mut self) -> Option<(Epoch, u8)> {
+        if core::mem::replace(&mut self.judged, true) {
+            return None;
+        }
         let mut missed = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
             // It did not come, or came without a word whom it is for.
@@ -440,8 +482,10 @@ mod tests {
         sum.take(at(2, 500), 1, Epoch(2), words(10, 1));
         assert_eq!(sum.taken, 2);
         sum.begin(&begin(3, 2), None);
-        assert_eq!(sum.check(at(3, 5_000)), Some((Epoch(3), 0b10)), "it did not come");
+        assert_eq!(sum.judge(), Some((Epoch(3), 0b10)), "it did not come");
         sum.begin(&begin(4, 2), None);
+        assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "it is looked in time");
+        assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (Check::NotYet, Check::Now));
         sum.take(at(4, 500), 1, Epoch(4), words(10, 1));
         assert_eq!(sum.taken, 2, "after a gap");
         sum.disown(1);
@@ -458,7 +502,7 @@ mod tests {
         sum.state(at(1, 0), 1, Epoch(1));
         sum.take(at(1, 100), 1, Epoch(1), Words::END);
         sum.begin(&begin(2, 2), None);
-        assert_eq!(sum.check(at(2, 5_000)), Some((Epoch(2), 0)), "nobody is missed");
+        assert_eq!((sum.poll_timeout(), sum.judge()), (None, Some((Epoch(2), 0))), "nobody is missed");
     }
 
     #[test]

@@ -143,6 +143,8 @@ pub struct Node {
     parent: Option<(usize, Option<CellId>)>,
     /// Whether the parent's sum of this epoch was heard.
     heard_parent: bool,
+    /// Whether a sum was said in the epoch before the present one.
+    said_before: bool,
     /// Sums in a row that the parent did not take, without and with the present epoch's.
     misses: (u8, u8),
     changes: u16,
@@ -184,6 +186,7 @@ impl Node {
             hears_changed: false,
             parent: None,
             heard_parent: false,
+            said_before: false,
             misses: (0, 0),
             changes: 0,
             asked: false,
@@ -384,7 +387,10 @@ impl Node {
             Message::Network { page, .. } => self.hear_own_number(now, &page),
             // Whose number is in doubt answers nothing.
             Message::Sync | Message::Report | Message::Configure { .. } if self.claim != Claim::Settled => {}
-            Message::Sync if self.sums.is_on() && !self.sums.is_settled() => self.asked = true,
+            Message::Sync if self.sums.is_on() && !self.sums.is_settled(now) => {
+                self.asked = true;
+                self.sums.watch();
+            }
             Message::Sync => self.push_heartbeat(),
             Message::Report => {
                 self.push_network(NetworkPage::Heard(self.heard));
@@ -415,6 +421,8 @@ impl Node {
             count(&mut self.heard.joints_repeated);
             return;
         }
+        // All that came before these joints has been heard.
+        self.judge(now);
         let in_use = self.configuration.in_use();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.refused.meaning);

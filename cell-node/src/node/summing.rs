@@ -9,7 +9,7 @@ use protocol::wire::{PORTS, PortMessage, UPLINK};
 use super::{Claim, Node, Storing, first_word};
 use crate::contact::Torque;
 use crate::network::Lost;
-use crate::sum::{Begin, Words};
+use crate::sum::{Begin, Check, Words};
 
 /// Sums in a row that a parent does not take, after which it is no parent any more.
 const MISSES: u8 = 2;
@@ -94,6 +94,7 @@ impl Node {
 
     /// The tree as it is for the sums of an epoch.
     pub(super) fn freeze(&mut self, epoch: Epoch) -> Begin {
+        self.said_before = self.sums.said().is_some_and(|(of, _)| of.next() == epoch);
         let up = self.network.up();
         // A parent that was left and may not know it takes no sum from who was silent for an epoch.
         let was_silent = self.sums.said().is_none_or(|(of, _)| of.next() != epoch);
@@ -115,6 +116,9 @@ impl Node {
 
     pub(super) fn begin_sum(&mut self, now: Micros, begin: &Begin, own: Option<Torque>) {
         self.sums.begin(begin, own.map(|torque| torque.exact()).as_ref());
+        if self.misses.1 > 0 {
+            self.sums.watch();
+        }
         self.handle_sums(now);
     }
 
@@ -143,7 +147,19 @@ impl Node {
             self.flags = self.flags.with(State::SATURATED, self.flags.has(State::SATURATED) || saturated);
             self.push(Message::Sum { from, epoch, torque: words.torque, count: words.count });
         }
-        let Some((epoch, missed)) = self.sums.check(now) else { return };
+        match self.sums.check(now) {
+            Check::NotYet => return,
+            Check::Now => self.judge(now),
+            Check::Late => {}
+        }
+        if core::mem::replace(&mut self.asked, false) {
+            self.push_heartbeat();
+        }
+    }
+
+    /// Looks whose sums did not come in this epoch, once.
+    pub(super) fn judge(&mut self, now: Micros) {
+        let Some((epoch, missed)) = self.sums.judge() else { return };
         for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
             self.network.say(port, PortMessage::Missed(epoch));
         }
@@ -156,25 +172,22 @@ impl Node {
             Some(_) => (before, before + 1),
         };
         self.give_up(now);
-        if core::mem::replace(&mut self.asked, false) {
-            self.push_heartbeat();
-        }
     }
 
     /// The parent says that it did not take a sum: it has to be told anew whom they are for.
     fn was_missed(&mut self, now: Micros, epoch: Epoch) {
         self.sums.break_off();
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
-        if self.sums.epoch() != Some(epoch) || !said {
-            return;
-        }
-        self.heard_parent = false;
-        if self.sums.is_checked() {
+        let before = self.sums.epoch().is_some_and(|present| epoch.next() == present);
+        if self.sums.epoch() == Some(epoch) && said && !self.sums.is_judged() {
+            self.heard_parent = false;
+            self.parent = self.parent.map(|(port, _)| (port, None));
+        } else if (self.sums.epoch() == Some(epoch) && said) || (before && self.said_before) {
+            // It was thought to be taken.
             self.misses.1 = self.misses.0 + 1;
             self.give_up(now);
-        } else {
-            self.parent = self.parent.map(|(port, _)| (port, None));
         }
+        self.sums.watch();
     }
 
     fn give_up(&mut self, now: Micros) {
