@@ -214,9 +214,16 @@ impl Receiver {
         }
         std::thread::sleep(DOWN);
         // What stood on it before is no sign that it works again.
-        while let Ok(1..) = self.ear.bus.receive(inbox) {
-            self.hear(inbox);
-            self.record(inbox, account);
+        loop {
+            match self.ear.bus.receive(inbox) {
+                Ok(1..) => {
+                    self.hear(inbox);
+                    self.record(inbox, account);
+                }
+                // An interface goes down before it is removed, and each is said once.
+                Err(error) if !error.may_pass() => return self.lose(inbox, account, &error),
+                Ok(0) | Err(_) => break,
+            }
         }
         inbox.clear();
         self.table.interrupt();
