@@ -8,8 +8,8 @@ use std::cell::Cell as Counter;
 use std::fs;
 use std::time::Duration;
 
-use gateway::generate::Format;
-use process::replay::{Replayed, cell, changed, is_torque, without};
+use gateway::generate::{self, Format};
+use process::replay::{Replayed, TOUCHED, cell, changed, is_torque, without};
 use process::{Place, Running, example, skin_of, until};
 use protocol::id::Node;
 use protocol::message::{From, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
@@ -245,6 +245,52 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     // A machine that was away while it was recorded is another reason, and nobody knows which one it is.
     let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
     assert!(lacking.iter().sum::<u64>() >= 1, "{:#}", replayed.0);
+}
+
+/// Whether a message is a sum of a cell with so many cells in it or more.
+fn is_sum(message: &Message, cell: u8, cells: u8) -> bool {
+    matches!(message, Message::Sum { from, count, .. } if from.get() == cell && *count >= cells)
+}
+
+#[test]
+fn sums_come_back_less_their_children_whatever_the_tree() {
+    let place = Place::new();
+    let wanted = generate::Wanted { cells: 12, reply: generate::Reply::Sum, ..generate::Wanted::default() };
+    place.write("skin.toml", &generate::generate(&wanted).unwrap());
+    place.scenario(TOUCHED);
+    place.bench(4.0, "--record run.mcap").end().well();
+    place.is_left_clean();
+    let mut counts = Vec::new();
+    for file in ["run.mcap", "run.log"] {
+        let (ended, replayed) = place.replayed(file, &format!("{FRESH} --lockstep"));
+        replayed.all_came_back(&ended);
+        place.is_left_clean();
+        counts.push(replayed.number("/expect/sums"));
+        // What changes while cells organise is before the first joints.
+        let left_out = ["parent_changing", "tree_unknown"];
+        let left_out = left_out.map(|why| replayed.number(&format!("/expect/lacking/{why}")));
+        assert_eq!(left_out, [0, 0], "{:#}", replayed.0);
+    }
+    assert!(counts[0] > 300 && counts[0] == counts[1], "{counts:?}");
+
+    // One cell that says something else, in a sum that others are in too.
+    let log = place.read("run.log");
+    let root = |message: &Message| is_sum(message, 1, 2);
+    let last = Counter::new(0);
+    without(&log, |message| {
+        last.set(last.get() + usize::from(root(message)));
+        false
+    });
+    let wrong = changed(&log, last.get() / 2, root, |words| words[1] += 5);
+    place.write("wrong.log", &wrong);
+    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --lockstep"));
+    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
+    let text = replayed.text("/expect/first/text");
+    assert!(text.starts_with("the first difference: cell 1 on vcan0, joints "), "{text}");
+    let lines: Vec<_> = text.lines().map(str::trim).collect();
+    assert!(lines[1].starts_with("recorded  sum 1 epoch ") && lines[1].contains("; less its child"), "{text}");
+    assert!(lines[3].starts_with("joint 2: ") && lines[3].contains(" steps less "), "{text}");
+    place.is_left_clean();
 }
 
 #[test]

@@ -133,7 +133,8 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
     let wearing = options.spawn.as_ref().map(|spawn| start::wearing(options, spawn, &routes, &extras));
     let wearing = wearing.transpose()?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
-    let mut buses = start::open(options, &survey, &routes, wearing.as_ref())?;
+    let recorded = start::recorded_skin(&extras);
+    let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;
     for lane in buses.lanes.iter() {
         teller.say(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
     }

@@ -65,12 +65,12 @@ impl<'a> Session<'a> {
     ) -> Result<Summary, RunError> {
         let mut ears = Vec::new();
         if self.options.hears() {
-            for (index, lane) in self.buses.lanes.iter().enumerate() {
+            let roots = std::mem::take(&mut self.buses.roots);
+            for ((index, lane), roots) in self.buses.lanes.iter().enumerate().zip(roots) {
                 let (bus, format, hall) = (Arc::clone(&lane.bus), lane.format, Arc::clone(&self.hall));
                 let name = format!("rx {}", bus.name());
-                let ear =
-                    thread::Builder::new().name(name).spawn(move || ear::hear(index, &bus, format, &hall));
-                ears.push(ear.map_err(no_thread)?);
+                let hear = move || ear::hear(index, &bus, format, roots, &hall);
+                ears.push(thread::Builder::new().name(name).spawn(hear).map_err(no_thread)?);
             }
         }
         let outcome = self.meet(wearing).and_then(|()| self.play());
@@ -101,6 +101,7 @@ impl<'a> Session<'a> {
         };
         let signalled = Arc::clone(&self.signalled);
         self.buses.call_the_roll(&self.hall, &wanted, || signalled.load(Ordering::Relaxed))?;
+        self.buses.let_them_organise(&self.hall, &self.teller, || signalled.load(Ordering::Relaxed))?;
         let judge = self.hall.judge();
         let lanes = 0..self.routes.names.len();
         let there: usize =

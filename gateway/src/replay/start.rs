@@ -22,13 +22,17 @@ use super::judge::Judge;
 use super::live::{Lane, mode};
 use super::reel::Only;
 use super::survey::{Known, Survey};
+use super::teller::Teller;
 use super::{Options, Spawn};
 use crate::capture::Extras;
 use crate::run::RunError;
 use crate::run::launch::{LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
+use crate::run::roots::{Ears, Roots};
 
 /// Cells that were there before say something within this time, by heartbeats alone.
 const SHOWING: Duration = Duration::from_secs(1);
+/// Cells of which none more finds a way up for so long have none: two hellos, and a search.
+const ORGANISING: Duration = Duration::from_secs(2);
 /// How often it is looked.
 const LOOK: Duration = Duration::from_millis(5);
 
@@ -97,6 +101,11 @@ pub(super) struct Buses {
     pub(super) lanes: Arc<Vec<Lane>>,
     /// Which of them nobody served before.
     pub(super) own: Vec<bool>,
+    /// The gateway's side of the wires to their roots, where cells reply with sums and wires are simulated; taken by
+    /// who hears.
+    pub(super) roots: Vec<Option<Roots>>,
+    /// Where there are such.
+    wired: Vec<bool>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
     _served: Vec<ServedBus>,
@@ -157,21 +166,32 @@ pub(super) fn wearing(
     Ok(wearing)
 }
 
-/// Opens all buses.
+/// The skin that a recording has, if it has one that can be read.
+pub(super) fn recorded_skin(extras: &Extras) -> Option<Skin> {
+    let (_, bytes) = extras.attachments.iter().find(|(name, _)| name == "skin.toml")?;
+    Skin::parse("skin.toml", &String::from_utf8_lossy(bytes)).ok()
+}
+
+/// Opens all buses. What is `recorded` is the skin of the cells that are there already, if it is known.
 pub(super) fn open(
     options: &Options,
     survey: &Survey,
     routes: &Routes,
     wearing: Option<&Wearing>,
+    recorded: Option<&Skin>,
 ) -> Result<Buses, RunError> {
     let (mut lanes, mut own, mut served) = (Vec::new(), Vec::new(), Vec::new());
+    let mut roots = Vec::new();
     for (bus, name) in &routes.names {
         let Some(surveyed) = survey.buses.get(*bus) else { continue };
         let described = wearing.and_then(|wearing| wearing.skin.buses.iter().find(|bus| bus.name == *name));
         let format = described.map(|bus| bus.format).or(surveyed.format);
+        let worn = wearing.map(|wearing| (&wearing.skin, name)).or_else(|| Some((recorded?, &surveyed.name)));
+        let worn = worn.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
+        let ears = worn.map_or_else(|| vec![Filter::ALL], |(skin, bus)| Ears::of(skin, bus, true).filters);
         let wanted = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
-            filters: if options.hears() { vec![Filter::ALL] } else { Vec::new() },
+            filters: if options.hears() { ears } else { Vec::new() },
             receive_buffer: options.receive_buffer,
             send_patience: options.patience,
             ..BusOptions::default()
@@ -180,11 +200,15 @@ pub(super) fn open(
             Some(_) => open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?,
             None => (Bus::open(name, options.kinds.of(name), &wanted)?, None),
         };
+        // On a real bus the wires are real.
+        let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
+        roots.push(worn.filter(|_| has_wires).and_then(|(skin, bus)| Roots::of(skin, bus)));
         own.push(of_ours.is_some());
         served.extend(of_ours);
         lanes.push(Lane { bus: Arc::new(bus), format: format.unwrap_or(Format::Fd) });
     }
-    Ok(Buses { lanes: Arc::new(lanes), own, processes: Processes::default(), _served: served })
+    let wired = roots.iter().map(Option::is_some).collect();
+    Ok(Buses { lanes: Arc::new(lanes), own, roots, wired, processes: Processes::default(), _served: served })
 }
 
 impl Buses {
@@ -306,6 +330,44 @@ impl Buses {
             if there == wanted.iter().map(BTreeSet::len).sum::<usize>() || progress.elapsed() > patience {
                 return Ok(());
             }
+        }
+    }
+}
+
+impl Buses {
+    /// Waits until all cells that reply with sums have a way to the gateway, or nobody more finds one.
+    pub(super) fn let_them_organise(
+        &self,
+        hall: &Hall,
+        teller: &Teller,
+        interrupted: impl Fn() -> bool,
+    ) -> Result<(), RunError> {
+        let wired: Vec<_> =
+            (0..self.wired.len()).filter(|lane| self.wired.get(*lane) == Some(&true)).collect();
+        for lane in wired.iter().filter_map(|lane| self.lanes.get(*lane)) {
+            send(lane, &Message::Report)?;
+        }
+        let (mut least, mut progress) = (usize::MAX, Instant::now());
+        loop {
+            let judge = hall.judge();
+            let without: Vec<_> = wired.iter().map(|lane| (*lane, judge.without_a_way(*lane))).collect();
+            drop(judge);
+            let count: usize = without.iter().map(|(_, cells)| cells.len()).sum();
+            if count < least {
+                (least, progress) = (count, Instant::now());
+            }
+            if count == 0 || interrupted() {
+                return Ok(());
+            }
+            if progress.elapsed() > ORGANISING {
+                for (lane, cells) in without.iter().filter(|(_, cells)| !cells.is_empty()) {
+                    let name = self.lanes.get(*lane).map_or("", |lane| lane.bus.name());
+                    teller
+                        .say(&format!("cells on {name} have no way to the gateway's side: {}", names(cells)));
+                }
+                return Ok(());
+            }
+            thread::sleep(LOOK);
         }
     }
 }

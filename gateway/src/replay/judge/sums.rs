@@ -37,6 +37,11 @@ impl Trees {
         }
     }
 
+    /// Whether a cell's sums go anywhere, by its last word.
+    pub(super) fn has_a_way(&self, cell: CellId) -> bool {
+        self.0.get(&cell).and_then(VecDeque::back).is_some_and(|step| step.parent.is_some())
+    }
+
     /// Where a cell's sums go in a round; none when that is not known.
     fn parent(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
         let steps = self.0.get(&cell)?;
