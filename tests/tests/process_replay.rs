@@ -288,7 +288,10 @@ fn sums_come_back_less_their_children_whatever_the_tree() {
     let text = replayed.text("/expect/first/text");
     assert!(text.starts_with("the first difference: cell 1 on vcan0, joints "), "{text}");
     let lines: Vec<_> = text.lines().map(str::trim).collect();
-    assert!(lines[1].starts_with("recorded  sum 1 epoch ") && lines[1].contains("; less its child"), "{text}");
+    assert!(
+        lines[1].starts_with("recorded  sum 1 epoch ") && lines[1].contains("; less its child"),
+        "{text}"
+    );
     assert!(lines[3].starts_with("joint 2: ") && lines[3].contains(" steps less "), "{text}");
     place.is_left_clean();
 }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, Choice, Filter, Inbox, Kinds, Options as BusOptions};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, State as Flags};
