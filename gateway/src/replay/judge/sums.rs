@@ -49,10 +49,15 @@ impl Trees {
     }
 
     /// Cells that had another parent before a round, or have one after it, with these parents. Their pages tell the
-    /// epoch of the last joints, which are the ones before the change or those at it.
+    /// epoch of the last joints, which are the ones before the change or those at it. A cell between two parents
+    /// says nothing; one that finds none any more is not between two.
     fn affected(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
+            let is_away = self.parent(*cell, round) == Some(None);
+            if is_away && steps.back().is_some_and(|last| last.parent.is_some()) {
+                all.insert(*cell);
+            }
             for (before, after) in steps.iter().zip(steps.iter().skip(1)) {
                 if after.since == round || after.since == round + 1 {
                     all.insert(*cell);
@@ -347,6 +352,17 @@ mod tests {
         // Nobody knows whose child the third is.
         today.1.0.remove(&cell(3));
         assert_eq!(outcomes(&then, &today, 4), [Outcome::LeftOut(Why::Unknown); 4]);
+    }
+
+    #[test]
+    fn a_cell_between_two_parents_is_left_out_and_one_that_finds_none_is_not() {
+        let felt = vec![words(10), words(20)];
+        let then = sums(&felt, &[0, 1]);
+        let mut today = sums(&vec![words(10), None], &[0, 1]);
+        today.1.say(cell(2), None, 2);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Missing]);
+        today.1.say(cell(2), Some(0), 9);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::LeftOut(Why::Changing)]);
     }
 
     #[test]
