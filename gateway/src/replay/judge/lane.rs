@@ -1,6 +1,6 @@
 //! What is known of one bus: its cells, the joints that they were asked, and what they answered.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use protocol::id::CellId;
 use protocol::message::{Answer, Heard, Heartbeat, NetworkPage, State as Flags};
@@ -120,6 +120,8 @@ pub(super) struct Lane {
     /// Whose children cells are, recorded and now.
     pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
+    /// Cells whose last recorded sum was no end of a contact: they have to go on, or say the end.
+    pub(super) speaking: BTreeSet<CellId>,
     /// Whether somebody had cells say what they feel without being asked: then that comes at times of their own.
     pub(super) senses: bool,
     /// Rounds that were announced.
@@ -143,6 +145,7 @@ impl Lane {
             rounds: VecDeque::new(),
             trees: Both::default(),
             answers: BTreeMap::new(),
+            speaking: BTreeSet::new(),
             senses: false,
             sent: 0,
             last_round: None,

@@ -494,12 +494,24 @@ impl Judge {
                 }
                 Outcome::Different => (different, How::Different),
                 Outcome::Missing => (missing, How::Missing),
+                // It had to go on then, or to say the end: it did not come to its slot in time.
+                Outcome::Extra if lane.speaking.contains(&cell) => {
+                    lacking.slot_missed += 1;
+                    continue;
+                }
                 // The words only say whether a contact has ended, which a sum does not tell.
                 Outcome::Extra if excuse_extra(lacking, excuse, round.nanos, is_last, [1; WORDS]) => continue,
                 Outcome::Extra => (extra, How::Extra),
             };
             *count += 1;
             notes.push((how, cell, Said::Sums { recorded: then.own(cell), now: now.own(cell) }));
+        }
+        for (cell, count) in round.sums.recorded.counts() {
+            if count > 0 {
+                lane.speaking.insert(cell);
+            } else {
+                lane.speaking.remove(&cell);
+            }
         }
         for (how, cell, said) in notes {
             self.note(index, how, cell, Some((number, round.epoch, round.nanos)), said);

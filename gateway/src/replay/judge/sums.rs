@@ -112,6 +112,11 @@ impl Sums {
         self.0.contains_key(&cell)
     }
 
+    /// Each cell, and how many are in its sum.
+    pub(super) fn counts(&self) -> impl Iterator<Item = (CellId, u8)> {
+        self.0.iter().map(|(cell, sum)| (*cell, sum.count))
+    }
+
     pub(super) fn cells(&self) -> impl Iterator<Item = CellId> {
         self.0.keys().copied()
     }
@@ -130,6 +135,13 @@ pub struct Own {
     pub steps: [Option<i32>; WORDS],
     /// The count less theirs: 1 of a cell that feels something, 0 of one that passes on what others feel.
     pub cells: i32,
+}
+
+impl Own {
+    /// Whether no word is left.
+    fn is_nothing(&self) -> bool {
+        self.steps.iter().flatten().all(|step| *step == 0)
+    }
 }
 
 /// The sums of one epoch and their tree, recorded or now.
@@ -205,7 +217,8 @@ impl<'a> Side<'a> {
     fn is_whole(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own(cell) else { return true };
         let adds_up = match own.cells {
-            0 => own.steps.iter().flatten().all(|step| *step == 0),
+            // Its own is in it, and a child's of one cell is not.
+            0 => own.is_nothing() || !other.feels(cell),
             1 => true,
             _ => false,
         };
@@ -256,9 +269,10 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outc
                 });
             if same { Outcome::Equal } else { Outcome::Different }
         }
-        // Whether a cell passes on what others feel depends on the tree.
         (Some(then), None) if then.cells > 0 => Outcome::Missing,
         (None, Some(today)) if today.cells > 0 => Outcome::Extra,
+        // Whether a cell passes on what others feel depends on the tree; but it adds nothing to that.
+        (Some(own), None) | (None, Some(own)) if !own.is_nothing() => Outcome::Different,
         (Some(_), None) | (None, Some(_) | None) => Outcome::Nothing,
     }
 }
@@ -338,6 +352,17 @@ mod tests {
         let then = sums(&vec![words(10), words(20)], &[0, 1]);
         let today = sums(&vec![None, words(20)], &[0, 1]);
         assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
+    }
+
+    #[test]
+    fn who_only_passes_on_must_not_add_anything() {
+        let felt = vec![None, words(20)];
+        let (then, other) = (sums(&felt, &[0, 1]), sums(&felt, &[0, 0]));
+        let mut today = sums(&felt, &[0, 1]);
+        today.0.0.get_mut(&cell(1)).unwrap().torque[2] = Q7_8::from_bits(9);
+        assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
+        assert_eq!(outcomes(&other, &today, 2), [Outcome::Different, Outcome::Equal]);
+        assert_eq!(outcomes(&today, &other, 2), [Outcome::Different, Outcome::Equal]);
     }
 
     #[test]

@@ -40,6 +40,8 @@ pub struct Lacking {
     pub measured: u64,
     /// What cells felt, said without being asked at another time than now.
     pub sensed_otherwise: u64,
+    /// Sums of cells that had spoken, had not said the end, and did not come to their slot in time.
+    pub slot_missed: u64,
     /// Sums of cells that, or whose children, were changing their parent in that epoch, then or now.
     pub parent_changing: u64,
     /// Sums of epochs in which a cell had not said where its sums go, then or now.

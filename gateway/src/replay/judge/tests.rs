@@ -357,6 +357,22 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
 }
 
 #[test]
+fn a_cell_that_spoke_and_did_not_say_the_end_did_not_come_to_its_slot() {
+    let mut late = row();
+    let silent = |epoch| move |message: &Message| matches!(message, Message::Sum { from, epoch: of, .. } if from.get() == 1 && of.0 == epoch);
+    late.retain(|message| !silent(3)(message));
+    let judge = judged(&late, &row());
+    assert_eq!((counts(&judge), judge.tally.lacking.slot_missed), ([17, 0, 0, 0], 1));
+    // One that had said the end would have had to say the beginning.
+    let mut ended = row();
+    ended.retain(|message| !silent(2)(message) && !silent(3)(message));
+    let at = ended.iter().position(|message| *message == joints(3)).unwrap();
+    ended.insert(at, sum(1, 2, 0, 0));
+    let judge = judged(&ended, &row());
+    assert_eq!((judge.tally.extra, judge.tally.lacking.slot_missed), (1, 0), "{:?}", judge.tally);
+}
+
+#[test]
 fn who_changes_its_parent_is_left_out_in_that_epoch_and_counted() {
     let mut now = row();
     let at = now.iter().position(|message| *message == joints(3)).unwrap();
