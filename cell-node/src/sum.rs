@@ -202,7 +202,8 @@ impl Sum {
         }
         let Some(child) = self.children.get_mut(port) else { return };
         child.next = Some(epoch);
-        if let Some((_, words)) = child.waiting.take() {
+        // One that came late, of an epoch before, says nothing of this one.
+        if let Some((_, words)) = child.waiting.take().filter(|(of, _)| *of == epoch) {
             self.dropped = self.dropped.wrapping_sub(1);
             self.take(now, port, epoch, words);
         }
