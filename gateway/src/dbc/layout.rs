@@ -21,7 +21,7 @@ pub(super) fn joints() -> Vec<Signal> {
 
 pub(super) fn sum() -> Vec<Signal> {
     let words = numbered(|joint, index| Signal::fixed::<8>(format!("sum_{joint}"), index, "Nm").saturating());
-    ended(words, [Signal::epoch(), Signal::count(1, 255)])
+    ended(words, [Signal::epoch(), Signal::count(0, 255)])
 }
 
 pub(super) fn torque() -> Vec<Signal> {
