@@ -140,7 +140,8 @@ fn from_or_to(kind: Kind, node: Node, period: Rhythm) -> Message {
             Rhythm::Seldom,
             layout::sum(),
             "The cell's torques and those of the cells below it in the tree, answering the joints of this epoch, where \
-             a bus replies with sums. count is the cells in it that feel something, 0 the end of a contact; of two for one epoch the one with more cells counts.",
+             a bus replies with sums. count is the cells in it that feel something, 0 the end of a contact; of two for \
+             one epoch the one with more cells counts.",
         ),
         Kind::Torque => (
             up,
