@@ -496,8 +496,8 @@ impl Cell {
         self.uplink.finish();
         if !self.summed {
             self.miss(self.due.count_ones());
+            self.due = 0;
         }
-        self.due = 0;
     }
 
     /// It started anew: what it still owed, it will never send; and why it owed what is missing, its
