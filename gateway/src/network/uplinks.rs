@@ -95,6 +95,12 @@ impl Uplinks {
         self.wires.get(root).is_some_and(|wire| wire.is_child)
     }
 
+    /// Whether the sums of a root are for the gateway; else another cell takes them.
+    #[must_use]
+    pub fn is_child(&self, root: usize) -> bool {
+        self.wires.get(root).is_some_and(|wire| wire.is_child)
+    }
+
     /// The round of exploration.
     #[must_use]
     pub const fn round(&self) -> u8 {

@@ -1,6 +1,7 @@
 //! Before the loop begins: cells that answer with sums become a tree, the tree is compared with the description, and
 //! everyone is told when to speak.
 
+use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -28,6 +29,7 @@ impl Bench<'_> {
         if self.networks.iter().all(Option::is_none) {
             return Ok(());
         }
+        self.shared.explore.store(true, Ordering::Relaxed);
         let began = Instant::now();
         let patience = if self.options.spawn { STARTING } else { SHOWING };
         let (mut most, mut progress) = (0, began);
@@ -183,7 +185,7 @@ impl Bench<'_> {
             match lane.link.send(&frames).map_err(BusError::from) {
                 Err(error) if may_return(&error) => {
                     let unsent = &self.shared.unsent;
-                    unsent.fetch_add(frames.len() as u64, std::sync::atomic::Ordering::Relaxed);
+                    unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
                 }
                 sent => sent?,
             }

@@ -165,6 +165,9 @@ impl Receiver {
             }
             self.hear(&inbox);
             if let Some(roots) = &mut self.roots {
+                if self.shared.explore.load(Ordering::Relaxed) {
+                    roots.explore();
+                }
                 roots.speak(&self.ear.bus);
             }
             self.record(&inbox, &mut account);
@@ -258,7 +261,12 @@ impl Receiver {
     fn hear(&mut self, inbox: &Inbox) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         for received in inbox.frames() {
-            if self.roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
+            if let Some(roots) = &mut self.roots
+                && roots.take(&received.frame)
+            {
+                for (root, feeds) in roots.changes() {
+                    self.table.set_feeds(root, feeds);
+                }
                 continue;
             }
             let at = Micros(received.at_nanos / 1_000);

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
-use protocol::id::{Id, Kind, Node};
+use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
@@ -16,15 +16,18 @@ use crate::network::Uplinks;
 #[derive(Debug)]
 pub struct Roots {
     uplinks: Uplinks,
-    /// The lanes on which the gateway speaks, by root.
-    lanes: Vec<Lane>,
+    /// Each root, with the lane on which the gateway speaks to it, and whether its sums are for the gateway.
+    roots: Vec<(CellId, Lane, bool)>,
     began: Instant,
+    /// Whether the gateway speaks: where it begins before its cells are all there, the first ones make a tree
+    /// that is deeper than it has to be.
+    explores: bool,
 }
 
-/// The lanes on which the gateway speaks to a bus' roots; none where cells answer with their own torques.
-fn lanes(skin: &Skin, bus: usize) -> Vec<Lane> {
+/// A bus' roots and the lanes on which the gateway speaks to them; none where cells answer with their own torques.
+fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, Lane)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
-    if sums { skin.wires(bus).roots().map(|(_, lane)| lane).collect() } else { Vec::new() }
+    if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
 }
 
 /// What a gateway receives of a bus.
@@ -41,8 +44,8 @@ impl Ears {
     /// sums only those of roots.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize, everything: bool) -> Self {
-        let lanes = lanes(skin, bus);
-        if lanes.is_empty() {
+        let roots = roots(skin, bus);
+        if roots.is_empty() {
             return Self { filters: vec![Filter::ALL], all_sums: true };
         }
         let standard = |id, mask| Filter { id, mask: mask | EXTENDED };
@@ -50,15 +53,15 @@ impl Ears {
             // All kinds but that of sums, remote frames of any, and each root's.
             let kinds = [standard(0x000, 0x700), standard(0x200, 0x600), standard(0x400, 0x400)];
             let remote = Filter { id: REMOTE, mask: EXTENDED | REMOTE };
-            let wires = skin.wires(bus);
-            let roots = wires.roots().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(root))));
+            let roots = roots.iter().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(*root))));
             kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
         };
         // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
-        let wires = lanes
-            .iter()
-            .map(|lane| Filter { id: lane.reversed().raw_id(), mask: EXTENDED | REMOTE | EXTENDED_MASK });
+        let wires = roots.iter().map(|(_, lane)| Filter {
+            id: lane.reversed().raw_id(),
+            mask: EXTENDED | REMOTE | EXTENDED_MASK,
+        });
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
         let all_sums = everything || few.len() + others.len() > Filter::MAX;
@@ -71,13 +74,28 @@ impl Roots {
     /// Those of a bus; `None` where cells answer with their own torques.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
-        let lanes = lanes(skin, bus);
+        let roots: Vec<_> = roots(skin, bus).into_iter().map(|(root, lane)| (root, lane, false)).collect();
         // Whoever was there before counted its walks too, and nobody knows how far.
         let walk = std::process::id().to_le_bytes()[0];
-        (!lanes.is_empty()).then(|| Self {
-            uplinks: Uplinks::new(lanes.len(), walk, Micros(0)),
-            lanes,
+        (!roots.is_empty()).then(|| Self {
+            uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
+            roots,
             began: Instant::now(),
+            explores: false,
+        })
+    }
+
+    /// The gateway speaks from now on.
+    pub const fn explore(&mut self) {
+        self.explores = true;
+    }
+
+    /// Roots whose sums are for the gateway now and were not, or the other way round, since the last call.
+    pub fn changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
+        let uplinks = &self.uplinks;
+        self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {
+            let now = uplinks.is_child(place);
+            (core::mem::replace(feeds, now) != now).then_some((*root, now))
         })
     }
 
@@ -95,8 +113,10 @@ impl Roots {
             }
             return false;
         };
-        let root = self.lanes.iter().position(|own| own.reversed() == lane);
-        if let Some((root, message)) = root.and_then(|root| Some((root, lane.read(frame)?))) {
+        let root = self.roots.iter().position(|(_, own, _)| own.reversed() == lane);
+        if let Some((root, message)) =
+            root.filter(|_| self.explores).and_then(|root| Some((root, lane.read(frame)?)))
+        {
             let now = self.now();
             self.uplinks.handle(now, root, message);
         }
@@ -105,10 +125,13 @@ impl Roots {
 
     /// Says what there is to say.
     pub fn speak(&mut self, bus: &Bus) {
+        if !self.explores {
+            return;
+        }
         let now = self.now();
         self.uplinks.handle_time(now);
         while let Some((root, message)) = self.uplinks.poll_transmit() {
-            if let Some(lane) = self.lanes.get(root) {
+            if let Some((_, lane, _)) = self.roots.get(root) {
                 // What the bus does not take is asked for again.
                 let _ = bus.offer(&[lane.frame(message)]);
             }
@@ -118,6 +141,9 @@ impl Roots {
     /// How long nothing has to be said, if nothing comes.
     #[must_use]
     pub fn patience(&self) -> Duration {
+        if !self.explores {
+            return Duration::MAX;
+        }
         Duration::from_micros(self.uplinks.poll_timeout().since(self.now()).0)
     }
 }
@@ -126,7 +152,6 @@ impl Roots {
 mod tests {
     use super::*;
     use protocol::can::Format;
-    use protocol::id::CellId;
     use protocol::message::Message;
     use protocol::packet::Epoch;
 
@@ -187,11 +212,20 @@ mod tests {
     fn a_roots_question_is_answered_and_other_wires_are_kept_from_the_table() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         let mut roots = Roots::of(&skin, 0).unwrap();
+        let leave = Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
+        assert!(roots.take(&leave));
+        assert_eq!(roots.uplinks.poll_transmit(), None, "it does not speak yet");
+        roots.explore();
         assert!(roots.take(&Lane { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
         assert_eq!(roots.uplinks.poll_transmit(), None);
         assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Join)));
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::wire::PortMessage::Grant(_)))), "{answer:?}");
+        let root = CellId::new(1).unwrap();
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
+        assert_eq!(roots.changes().collect::<Vec<_>>(), []);
+        assert!(roots.take(&leave));
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, false)]);
         assert!(!roots.take(&sum(1)));
         assert!(Roots::of(&self::skin("reply = \"torque\""), 0).is_none());
     }

@@ -25,6 +25,8 @@ pub struct Shared {
     pub stop_loop: AtomicBool,
     /// Set once, after the loop's end: the receivers end.
     pub stop: AtomicBool,
+    /// Set once, when all cells are there: the gateway speaks to roots.
+    pub explore: AtomicBool,
     /// Whether torques are compared with central ones.
     pub comparing: AtomicBool,
     /// Broadcasts sent so far.

@@ -95,6 +95,8 @@ pub struct Cell {
     pub serial: u32,
     /// Whether it is wired to the gateway's side.
     pub root: bool,
+    /// Whether a root's sums are for the gateway; else another cell takes them.
+    pub(super) feeds: bool,
     /// The joint that moves it, from 1.
     pub(super) joint: usize,
     /// The hash that its configuration must have.
@@ -164,6 +166,7 @@ impl Cell {
             node: described.node,
             serial: described.serial,
             root: described.root,
+            feeds: described.root,
             joint: described.joint.into(),
             configuration: parameters.hash(),
             last_joints: Epoch(0),
@@ -416,6 +419,11 @@ impl Cell {
         // Of what some cells feel, all words may be rounded to 0.
         self.held = (count > 0).then_some(words);
         self.contribute(words, count)
+    }
+
+    /// Whether what it holds is older than of the broadcast before `number`.
+    pub(super) fn is_behind(&self, number: u64) -> bool {
+        self.held.is_some() && self.answered.is_some_and(|last| last + 1 < number)
     }
 
     /// Cells that what is held is of.

@@ -209,6 +209,17 @@ impl Table {
         self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.uplink.without_sums());
     }
 
+    /// Whether the sums of a root are for the gateway. When they are not any more they come in another one's: what was
+    /// held of it would count twice.
+    pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
+        let Some(cell) = self.cell_mut(root) else { return };
+        cell.feeds = feeds;
+        if !feeds && cell.summed {
+            let change = cell.let_go();
+            self.apply(change);
+        }
+    }
+
     /// Whether distributed torques are compared with central ones from the next epoch on.
     pub const fn set_comparing(&mut self, comparing: bool) {
         self.comparing = comparing;
@@ -497,7 +508,7 @@ impl Table {
             return self.counters.count(Event::Stranger);
         };
         trunk.counts.received += 1;
-        if !cell.root {
+        if !cell.feeds {
             trunk.counts.overheard += 1;
             return;
         }
@@ -522,6 +533,17 @@ impl Table {
         // Q7.8 in steps of Q3.12, of which the running sum is made.
         let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
         self.apply(change);
+        self.let_go_of_what_moved(number);
+    }
+
+    /// Cells whose root fell silent find another one: then they are in its sum and not in what was held.
+    fn let_go_of_what_moved(&mut self, number: u64) {
+        let Some(due) = self.trunk.as_ref().and_then(Trunk::due) else { return };
+        if self.snapshot.sums.contributing > due {
+            self.each_cell(
+                |cell| if cell.is_behind(number) { cell.let_go() } else { cell::Change::default() },
+            );
+        }
     }
 
     /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
@@ -542,13 +564,14 @@ impl Table {
         let exact = frames.map(|_| {
             self.unquantised.frames_at(&q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians)))
         });
-        let (mut due, mut stale, mut age) = (0, 0, 0);
+        let (mut due, mut stale, mut age, mut known) = (0, 0, 0, true);
         let mut whole = frames.as_ref().map(|_| Expected { constant: true, ..Expected::default() });
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let f_z = cell.latch(epoch).map(|skin| (self.central.force(place, &skin), skin));
             let in_contact = f_z.is_some_and(|(force, _)| force > 0.0);
             if self.trunk.is_some() {
+                known &= f_z.is_some() || !cell.is_ready();
                 let (change, missed) = cell.open_epoch_of_sums(number, in_contact, &self.safety);
                 due += u32::from(cell.is_due());
                 if missed > 0 {
@@ -583,7 +606,7 @@ impl Table {
             self.apply(change);
         }
         if let Some(trunk) = &mut self.trunk {
-            trunk.open(due, whole);
+            trunk.open(due, known, whole);
         }
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));

@@ -178,6 +178,40 @@ fn a_root_that_starts_anew_does_not_take_its_childrens_torque_with_it() {
 }
 
 #[test]
+fn what_moved_to_another_root_is_not_counted_twice_while_the_old_one_is_held() {
+    let mut bench = Bench::new(&[1, 2, 3, 4]);
+    bench.joints(0);
+    bench.sum(1, 0, 3, 30);
+    bench.sum(2, 0, 1, 10);
+    bench.joints(1);
+    // The first root is silent; its sum is held.
+    assert_eq!(first(&bench.sum(2, 1, 1, 10)), (40.0, 4));
+    bench.joints(2);
+    assert_eq!(first(&bench.sum(2, 2, 3, 29)), (29.0, 3), "two of its cells have come to the other one");
+    bench.joints(3);
+    bench.sum(2, 3, 3, 29);
+    assert_eq!(first(&bench.sum(1, 3, 1, 11)), (40.0, 4), "it speaks again");
+}
+
+#[test]
+fn a_root_below_another_cell_is_in_that_ones_sum() {
+    let mut bench = Bench::new(&[1, 2, 3, 4]);
+    bench.joints(0);
+    bench.sum(1, 0, 3, 30);
+    assert_eq!(first(&bench.sum(2, 0, 1, 10)), (40.0, 4));
+    bench.table.set_feeds(cell(2), false);
+    assert_eq!(first(&bench.table.snapshot().sums), (30.0, 3), "it is about to come with the first one's");
+    bench.joints(1);
+    bench.sum(2, 1, 1, 10);
+    assert_eq!(first(&bench.sum(1, 1, 4, 41)), (41.0, 4));
+    assert_eq!((bench.counts().overheard, bench.counts().first), (1, 3));
+    bench.table.set_feeds(cell(2), true);
+    bench.joints(2);
+    bench.sum(1, 2, 3, 31);
+    assert_eq!(first(&bench.sum(2, 2, 1, 9)), (40.0, 4));
+}
+
+#[test]
 fn a_halt_lets_go_of_sums_and_nobody_is_due() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);

@@ -71,6 +71,8 @@ impl Sum {
 #[derive(Clone, Copy, Debug)]
 struct Open {
     due: u32,
+    /// Nobody else can be in it.
+    known: bool,
     came: u32,
     /// What had come before the next joints.
     in_time: Option<u32>,
@@ -143,12 +145,18 @@ impl Trunk {
         Taken::Best
     }
 
-    /// New joints: `due` cells are to be in their sum. What was open for longest is settled.
-    pub(super) fn open(&mut self, due: u32, expected: Option<Expected>) {
+    /// Cells that are to be in the newest epoch's sum; `None` where of some only they themselves know.
+    pub(super) fn due(&self) -> Option<u32> {
+        self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
+    }
+
+    /// New joints: `due` cells are to be in their sum, and nobody else if that is `known`. What was open for longest is settled.
+    pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
             let settled = oldest.replace(Open {
                 due,
+                known,
                 came: 0,
                 in_time: None,
                 sum: [0; WORDS],
