@@ -77,6 +77,7 @@ fn turn_of(
         positions,
         works: Arc::clone(&works),
         commands: Arc::default(),
+        returned: Arc::default(),
     };
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };

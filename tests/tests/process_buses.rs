@@ -132,6 +132,32 @@ fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_u
 }
 
 #[test]
+fn cells_that_were_away_hear_of_a_resume_and_of_a_touch_that_they_missed() {
+    let place = place();
+    let late = "at_s = 2.0\nfor_s = 60.0\nbus = \"vcan1\"";
+    let text = place.read("scenario.toml");
+    let touch = text.find("[[touch]]").unwrap();
+    let others =
+        ["vcan0", "vcan2"].map(|bus| text[touch..].replacen("at_s", &format!("bus = \"{bus}\"\nat_s"), 1));
+    let vcan1 = text[touch..].replacen("at_s = 0.0\nfor_s = 60.0", late, 1);
+    place.scenario(&[&text[..touch], &others[0], "\n", &others[1], "\n", &vcan1].concat());
+    let first = serve(&place, "vcan1");
+    let bench = place.running_bench(60.0, "");
+    place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    Listener::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
+    first.signal(Signal::KILL);
+    first.end();
+    bench.hears(LOST);
+    place.start("gateway", "ack vcan0 --bus-kind embedded").end().well();
+    bench.hears("the robot goes on");
+    // More than the two seconds after which the cells that are away are touched.
+    Listener::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
+    let second = serve(&place, "vcan1");
+    listeners(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    ended_well(&place, bench, Some(second), 1);
+}
+
+#[test]
 fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     let place = place();
     let vcan1 = serve(&place, "vcan1");

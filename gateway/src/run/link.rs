@@ -22,6 +22,7 @@ pub struct Link {
     works: Arc<AtomicBool>,
     gone: AtomicBool,
     commands: Arc<AtomicU64>,
+    returned: Arc<AtomicBool>,
 }
 
 /// Where the loop finds the bus.
@@ -52,6 +53,7 @@ impl Link {
             works: Arc::new(AtomicBool::new(true)),
             gone: AtomicBool::new(false),
             commands: Arc::default(),
+            returned: Arc::default(),
         });
         let (slot, output) = triple_buffer::triple_buffer(&bus);
         (Arc::clone(&link), Ear { link, bus, slot }, output)
@@ -97,6 +99,12 @@ impl Link {
     #[must_use]
     pub const fn commands(&self) -> &Arc<AtomicU64> {
         &self.commands
+    }
+
+    /// Set when cells are back on it after it was lost; the loop then says whether the robot is halted.
+    #[must_use]
+    pub const fn returned(&self) -> &Arc<AtomicBool> {
+        &self.returned
     }
 
     /// Sends frames; not for the loop, for a bus that is being exchanged is waited for.

@@ -71,16 +71,24 @@ impl Measured {
         })
     }
 
-    pub(super) fn line(&self, started: Instant, duration_us: u64, cells: usize, comparing: bool) -> String {
+    pub(super) fn line(
+        &self,
+        started: Instant,
+        duration_us: u64,
+        cells: usize,
+        comparing: bool,
+        lost: &[&str],
+    ) -> String {
         let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
         let seconds = started.elapsed().as_secs_f64();
         let of = Duration::from_micros(duration_us).as_secs_f64();
         let mode = if comparing { "compare" } else { "distributed" };
         let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
+        let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
         let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
         format!(
             "{seconds:5.1} of {of:.1} s  {mode:11}  {:3} of {cells} in contact, {} stale, {} dead  torque {} Nm  \
-             late p99 {:.0} us{halted}",
+             late p99 {:.0} us{lost}{halted}",
             record.contributing,
             record.stale,
             record.dead,

@@ -294,7 +294,8 @@ fn listen(
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
     let format = options.skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
     let (works, commands) = (Arc::clone(link.works()), Arc::clone(link.commands()));
-    let line = Line { format, snapshot, positions, works, commands };
+    let returned = Arc::clone(link.returned());
+    let line = Line { format, snapshot, positions, works, commands, returned };
     let receiver = Receiver {
         index,
         ear,

@@ -69,6 +69,8 @@ pub struct Line {
     pub works: Arc<AtomicBool>,
     /// Commands that the bus took, joints among them.
     pub commands: Arc<AtomicU64>,
+    /// Set when cells are back on the bus after it was lost.
+    pub returned: Arc<AtomicBool>,
 }
 
 /// The control loop between two looks at the clock.
@@ -179,12 +181,13 @@ impl Turn {
         }
     }
 
-    /// What a bus took just before it was lost its cells may not have heard: once it is back they are told to be as the
-    /// robot is.
+    /// What a bus took just before it was lost, or before its cells were back on it, they have not heard: once it works
+    /// and once more when they are heard they are told to be as the robot is.
     fn owe_to_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
             let works = line.works.load(Ordering::Relaxed);
-            if works && !*worked {
+            let returned = line.returned.swap(false, Ordering::Relaxed);
+            if (works && !*worked) || returned {
                 *owed = Some(if halted { Message::Halt } else { Message::Resume });
             }
             *worked = works;

@@ -1,7 +1,7 @@
 //! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, news and
 //! progress for people, frames into the log, and at the end the summary.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -188,6 +188,7 @@ impl Bench<'_> {
             progress.note(&line);
         }
         let shared = Arc::clone(&self.shared);
+        let lost = self.lanes.iter().filter(|lane| !lane.link.is_there());
         progress.show(|| {
             let cells = self.options.skin.cells.len();
             measured.line(
@@ -195,6 +196,7 @@ impl Bench<'_> {
                 self.options.scenario.duration.0,
                 cells,
                 shared.comparing.load(Ordering::Relaxed),
+                &lost.map(|lane| lane.link.name()).collect::<Vec<_>>(),
             )
         });
         Ok(())
@@ -300,6 +302,7 @@ impl Bench<'_> {
         let options = self.options;
         let name = |bus: usize| options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
         let news: Vec<_> = self.news.try_iter().collect();
+        let mut returned = BTreeSet::new();
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
         for (bus, news) in news {
             match news {
@@ -315,6 +318,9 @@ impl Bench<'_> {
                     // It has forgotten what it felt.
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
+                News::Notice(Notice::Returned(cell)) => {
+                    returned.insert((bus, cell));
+                }
                 News::Notice(Notice::Duplicate(cell)) => {
                     progress.note(&format!(
                         "cell {cell} on {} hears another cell under its number: stop one of the two",
@@ -324,8 +330,6 @@ impl Bench<'_> {
                 News::Down(why) => progress.note(&why),
                 News::Up => {
                     progress.note(&format!("{} works again", name(bus)));
-                    // What was to change meanwhile did not come to them.
-                    self.remind(script, |it| it.bus == bus)?;
                 }
                 // Who has no bus left feels nothing.
                 News::Lost(why) if self.lanes.iter().all(|lane| lane.link.is_gone()) => {
@@ -338,6 +342,13 @@ impl Bench<'_> {
                 News::Refused(why) => {
                     progress.note(&format!("{} cannot be opened again yet: {why}", name(bus)))
                 }
+            }
+        }
+        if !returned.is_empty() {
+            // What was to change while they were away did not come to them.
+            self.remind(script, |it| returned.contains(&(it.bus, it.node)))?;
+            for lane in returned.iter().filter_map(|&(bus, _)| self.lanes.get(bus)) {
+                lane.link.returned().store(true, Ordering::Relaxed);
             }
         }
         for ((bus, how), cells) in changed {

@@ -318,13 +318,13 @@ impl Cell {
 
     /// What it feels; `None` where only the cell knows.
     pub(super) fn feeling(&self) -> Option<SkinSensors> {
-        self.felt.now().filter(|_| self.obeys())
+        self.felt.now().filter(|_| self.obeys() && !self.uplink.is_interrupted())
     }
 
     /// What the cell feels from the joints of this epoch on; `None` where only the cell knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         let felt = self.felt.latch(epoch);
-        felt.filter(|_| self.obeys())
+        felt.filter(|_| self.obeys() && !self.uplink.is_interrupted())
     }
 
     /// A new broadcast: what was not answered in three epochs is missing, and what is held grows old.
@@ -497,6 +497,7 @@ impl Cell {
         self.replies.in_doubt += due;
         self.due = 0;
         self.uplink.interrupt();
+        self.felt.forget();
     }
 
     /// Nothing more will come: what is still due is missing.

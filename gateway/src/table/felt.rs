@@ -30,6 +30,11 @@ impl Felt {
         self.now = Some(SkinSensors::default());
     }
 
+    /// Nobody knows what it has heard, and so what it feels.
+    pub(super) fn forget(&mut self) {
+        *self = Self::default();
+    }
+
     /// What it feels since the last joints.
     pub(super) const fn now(&self) -> Option<SkinSensors> {
         self.now

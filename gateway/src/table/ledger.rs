@@ -54,6 +54,11 @@ impl Uplink {
         self.interrupted = true;
     }
 
+    /// Whether the bus was lost since the cell's last heartbeat: nobody knows whether it is back on it.
+    pub(super) const fn is_interrupted(&self) -> bool {
+        self.interrupted
+    }
+
     /// A packet arrived.
     pub(super) const fn arrive(&mut self) {
         self.arrived_since += 1;

@@ -102,6 +102,8 @@ pub enum Notice {
     Restarted(CellId),
     /// A cell heard another one under its number.
     Duplicate(CellId),
+    /// A cell is heard for the first time since its bus was lost: nobody knows what it has not heard.
+    Returned(CellId),
     /// Another gateway speaks on this bus.
     Rival,
 }
@@ -460,7 +462,12 @@ impl Table {
         if speaker == Speaker::Anew {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
+        let away = cell.uplink.is_interrupted();
         let released = cell.take_heartbeat(speaker, heartbeat);
+        if away && !cell.uplink.is_interrupted() && speaker == Speaker::Known {
+            cell.felt.forget();
+            self.notices.push_back(Notice::Returned(cell.node));
+        }
         cell.uplink.heartbeat_at(joints);
         self.apply(released);
     }
@@ -794,6 +801,44 @@ mod tests {
             assert_eq!(after, contributing, "{interrupted}, joints {next} after joints 1");
             assert_eq!(hear(&mut table, false, torque(next)), 1, "new ones count again");
         }
+    }
+
+    #[test]
+    fn a_cell_that_was_away_owes_nothing_before_it_is_heard_and_told_what_it_feels() {
+        let cell = CellId::new(1).unwrap();
+        let positions = [Q1_14::ZERO; WORDS];
+        let joints =
+            |epoch| (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } });
+        let heartbeat = |sent| {
+            let state = State::CONFIGURED.with(State::TEST_MODE, true);
+            let page = NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
+            (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page })
+        };
+        let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
+        let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+        let press =
+            (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page });
+        let hear = |table: &mut Table, heard: &[(bool, Message)]| {
+            for (own, message) in heard {
+                for frame in message.encode().frames(Format::Fd) {
+                    table.handle_frame(Micros(0), *own, &frame, &mut |_| None);
+                }
+            }
+            let replies = table.cells().first().unwrap().replies;
+            (replies.due, replies.missing, replies.in_doubt)
+        };
+        let mut table = table(&[]);
+        assert_eq!(hear(&mut table, &[heartbeat(1), press, joints(1), joints(2)]), (2, 0, 0));
+        table.interrupt();
+        // It may not be back when the bus is, and so may not have heard this.
+        assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
+        assert_eq!(table.notices().count(), 0);
+        assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "nobody knows what it feels");
+        assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
+        assert_eq!(hear(&mut table, &[press, joints(6), heartbeat(10), joints(7)]), (4, 2, 2));
+        assert_eq!(table.notices().count(), 0, "said once");
+        let uplink = table.cells().first().unwrap().uplink;
+        assert_eq!((uplink.lost, uplink.outage), (7, 7));
     }
 
     #[test]
