@@ -197,15 +197,12 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     };
     rows.row("received", list(&bus.received), "");
     let sensors = &bus.sensors;
-    if let (Some(least), Some(mean), Some(greatest)) =
+    // A frame or two are answers to reports.
+    if let (Some(least), Some(mean), Some(greatest @ 1.0..)) =
         (sensors.least_hz, sensors.mean_hz, sensors.greatest_hz)
     {
         let touches = format!("{} touches, {} releases", sensors.touches, sensors.releases);
-        rows.row(
-            "  sensors frames a second and cell",
-            format!("{least:.1} / {mean:.1} / {greatest:.1}"),
-            touches,
-        );
+        rows.row("  sensors of a cell, Hz", format!("{least:.1} / {mean:.1} / {greatest:.1}"), touches);
     }
     rows.row("sent", list(&bus.sent), "");
     if !bus.events.is_empty() {

@@ -6,7 +6,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Contact, Events, Parameter, Parameters, Pose, Sensing as Mode};
 use protocol::time::{Micros, Span};
 
-use crate::node::{Flash, HEARTBEAT, Identity, Node};
+use crate::node::{Claim, Flash, HEARTBEAT, Identity, Node};
 
 const NODE: u8 = 51;
 /// Node 51 speaks a fifth into a period.
@@ -325,6 +325,33 @@ fn switching_begins_anew_and_the_same_again_changes_nothing() {
     assert_eq!(said, [59, 49, 0], "a fall, a release, and nothing any more");
     assert_eq!(cell.switches(Mode::Off), []);
     assert!(!cell.says(900));
+}
+
+#[test]
+fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
+    let mut cell = eventful();
+    cell.write(Parameter::Events, [0; WORDS]);
+    assert_eq!(
+        [1, 2, 2, 3, 1, 0, 0].map(|bits| cell.says(bits)),
+        [true, true, false, true, true, true, false]
+    );
+}
+
+#[test]
+fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
+    let mut cell = eventful();
+    cell.node.claim = Claim::Said;
+    assert!(!cell.says(500));
+    cell.node.claim = Claim::Settled;
+    assert_eq!(cell.joints(), [pressed(500)]);
+
+    let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
+    cell.node.claim = Claim::Said;
+    let heartbeat = cell.node.next_heartbeat;
+    assert_eq!(cell.node.poll_timeout(), heartbeat, "it is not woken for it");
+    cell.now = heartbeat - Span(1);
+    cell.node.handle_timeout(cell.now);
+    assert_eq!(cell.sends(), []);
 }
 
 #[test]
