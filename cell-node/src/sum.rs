@@ -6,8 +6,9 @@
 //!   a child's word ──> state                 ┘                └─> judge: children whose sums did not come
 //! ```
 //!
-//! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell,
-//! epoch by epoch without a gap. So a child that fell silent for one epoch is free to send its sums to another.
+//! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell, as
+//! they come, epoch by epoch without a gap. So a child that fell silent for one epoch is free to send its sums to
+//! another, and one that is late loses nothing but that epoch.
 //! A sum of no cells, count 0, ends the lease: nothing is to come.
 
 use protocol::fixed::{Acc, Q7_8};
@@ -57,8 +58,10 @@ pub enum Check {
 /// What is known of the sums of one child.
 #[derive(Clone, Copy, Debug, Default)]
 struct Child {
-    /// The epoch whose sum is to come next.
-    next: Option<Epoch>,
+    /// The epoch of the last sum that came, while the lease runs.
+    last: Option<Epoch>,
+    /// Whether any sum came in the present epoch, of whatever epoch it was.
+    heard: bool,
     /// The sum of the present epoch.
     taken: Option<Words>,
     /// One that came before its child said that it is for this cell.
@@ -142,12 +145,9 @@ impl Sum {
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
         for (port, child) in self.children.iter_mut().enumerate() {
             let is_child = begin.children >> port & 1 == 1;
-            // Nor does a child go on that left in the meantime and came back.
-            let goes_on = follows && child.next.is_some() && child.taken.is_some_and(|words| !words.is_end());
-            // Who was silent for an epoch has to say again whom its sums are for.
-            let next = (is_child && goes_on).then_some(begin.epoch);
+            let last = child.last.filter(|_| is_child);
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
-            *child = Child { next, taken: None, waiting, missing: child.missing };
+            *child = Child { last, heard: false, taken: None, waiting, missing: child.missing };
         }
         self.period = begin.period;
         self.began = begin.at;
@@ -197,13 +197,9 @@ impl Sum {
 
     /// A child says that its sums from this epoch on are for this cell.
     pub fn state(&mut self, now: Micros, port: usize, epoch: Epoch) {
-        if self.epoch != Some(epoch) {
-            return;
-        }
         let Some(child) = self.children.get_mut(port) else { return };
-        child.next = Some(epoch);
-        // One that came late, of an epoch before, says nothing of this one.
-        if let Some((_, words)) = child.waiting.take().filter(|(of, _)| *of == epoch) {
+        child.last = Some(epoch.before());
+        if let Some((_, words)) = child.waiting.take_if(|(of, _)| *of == epoch) {
             self.dropped = self.dropped.wrapping_sub(1);
             self.take(now, port, epoch, words);
         }
@@ -213,16 +209,19 @@ impl Sum {
     pub fn take(&mut self, now: Micros, port: usize, epoch: Epoch, words: Words) {
         let present = self.epoch == Some(epoch);
         let Some(child) = self.children.get_mut(port) else { return };
-        if child.next != Some(epoch) || !present {
+        child.heard = true;
+        child.missing = 0;
+        let follows = child.last.is_some_and(|last| epoch == last || epoch == last.next());
+        child.last = Some(epoch).filter(|_| follows && !words.is_end());
+        if !follows || !present {
             self.dropped = self.dropped.wrapping_add(1);
-            child.waiting = Some((epoch, words));
+            child.waiting = (present && !follows).then_some((epoch, words));
             return;
         }
         if child.taken.is_some_and(|before| before.count >= words.count) {
             return;
         }
         child.taken = Some(words);
-        child.missing = 0;
         self.taken = self.taken.wrapping_add(1);
         self.plan(now);
     }
@@ -243,7 +242,7 @@ impl Sum {
     pub fn disown(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
             // What was taken in this epoch stays: its sender sends no other for it.
-            child.next = None;
+            child.last = None;
             child.waiting = None;
             child.missing = 0;
         }
@@ -367,10 +366,10 @@ impl Sum {
         }
         let mut missed = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
-            // It did not come, or came without a word whom it is for.
+            // Nothing came, or what came was without a word whom it is for.
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
-            if child.taken.is_none() && (child.next.is_some() || unsaid) {
-                child.next = None;
+            if unsaid || (child.last.is_some() && !child.heard) {
+                child.last = None;
                 child.missing = MISSING;
             }
             if child.missing > 0 {
@@ -494,6 +493,21 @@ mod tests {
         sum.state(at(5, 0), 1, Epoch(4));
         sum.take(at(5, 500), 1, Epoch(5), words(10, 1));
         assert_eq!(sum.taken, 2, "stated for another epoch");
+    }
+
+    #[test]
+    fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
+        let mut sum = sum(false);
+        sum.begin(&begin(1, 2), None);
+        sum.state(at(1, 0), 1, Epoch(1));
+        sum.take(at(1, 100), 1, Epoch(1), words(10, 1));
+        sum.begin(&begin(2, 2), None);
+        sum.begin(&begin(3, 2), None);
+        sum.take(at(3, 100), 1, Epoch(2), words(10, 1));
+        assert_eq!((sum.taken, sum.dropped), (1, 1));
+        sum.take(at(3, 200), 1, Epoch(3), words(10, 1));
+        assert_eq!((sum.taken, sum.dropped), (2, 1));
+        assert_eq!(sum.judge(), Some((Epoch(3), 0)));
     }
 
     #[test]

@@ -46,6 +46,12 @@ impl Epoch {
         self.plus(1)
     }
 
+    /// The epoch before this one.
+    #[must_use]
+    pub const fn before(self) -> Self {
+        Self(self.0.wrapping_sub(1))
+    }
+
     /// The epoch `steps` later.
     #[must_use]
     pub const fn plus(self, steps: u8) -> Self {

@@ -30,7 +30,7 @@ const JOIN_PATIENCE: Span = Span::from_millis(5);
 /// From one search for a way to the next, at first and at most.
 const SEEK: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
 /// So long a cell without a way looks for another before it tells those below it.
-const GRACE: Span = Span::from_millis(3);
+const GRACE: Span = Span::from_millis(10);
 /// Ports, and a root's wire to the gateway's side.
 const ALL: usize = PORTS + 1;
 /// Messages that wait for ports; a shell takes them after every call.

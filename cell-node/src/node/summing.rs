@@ -127,7 +127,8 @@ impl Node {
         if let Some((port, Some(parent))) = self.parent
             && parent == from
         {
-            self.heard_parent |= !self.network.is_deaf(port) && self.sums.epoch() == Some(epoch);
+            // A late sum of an earlier epoch is a sign of life too.
+            self.heard_parent |= !self.network.is_deaf(port);
         } else if let Some(port) = self.network.child_with(from.get())
             && !self.network.is_deaf(port)
         {
