@@ -86,6 +86,8 @@ pub struct Sum {
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
+    /// Bit p: the cell at port p is a child in the present epoch.
+    ports: u8,
     /// Whether the present epoch's sum may be sent.
     speaks: bool,
     /// When it is to be sent.
@@ -162,9 +164,9 @@ impl Sum {
         };
         // What was said last is not to be held for ever.
         self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
-        let slot = slots.deepest.saturating_sub(self.depth);
-        self.due = (self.own.is_some() || self.ends)
-            .then(|| self.began + Span(u64::from(slot) * u64::from(slots.slot_us)));
+        self.ports = begin.children;
+        self.due = None;
+        self.plan(self.began);
         (self.judged, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
             self.watch();
@@ -226,16 +228,31 @@ impl Sum {
         self.plan(now);
     }
 
-    /// There is something new to say: in this cell's slot, or in the next one after it.
+    /// When to say what there is to say: at once when every child has spoken, else in this cell's slot, else, where
+    /// a child is late that spoke in the epoch before, two slots later; and what comes after that in the next slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
+        if self.words().is_none() {
+            return;
+        }
         let width = u64::from(slots.slot_us);
-        let own_slot = u64::from(slots.deepest.saturating_sub(self.depth)) * width;
-        let said = self.said.is_some_and(|(of, _)| Some(of) == self.epoch);
-        let passed = now.since(self.began).0;
-        let at = if said { own_slot.max((passed / width + 1) * width) } else { own_slot.max(passed) };
-        let at = self.began + Span(at);
-        self.due = Some(self.due.map_or(at, |due| due.min(at)));
+        let slot = u64::from(slots.deepest.saturating_sub(self.depth)) * width;
+        if self.said.is_some_and(|(of, _)| Some(of) == self.epoch) {
+            let next = (now.since(self.began).0 / width + 1) * width;
+            let at = self.began + Span(next.max(slot));
+            self.due = Some(self.due.map_or(at, |due| due.min(at)));
+            return;
+        }
+        let is_in = |(port, child): (usize, &Child)| self.ports >> port & 1 == 0 || child.taken.is_some();
+        let is_late = |child: &Child| child.last.is_some() && child.taken.is_none();
+        let at = if self.children.iter().enumerate().all(is_in) {
+            0
+        } else if self.children.iter().any(is_late) {
+            (slot + 2 * width).min(self.period.0 * 7 / 8)
+        } else {
+            slot
+        };
+        self.due = Some(self.began + Span(at));
     }
 
     /// A child is none any more.
