@@ -12,6 +12,9 @@ use vcan_setup::embedded::Server;
 
 use super::bus_name;
 
+/// Before all other processes, as far as niceness goes.
+const URGENT: i32 = -20;
+
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
 ///
 /// Prints one line, "serving NAME at PATH", when clients can connect. The bus is private to the user; its
@@ -50,6 +53,9 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
             let _ = (&stop).write_all(b"end");
         });
     }
+    // A kernel passes frames on at once; a process that waits its turn among hundreds of cells does not. Whoever may
+    // not do this has a slower bus.
+    let _ = rustix::process::setpriority_process(None, URGENT);
     let server = Server::bind(name)?;
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
