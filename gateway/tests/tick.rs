@@ -14,6 +14,7 @@ use gateway::controller::Kinesthetic;
 use gateway::cycle::{Cycle, Tick};
 use gateway::generate::{Wanted, generate};
 use gateway::robot::SimulatedArm;
+use gateway::run::link::Link;
 use gateway::run::realtime;
 use gateway::run::turn::{Line, Shared, Turn};
 use gateway::scenario::{Mode, ModeChange, Scenario};
@@ -160,6 +161,35 @@ fn a_bus_that_is_back_is_told_before_its_next_joints_to_be_as_the_robot_is() {
     let others: Vec<_> = said.iter().copied().filter(|(_, id)| *id != joints).collect();
     assert_eq!(others[..2], [(32, resume), (44, halt)], "back at tick 30, and the next joints are due at 32");
     assert!(said.iter().position(|it| *it == (32, resume)) < said.iter().position(|it| *it == (32, joints)));
+}
+
+#[test]
+fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let directory = directory.path().join("skinbus");
+    let serve = || Served::start_in(&directory, "vcan0").unwrap();
+    let options = Options { directory: Some(directory.clone()), ..Options::default() };
+    let frames = [Frame::classic(0x001, &[0; 8]).unwrap()];
+    let first = serve();
+    let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let (link, mut ear, mut slot) = Link::new(bus, options);
+    let mut offer = || {
+        let before = ALLOCATIONS.with(Cell::get);
+        let taken = slot.read().offer(&frames);
+        (taken, ALLOCATIONS.with(Cell::get) - before)
+    };
+    assert_eq!(offer(), (true, 0));
+    first.stop().unwrap();
+    assert!(ear.lose(true) && !ear.lose(true), "news once");
+    assert_eq!((offer(), link.is_gone(), link.is_there()), ((false, 0), true, false));
+    assert!(ear.reopen().is_err() && link.is_gone());
+    let second = serve();
+    ear.reopen().unwrap();
+    assert_eq!((link.is_gone(), link.is_there()), (false, false), "open, and nothing was heard on it yet");
+    assert!(ear.regain() && !ear.regain() && link.is_there());
+    assert_eq!(offer(), (true, 0));
+    link.send(&frames).unwrap();
+    assert_eq!(second.stop().unwrap().frames, 2);
 }
 
 #[derive(Debug, PartialEq)]

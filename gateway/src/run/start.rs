@@ -398,9 +398,11 @@ impl Bench<'_> {
         if self.options.spawn {
             return;
         }
-        let last =
-            |_: &str, view: &View| view.cells.iter().find(|cell| cell.ready).map(|cell| cell.last_joints);
-        let last = self.each_view(last).into_iter().flatten().next().unwrap_or_default();
+        let heard = |_: &str, view: &View| {
+            let ready = view.cells.iter().filter(|cell| cell.ready);
+            ready.map(|cell| cell.last_joints).collect::<Vec<_>>()
+        };
+        let last = after(&self.each_view(heard).concat());
         self.first_epoch = last.next();
         if let Some(cycle) = &mut self.cycle {
             cycle.start_after(last);
@@ -555,4 +557,32 @@ pub(super) fn rival(bus: &str) -> RunError {
     RunError::Failed(format!(
         "another gateway is on {bus}: stop one of the two, or give this one another bus"
     ))
+}
+
+/// The epoch after which to begin on cells that have taken these last, the first cell's if that can be: joints of the
+/// epoch that a cell has taken last it takes for repeated ones. Buses need not have had the same.
+fn after(taken: &[Epoch]) -> Epoch {
+    let mut last = taken.first().copied().unwrap_or_default();
+    for _ in 0..u8::MAX {
+        if !taken.contains(&last.next()) {
+            break;
+        }
+        last = last.next();
+    }
+    last
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_epoch_is_new_to_the_cells_of_all_buses() {
+        let after =
+            |taken: &[u8]| super::after(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
+        assert_eq!(after(&[]), 0);
+        assert_eq!(after(&[7, 7, 7]), 7);
+        assert_eq!(after(&[7, 7, 200, 200]), 7);
+        assert_eq!(after(&[255, 255, 0, 0, 1]), 1, "0 would be repeated on one bus, and 1 on another");
+    }
 }
