@@ -578,11 +578,10 @@ mod tests {
 
     #[test]
     fn the_first_epoch_is_new_to_the_cells_of_all_buses() {
-        let after =
-            |taken: &[u8]| super::after(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
-        assert_eq!(after(&[]), 0);
-        assert_eq!(after(&[7, 7, 7]), 7);
-        assert_eq!(after(&[7, 7, 200, 200]), 7);
-        assert_eq!(after(&[255, 255, 0, 0, 1]), 1, "0 would be repeated on one bus, and 1 on another");
+        let first = |taken: &[u8]| after(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
+        assert_eq!(first(&[]), 0);
+        assert_eq!(first(&[7, 7, 7]), 7);
+        assert_eq!(first(&[7, 7, 200, 200]), 7);
+        assert_eq!(first(&[255, 255, 0, 0, 1]), 1, "0 would be repeated on one bus, and 1 on another");
     }
 }
