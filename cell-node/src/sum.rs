@@ -229,7 +229,8 @@ impl Sum {
     }
 
     /// When to say what there is to say: at once when every child has spoken, else in this cell's slot, else, where
-    /// a child is late that spoke in the epoch before, two slots later; and what comes after that in the next slot.
+    /// a child is late that spoke in the epoch before, as late as still helps; and what comes after that in the next
+    /// slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
         if self.words().is_none() {
@@ -248,7 +249,8 @@ impl Sum {
         let at = if self.children.iter().enumerate().all(is_in) {
             0
         } else if self.children.iter().any(is_late) {
-            (slot + 2 * width).min(self.period.0 * 7 / 8)
+            // Half a slot for each wire to the root, so that who waits above does not wait in vain.
+            (self.period.0 * 7 / 8).saturating_sub(u64::from(self.depth) * width / 2).max(slot)
         } else {
             slot
         };
