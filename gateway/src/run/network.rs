@@ -32,8 +32,8 @@ pub(super) struct Network {
     deaf: BTreeMap<CellId, (u8, Option<Instant>)>,
     /// Cells that speak and have no way, and since when.
     without: BTreeMap<CellId, Instant>,
-    /// Of these, the ones that people have heard of.
-    said: BTreeSet<CellId>,
+    /// Cells that people have heard of as without a way, and since when they are; until they have one again.
+    said: BTreeMap<CellId, Instant>,
     said_too_deep: bool,
     /// How long a cell was without a way, at most.
     pub(super) longest: Duration,
@@ -65,7 +65,7 @@ impl Network {
             told: BTreeMap::new(),
             deaf: BTreeMap::new(),
             without: BTreeMap::new(),
-            said: BTreeSet::new(),
+            said: BTreeMap::new(),
             said_too_deep: false,
             longest: Duration::ZERO,
             organised: None,
@@ -202,23 +202,27 @@ impl Network {
         look.messages.extend(self.tell_again(now, view));
         look.messages.extend(self.tell_cuts(now, view));
         let without: BTreeSet<_> = places.without_way.into_iter().collect();
-        let mut back = Vec::new();
         self.without.retain(|cell, since| {
             self.longest = self.longest.max(now.duration_since(*since));
-            let stays = without.contains(cell);
-            if !stays && self.said.remove(cell) && places.depths.contains_key(cell) {
+            without.contains(cell)
+        });
+        let mut back = Vec::new();
+        self.said.retain(|cell, since| {
+            let has_one = places.depths.contains_key(cell);
+            if has_one {
                 back.push((*cell, now.duration_since(*since)));
             }
-            stays
+            !has_one
         });
         for &cell in &without {
             self.without.entry(cell).or_insert(now);
         }
         let news = |(cell, since): (&CellId, &Instant)| {
-            (now.duration_since(*since) >= GRACE && !self.said.contains(cell)).then_some((*cell, *since))
+            (now.duration_since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
         };
         let news: Vec<_> = self.without.iter().filter_map(news).collect();
         if let Some(oldest) = news.iter().map(|(_, since)| now.duration_since(*since)).max() {
+            self.said.extend(news.iter().copied());
             let cells: Vec<_> = news.into_iter().map(|(cell, _)| cell).collect();
             let (has, them) = if cells.len() == 1 { ("has", "it") } else { ("have", "them") };
             look.notes.push(format!(
@@ -227,7 +231,6 @@ impl Network {
                 self.name,
                 oldest.as_secs_f64()
             ));
-            self.said.extend(cells);
         }
         if let Some(longest) = back.iter().map(|(_, length)| *length).max() {
             let cells: Vec<_> = back.into_iter().map(|(cell, _)| cell).collect();
@@ -386,6 +389,7 @@ mod tests {
         let half = [Some((Some(0), 0)), None, Some((Some(1), 1))];
         assert_eq!(look(&mut network, &half), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
         assert_eq!(network.without_way().count(), 0);
+        assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a way to a root again, after 1.0 s"]);
         assert_eq!(network.longest, Duration::from_millis(800));
     }
 }
