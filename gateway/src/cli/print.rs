@@ -145,6 +145,23 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
         let more = format!("{} resent, {} overheard, {} stale", sums.resent, sums.overheard, sums.stale);
         rows.row(format!("sums from {} roots", sums.roots), sums.first, more);
+        let on_the_bus = sums.received + bus.uplink.unheard;
+        let plainly =
+            format!("the gateway took {}: the tree spares it frames, and a shared bus none", sums.received);
+        rows.row("sums on the bus, of all cells", on_the_bus, plainly);
+        if let Some(network) = &bus.network {
+            let organised =
+                network.organised_s.map_or_else(|| "never whole".to_owned(), |s| format!("in {s:.2} s"));
+            let changes = format!("{organised}, {} changes of parents", network.parent_changes);
+            rows.row("tree, wires deep", network.deepest, changes);
+            let without: Vec<_> = network.without_way.iter().map(u8::to_string).collect();
+            if !without.is_empty() {
+                rows.row("cells without a way to a root", without.join(" "), "no sum holds them");
+            }
+            for difference in &network.differences {
+                rows.row("not as described", difference, "");
+            }
+        }
         rows.row("last sum after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
         return;
     }
