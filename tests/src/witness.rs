@@ -210,6 +210,12 @@ impl Witness {
             Message::Joints { epoch, .. } if self.broadcasts.last() == Some(&epoch) => {}
             Message::Joints { epoch, .. } => {
                 self.tally.broadcasts += 1;
+                // So many broadcasts did not stand on the bus that the loop has let go of everything meanwhile.
+                let recent = self.broadcasts.iter().rev().take(LATEST);
+                let passed = recent.map(|&before| epoch.since(before)).min().unwrap_or(1);
+                if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
+                    self.mirrors.iter_mut().for_each(Mirror::let_go);
+                }
                 self.broadcasts.push(epoch);
                 let newest = self.broadcasts.len() - 1;
                 for mirror in &mut self.mirrors {

@@ -646,7 +646,9 @@ impl Table {
 
     /// What the loop has let go while the bus carried no joints does not come back with the next ones that it carries.
     fn let_go_of_what_is_over(&mut self, epoch: Epoch) {
-        let gap = self.broadcast.map_or(0, |before| epoch.since(before.epoch));
+        // Broadcasts may change places on the way back: the newest is not always the last that came.
+        let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
+        let gap = recent.map(|before| epoch.since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
             self.each_cell(Cell::let_go);
