@@ -12,6 +12,7 @@ use protocol::bus::{BusError, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Reply;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
@@ -215,6 +216,13 @@ fn open(
     };
     let (bus, own) = open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?;
     served.extend(own);
+    let sums = options.skin.buses.iter().any(|bus| bus.name == name && bus.reply != Reply::Torque);
+    if sums && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
+        return Err(RunError::Usage(format!(
+            "{name} is real hardware, and the wires between cells that answer with sums are simulated by frames that may \
+             not go there: use a vcan or the embedded bus, or reply = \"torque\""
+        )));
+    }
     Ok(Link::new(bus, wanted))
 }
 
