@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{BusError, Filter, Kinds, Options as BusOptions};
+use protocol::bus::{BusError, BusKind, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
