@@ -15,7 +15,7 @@ use clap::Args;
 use gateway::commission::numbers::{Numbers, renumbered};
 use gateway::commission::{Outcome, Progress, Wish};
 use gateway::run::progress::Progress as Line;
-use protocol::bus::Choice;
+use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
@@ -45,9 +45,10 @@ pub(crate) struct Commission {
     /// Only this bus of the skin's
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
     /// Write nothing: say which cells are there and which would be written
     #[arg(long)]
     dry_run: bool,
@@ -73,9 +74,11 @@ impl Commission {
         let wanted = self.buses(&skin)?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
+        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
+            .and_then(|kinds| kinds.only(skin.buses.iter().map(|bus| bus.name.as_str())))
+            .map_err(Failure::usage)?;
         // All are opened before anybody is told.
-        let benches =
-            wanted.iter().map(|&bus| open(&skin, bus, self.bus_kind)).collect::<Result<Vec<_>, _>>();
+        let benches = wanted.iter().map(|&bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
         let far = Mutex::new(vec![None; benches.len()]);

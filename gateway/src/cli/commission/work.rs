@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use gateway::commission::{Commission, Progress, Report, Wish};
 use gateway::decode::{Decoded, Decoder};
 use gateway::network::Uplinks;
-use protocol::bus::{Bus, BusError, Choice, Filter, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
+use protocol::bus::{Bus, BusError, Filter, GATEWAY_RECEIVE_BUFFER, Inbox, Kinds, Options};
 use protocol::can::{EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::Message;
@@ -45,7 +45,7 @@ pub(super) struct Done {
 }
 
 /// Opens a bus of a skin.
-pub(super) fn open(skin: &Skin, index: usize, kind: Choice) -> Result<Bench, BusError> {
+pub(super) fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let sums = described.is_some_and(|bus| matches!(bus.reply, Reply::Sum { .. }));
@@ -62,7 +62,7 @@ pub(super) fn open(skin: &Skin, index: usize, kind: Choice) -> Result<Bench, Bus
         receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
         ..Options::default()
     };
-    let bus = Bus::open(name, kind, &options)?;
+    let bus = Bus::open(name, kinds.of(name), &options)?;
     if !roots.is_empty() && !bus.is_virtual()? {
         // Simulated wires have no place among real cells, which have real ones.
         roots.clear();
