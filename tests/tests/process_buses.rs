@@ -4,7 +4,7 @@
 
 mod process;
 
-use gateway::generate::Format as Wire;
+use gateway::generate::{Format as Wire, Reply, Wanted, generate};
 use process::buses::{Listener, carries, mixed_skin};
 use process::{PRESSED, Place, Running, signal, skin_of, until};
 use protocol::can::Format;
@@ -91,6 +91,23 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     let summary = place.summary();
     assert_eq!(summary.total("/loop/bad_cycles"), 0, "{:#}", summary.0);
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
+}
+
+#[test]
+fn each_bus_has_a_tree_of_its_own_which_is_whole_again_when_the_bus_is_back() {
+    let place = place();
+    let wanted = Wanted { cells: CELLS, buses: 3, reply: Reply::Sum, ..Wanted::default() };
+    place.write("skin.toml", &mixed_skin(&generate(&wanted).unwrap(), &["vcan1"]));
+    let bench = place.running_bench(60.0, "");
+    let whole = || listeners(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
+    whole();
+    let cells = bench.cells();
+    signal(server(&place, "vcan1"), Signal::KILL);
+    bench.hears("vcan1 works again");
+    whole();
+    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    ended_well(&place, bench, None, 1);
+    assert_eq!(place.summary().total("/loop/bad_cycles"), 0, "{:#}", place.summary().0);
 }
 
 #[test]

@@ -492,7 +492,8 @@ impl Cell {
 
     /// The bus is lost: what is still due may have been said and not carried.
     pub(super) fn interrupt(&mut self) {
-        let due = u64::from(self.due.count_ones());
+        // What it owes to a sum is missing there.
+        let due = if self.summed { 0 } else { u64::from(self.due.count_ones()) };
         self.replies.missing += due;
         self.replies.in_doubt += due;
         self.due = 0;

@@ -104,6 +104,11 @@ impl Listener {
         });
     }
 
+    /// Waits for a sum of so many cells.
+    pub(crate) fn waits_for_a_sum_of(&self, cells: u8) {
+        self.waits_until("a sum", |message| matches!(message, Message::Sum { count, .. } if *count == cells));
+    }
+
     /// Waits for so many joints.
     pub(crate) fn waits_for_joints(&self, mut count: u32) {
         self.waits_until("joints", |message| {
