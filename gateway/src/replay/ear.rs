@@ -30,6 +30,8 @@ pub(super) fn hear(
     realtime::prepare_receiver();
     let mut inbox = Inbox::new();
     let mut decoder = Decoder::new(Some(format));
+    // Its cells may be there already, and organise themselves as they come.
+    roots.iter_mut().for_each(Roots::explore);
     while !hall.deaf.load(Ordering::Relaxed) {
         if let Some(roots) = &mut roots {
             roots.speak(bus);
