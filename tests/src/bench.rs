@@ -9,7 +9,7 @@
 //! A receiver's frames come in the wire's order, however long each takes, unless a fault delays or
 //! reorders them. Frames that nobody's filters let through are not delivered.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 use cell_node::node::{Flash, Identity};
 use gateway::scenario::{Scenario, contact_words};
@@ -22,6 +22,7 @@ use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use crate::agenda::Agenda;
 use crate::fault::{Fault, Faults, Party};
 use crate::gateway::Gateway;
 use crate::seat::Seat;
@@ -114,10 +115,8 @@ pub struct Bench {
     pub witness: Witness,
     /// All that stood on the wire.
     pub wire: Vec<OnTheWire>,
-    now: Micros,
+    agenda: Agenda<Event>,
     format: Format,
-    events: BTreeMap<(Micros, u64), Event>,
-    scheduled: u64,
     packets: u64,
     free: Micros,
     held: Option<Sent>,
@@ -151,10 +150,8 @@ impl Bench {
             faults: Faults::new(seed),
             witness: Witness::new(skin),
             wire: Vec::new(),
-            now: Micros(0),
+            agenda: Agenda::default(),
             format: skin.buses.first().expect("a skin has a bus").format,
-            events: BTreeMap::new(),
-            scheduled: 0,
             packets: 0,
             free: Micros(0),
             held: None,
@@ -169,7 +166,7 @@ impl Bench {
             let seat = bench.add(identity, Flash::Sound(skin.parameters(cell)));
             bench.at(start(place), Act::Start(seat));
         }
-        bench.schedule(Micros(0), Event::Look);
+        bench.agenda.enter(Micros(0), Event::Look);
         bench
     }
 
@@ -187,7 +184,7 @@ impl Bench {
     /// What time it is.
     #[must_use]
     pub const fn now(&self) -> Micros {
-        self.now
+        self.agenda.now
     }
 
     /// From one broadcast to the next.
@@ -203,12 +200,12 @@ impl Bench {
 
     /// Something is done at a time.
     pub fn at(&mut self, at: Micros, act: Act) {
-        self.schedule(at, Event::Act(Box::new(act)));
+        self.agenda.enter(at, Event::Act(Box::new(act)));
     }
 
     /// Something is done now.
     pub fn act(&mut self, act: Act) {
-        self.at(self.now, act);
+        self.at(self.agenda.now, act);
         self.run(Span(0));
     }
 
@@ -234,9 +231,9 @@ impl Bench {
     /// # Panics
     /// When that takes more than two seconds.
     pub fn settle(&mut self) {
-        let give_up = self.now + Span::from_millis(2_000);
+        let give_up = self.agenda.now + Span::from_millis(2_000);
         while !self.is_settled() {
-            assert!(self.now < give_up, "cells that never settle: {:?}", self.gateway.table.cells());
+            assert!(self.agenda.now < give_up, "cells that never settle: {:?}", self.gateway.table.cells());
             self.run(LOOK);
         }
     }
@@ -251,7 +248,7 @@ impl Bench {
     pub fn begin(&mut self) {
         if !self.ticking {
             self.ticking = true;
-            self.schedule(self.now, Event::Tick);
+            self.agenda.enter_in(Span(0), Event::Tick);
         }
     }
 
@@ -270,16 +267,11 @@ impl Bench {
 
     /// Runs for some time.
     pub fn run(&mut self, span: Span) {
-        let until = self.now + span;
-        while let Some(entry) = self.events.first_entry() {
-            if entry.key().0 > until {
-                break;
-            }
-            let ((at, _), event) = entry.remove_entry();
-            self.now = at;
+        let until = self.agenda.now + span;
+        while let Some(event) = self.agenda.take_until(until) {
             self.handle(event);
         }
-        self.now = until;
+        self.agenda.now = until;
     }
 
     /// The loop ends; the cells say their last words, as at the end of every run.
@@ -290,13 +282,8 @@ impl Bench {
         self.run(Span::from_millis(100));
         self.act(Act::Say(Message::Sync));
         self.run(Span::from_millis(150));
-        self.gateway.table.handle_time(self.now);
+        self.gateway.table.handle_time(self.agenda.now);
         self.gateway.table.finish();
-    }
-
-    fn schedule(&mut self, at: Micros, event: Event) {
-        self.scheduled += 1;
-        self.events.insert((at.max(self.now), self.scheduled), event);
     }
 
     fn handle(&mut self, event: Event) {
@@ -305,20 +292,20 @@ impl Bench {
             Event::Deliver(delivery) => self.deliver(delivery),
             Event::Wake(seat) => self.wake(seat),
             Event::Tick if self.ticking => {
-                let messages = self.gateway.turn(self.now);
-                self.witness.check_sum(self.now, &self.gateway.table.snapshot().sums);
+                let messages = self.gateway.turn(self.agenda.now);
+                self.witness.check_sum(self.agenda.now, &self.gateway.table.snapshot().sums);
                 self.say(&messages);
-                self.schedule(self.now + self.gateway.period(), Event::Tick);
+                self.agenda.enter_in(self.gateway.period(), Event::Tick);
             }
             Event::Tick => {}
             Event::Look => {
                 let known = self.gateway.notices.len();
-                let messages = self.gateway.look(self.now);
+                let messages = self.gateway.look(self.agenda.now);
                 for (_, notice) in self.gateway.notices.iter().skip(known) {
                     self.witness.notice(*notice);
                 }
                 self.say(&messages);
-                self.schedule(self.now + LOOK, Event::Look);
+                self.agenda.enter_in(LOOK, Event::Look);
             }
             Event::Act(act) => self.perform(*act),
         }
@@ -328,21 +315,21 @@ impl Bench {
         let of = |bench: &mut Self, seat: usize, packets: Vec<Packet>| bench.sends(seat, &packets);
         match act {
             Act::Say(message) => self.say(&[message]),
-            Act::Inject(message) => self.packets(Party::Stranger, 0, self.now, &[message.encode()]),
+            Act::Inject(message) => self.packets(Party::Stranger, 0, self.agenda.now, &[message.encode()]),
             Act::Babble(frame) => {
                 let from = Party::Stranger;
                 let truth = Truth { from, life: 0, packet: None, number: 0, half: 0, damage: None };
-                self.schedule(self.now, Event::Send(Sent { frame, truth }, true));
+                self.agenda.enter_in(Span(0), Event::Send(Sent { frame, truth }, true));
             }
             Act::Kill(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::kill),
             Act::Hang(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::hang),
             Act::Start(seat) => {
-                let now = self.now;
+                let now = self.agenda.now;
                 self.seats.get_mut(seat).into_iter().for_each(|seat| seat.start(now));
                 of(self, seat, Vec::new());
             }
             Act::GoOn(seat) => {
-                let now = self.now;
+                let now = self.agenda.now;
                 let packets = self.seats.get_mut(seat).map(|seat| seat.go_on(now)).unwrap_or_default();
                 of(self, seat, packets);
             }
@@ -350,7 +337,7 @@ impl Bench {
     }
 
     fn wake(&mut self, seat: usize) {
-        let now = self.now;
+        let now = self.agenda.now;
         let Some(there) = self.seats.get_mut(seat) else { return };
         there.wake = None;
         let packets = there.time(now);
@@ -360,20 +347,21 @@ impl Bench {
     /// A cell's packets go out when it has thought, and its next timer is set.
     fn sends(&mut self, seat: usize, packets: &[Packet]) {
         let Some(there) = self.seats.get_mut(seat) else { return };
-        let (life, at) = (there.lives, self.now + there.thinks);
-        let timeout = there.node().filter(|_| there.runs()).map(|node| node.poll_timeout().max(self.now));
+        let (life, at) = (there.lives, self.agenda.now + there.thinks);
+        let timeout =
+            there.node().filter(|_| there.runs()).map(|node| node.poll_timeout().max(self.agenda.now));
         if let Some(timeout) = timeout
             && there.wake != Some(timeout)
         {
             there.wake = Some(timeout);
-            self.schedule(timeout, Event::Wake(seat));
+            self.agenda.enter(timeout, Event::Wake(seat));
         }
         self.packets(Party::Seat(seat), life, at, packets);
     }
 
     fn say(&mut self, messages: &[Message]) {
         let packets: Vec<_> = messages.iter().map(Message::encode).collect();
-        self.packets(Party::Gateway, 0, self.now, &packets);
+        self.packets(Party::Gateway, 0, self.agenda.now, &packets);
     }
 
     fn packets(&mut self, from: Party, life: u32, at: Micros, packets: &[Packet]) {
@@ -382,7 +370,7 @@ impl Bench {
             for (half, frame) in packet.frames(self.format).enumerate() {
                 let truth =
                     Truth { from, life, packet: Some(*packet), number: self.packets, half, damage: None };
-                self.schedule(at, Event::Send(Sent { frame, truth }, true));
+                self.agenda.enter(at, Event::Send(Sent { frame, truth }, true));
             }
         }
     }
@@ -390,7 +378,7 @@ impl Bench {
     /// A frame wants a place on the wire.
     fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
         if may_be_hit {
-            let fate = self.faults.fate(self.now, sent.truth.from, None, sent.frame);
+            let fate = self.faults.fate(self.agenda.now, sent.truth.from, None, sent.frame);
             sent.frame = fate.frame;
             sent.truth = sent.truth.and(fate.damage);
             if fate.after_next && fate.times > 0 && self.held.is_none() {
@@ -398,7 +386,7 @@ impl Bench {
                 return;
             }
             for _ in 0..fate.times {
-                self.schedule(self.now + fate.delay, Event::Send(sent, false));
+                self.agenda.enter_in(fate.delay, Event::Send(sent, false));
             }
             return;
         }
@@ -410,7 +398,7 @@ impl Bench {
 
     /// A frame has its place in the order, and goes to whoever hears it.
     fn stand(&mut self, sent: &Sent) {
-        let stood = self.now.max(self.free);
+        let stood = self.agenda.now.max(self.free);
         self.free = stood + FRAME;
         let from = sent.truth.from;
         self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
@@ -425,7 +413,7 @@ impl Bench {
 
     /// From the wire to one receiver.
     fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
-        let fate = self.faults.fate(self.now, sent.truth.from, Some(to), sent.frame);
+        let fate = self.faults.fate(self.agenda.now, sent.truth.from, Some(to), sent.frame);
         let latency = Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let mut at = stood + latency;
         if let Some(inlet) = self.inlet(to) {
@@ -437,7 +425,7 @@ impl Bench {
         let sent = Sent { frame: fate.frame, truth: sent.truth.and(fate.damage) };
         for _ in 0..fate.times {
             let delivery = Delivery { to, stood, sent, after_next: fate.after_next };
-            self.schedule(at + fate.delay, Event::Deliver(delivery));
+            self.agenda.enter(at + fate.delay, Event::Deliver(delivery));
         }
     }
 
@@ -465,7 +453,7 @@ impl Bench {
                     self.witness.hear(stood, &truth, &frame);
                 }
                 Party::Seat(seat) => {
-                    let now = self.now;
+                    let now = self.agenda.now;
                     let Some(there) = self.seats.get_mut(seat) else { return };
                     let packets = there.hear(now, stood, frame);
                     self.sends(seat, &packets);
@@ -479,7 +467,7 @@ impl Bench {
     #[must_use]
     pub fn transcript(&self) -> String {
         let lines = self.wire.iter().map(|it| format!("{} {:?} {:?}\n", it.at.0, it.from, it.frame));
-        let end = format!("{:?}\n{:?}\n{:?}", self.gateway, self.seats, self.now);
+        let end = format!("{:?}\n{:?}\n{:?}", self.gateway, self.seats, self.agenda.now);
         lines.chain([end]).collect()
     }
 

@@ -14,6 +14,7 @@
 //! same run, byte for byte. [`accounts::check`] holds what must be true of every run, whatever was broken.
 
 pub mod accounts;
+mod agenda;
 pub mod bench;
 pub mod fault;
 pub mod gateway;

@@ -12,7 +12,7 @@
     reason = "a harness may stop when it is asked for what is not there; of messages it wants three"
 )]
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
@@ -30,6 +30,8 @@ use protocol::wire::{PORTS, PortMessage, UPLINK};
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+
+use crate::agenda::Agenda;
 
 /// From one broadcast to the next.
 pub const PERIOD: Span = Span(16_000);
@@ -121,9 +123,7 @@ pub struct Wiring {
     pub deepest: u8,
     uplinks: Uplinks,
     root_sums: HashMap<usize, (Words, u128)>,
-    now: Micros,
-    events: BTreeMap<(Micros, u64), Event>,
-    scheduled: u64,
+    agenda: Agenda<Event>,
     gateway_newest: Micros,
     epoch: Option<Epoch>,
     ticking: bool,
@@ -144,15 +144,13 @@ impl Wiring {
             deepest: 0,
             uplinks: Uplinks::new(0, 0, Micros(0)),
             root_sums: HashMap::new(),
-            now: Micros(0),
-            events: BTreeMap::new(),
-            scheduled: 0,
+            agenda: Agenda::default(),
             gateway_newest: Micros(0),
             epoch: None,
             ticking: false,
             dice,
         };
-        wiring.schedule(Micros(0), Event::GatewayWake);
+        wiring.agenda.enter(Micros(0), Event::GatewayWake);
         wiring
     }
 
@@ -206,7 +204,7 @@ impl Wiring {
     pub fn add_root(&mut self, cell: usize) {
         self.cells[cell].wires[UPLINK] = Some(End::Gateway(self.roots.len()));
         self.roots.push(cell);
-        self.uplinks = Uplinks::new(self.roots.len(), 0, self.now);
+        self.uplinks = Uplinks::new(self.roots.len(), 0, self.agenda.now);
     }
 
     /// A broken direction of a wire: what `cell` says through `port` is not heard.
@@ -225,13 +223,13 @@ impl Wiring {
         let request = Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
         let message = Message::Configure { to: protocol::id::Node::Cell(number), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
-        self.hand(cell, self.now, Inlet::Frame(frame));
+        self.hand(cell, self.agenda.now, Inlet::Frame(frame));
     }
 
     /// What time it is.
     #[must_use]
     pub const fn now(&self) -> Micros {
-        self.now
+        self.agenda.now
     }
 
     /// Whether a cell works.
@@ -242,7 +240,7 @@ impl Wiring {
 
     /// A cell is switched on, or off and on.
     pub fn start(&mut self, cell: usize) {
-        let (now, place) = (self.now, &mut self.cells[cell]);
+        let (now, place) = (self.agenda.now, &mut self.cells[cell]);
         let identity = Identity { cell: place.number, serial: place.serial };
         let wired = place.wires.iter().enumerate().filter(|(_, wire)| wire.is_some());
         let wired = wired.map(|(port, _)| 1 << port).sum();
@@ -283,35 +281,25 @@ impl Wiring {
         }
     }
 
-    fn schedule(&mut self, at: Micros, event: Event) {
-        self.scheduled += 1;
-        self.events.insert((at.max(self.now), self.scheduled), event);
-    }
-
     /// Runs for some time.
     pub fn run(&mut self, span: Span) {
-        let until = self.now + span;
-        while let Some(entry) = self.events.first_entry() {
-            if entry.key().0 > until {
-                break;
-            }
-            let ((at, _), event) = entry.remove_entry();
-            self.now = at;
+        let until = self.agenda.now + span;
+        while let Some(event) = self.agenda.take_until(until) {
             self.happen(event);
         }
-        self.now = until;
+        self.agenda.now = until;
     }
 
     fn happen(&mut self, event: Event) {
         match event {
             Event::Wake(cell) => {
-                if self.cells[cell].wake == Some(self.now) {
+                if self.cells[cell].wake == Some(self.agenda.now) {
                     self.cells[cell].wake = None;
                     self.pass(cell);
                 }
             }
             Event::Deliver(cell, inlet) => {
-                let now = self.now;
+                let now = self.agenda.now;
                 if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
                     waiting.push_back((now, inlet));
                 } else {
@@ -319,14 +307,14 @@ impl Wiring {
                 }
             }
             Event::ToGateway(root, message) => {
-                self.uplinks.handle(self.now, root, message);
+                self.uplinks.handle(self.agenda.now, root, message);
                 self.gateway_says();
             }
             Event::GatewayWake => {
-                self.uplinks.handle_time(self.now);
+                self.uplinks.handle_time(self.agenda.now);
                 self.gateway_says();
-                let next = self.uplinks.poll_timeout().max(self.now + Span(500));
-                self.schedule(next, Event::GatewayWake);
+                let next = self.uplinks.poll_timeout().max(self.agenda.now + Span(500));
+                self.agenda.enter(next, Event::GatewayWake);
             }
             Event::Joints if self.ticking => self.broadcast(),
             Event::Joints => {}
@@ -334,7 +322,7 @@ impl Wiring {
     }
 
     fn pass(&mut self, cell: usize) {
-        let now = self.now;
+        let now = self.agenda.now;
         if let Life::Runs(node) = &mut self.cells[cell].life {
             node.handle_timeout(now);
         }
@@ -342,7 +330,7 @@ impl Wiring {
     }
 
     fn hand(&mut self, cell: usize, stood: Micros, inlet: Inlet) {
-        let now = self.now;
+        let now = self.agenda.now;
         let place = &mut self.cells[cell];
         if let Life::Runs(node) = &mut place.life {
             match inlet {
@@ -371,10 +359,10 @@ impl Wiring {
         while let Some(packet) = node.poll_transmit() {
             packets.push(packet);
         }
-        let timeout = node.poll_timeout().max(self.now + Span(1));
+        let timeout = node.poll_timeout().max(self.agenda.now + Span(1));
         if place.wake != Some(timeout) {
             place.wake = Some(timeout);
-            self.schedule(timeout, Event::Wake(cell));
+            self.agenda.enter(timeout, Event::Wake(cell));
         }
         for (port, message) in messages {
             let end = self.cells[cell].wires[port].expect("a wired port");
@@ -384,11 +372,11 @@ impl Wiring {
             match end {
                 End::Cell(other, at) => {
                     let at_time = self.arrival(Some(other));
-                    self.schedule(at_time, Event::Deliver(other, Inlet::Port(at, message)));
+                    self.agenda.enter(at_time, Event::Deliver(other, Inlet::Port(at, message)));
                 }
                 End::Gateway(root) => {
                     let at = self.arrival(None);
-                    self.schedule(at, Event::ToGateway(root, message));
+                    self.agenda.enter(at, Event::ToGateway(root, message));
                 }
             }
         }
@@ -412,7 +400,7 @@ impl Wiring {
 
     /// When something that is said now comes in; what was said before comes in before.
     fn arrival(&mut self, at: Option<usize>) -> Micros {
-        let arrives = self.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        let arrives = self.agenda.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
         *newest = arrives.max(*newest);
         *newest
@@ -443,11 +431,11 @@ impl Wiring {
             };
             if hears {
                 let at = self.arrival(Some(other));
-                self.schedule(at, Event::Deliver(other, Inlet::Frame(frame)));
+                self.agenda.enter(at, Event::Deliver(other, Inlet::Frame(frame)));
             }
         }
         let root = self.roots.iter().position(|&root| root == cell);
-        if root.is_some_and(|root| self.uplinks.takes(root)) && self.epoch == Some(epoch) {
+        if root.is_some_and(|root| self.uplinks.is_child(root)) && self.epoch == Some(epoch) {
             let best = self.root_sums.entry(cell).or_insert((words, cells));
             if words.count >= best.0.count {
                 *best = (words, cells);
@@ -497,7 +485,7 @@ impl Wiring {
             cells,
             TWICE,
             "cell {cell} counts a cell twice in {epoch:?} at {:?}: {words:?} of {heard:?}; {}",
-            self.now,
+            self.agenda.now,
             self.ways()
         );
         cells
@@ -510,7 +498,7 @@ impl Wiring {
             }
             let cell = self.roots[root];
             let at = self.arrival(Some(cell));
-            self.schedule(at, Event::Deliver(cell, Inlet::Port(UPLINK, message)));
+            self.agenda.enter(at, Event::Deliver(cell, Inlet::Port(UPLINK, message)));
         }
     }
 
@@ -519,7 +507,7 @@ impl Wiring {
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         for cell in 0..self.cells.len() {
             let at = self.arrival(Some(cell));
-            self.schedule(at, Event::Deliver(cell, Inlet::Frame(frame)));
+            self.agenda.enter(at, Event::Deliver(cell, Inlet::Frame(frame)));
         }
     }
 
@@ -530,13 +518,13 @@ impl Wiring {
         self.took.push(Took::default());
         let joints = Joints { positions: POSITIONS.map(Q1_14::nearest), in_use: 6 };
         self.say(&Message::Joints { epoch, joints });
-        self.schedule(self.now + PERIOD, Event::Joints);
+        self.agenda.enter_in(PERIOD, Event::Joints);
     }
 
     /// Joints are sent from now on.
     pub fn begin(&mut self) {
         self.ticking = true;
-        self.schedule(self.now, Event::Joints);
+        self.agenda.enter_in(Span(0), Event::Joints);
     }
 
     /// Every cell is told to answer with sums.

@@ -1,8 +1,6 @@
 //! Where cells are commissioned in virtual time: real [`Node`]s, a bus that loses, repeats and damages by seeded
 //! chance, and a hand that switches cells, and the commissioning, off and on.
 
-use std::collections::BTreeMap;
-
 use cell_node::node::{Flash, Identity, Node};
 use gateway::commission::{Commission, Report, Wish};
 use gateway::decode::{Decoded, Decoder};
@@ -15,6 +13,8 @@ use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+
+use crate::agenda::Agenda;
 
 /// From the wire to a receiver, at least and at most.
 const LATENCY: (u64, u64) = (40, 300);
@@ -72,10 +72,8 @@ pub struct Workshop {
     pub forgers: Option<(Forger, Forger)>,
     /// Messages that cells and the gateway's side said.
     pub said: u64,
-    now: Micros,
+    agenda: Agenda<Event>,
     format: Format,
-    events: BTreeMap<(Micros, u64), Event>,
-    scheduled: u64,
     gateway_newest: Micros,
     dice: Pcg64Mcg,
 }
@@ -91,10 +89,8 @@ impl Workshop {
             damage: 0.0,
             forgers: None,
             said: 0,
-            now: Micros(0),
+            agenda: Agenda::default(),
             format,
-            events: BTreeMap::new(),
-            scheduled: 0,
             gateway_newest: Micros(0),
             dice: Pcg64Mcg::seed_from_u64(seed),
         }
@@ -122,7 +118,7 @@ impl Workshop {
     /// What time it is.
     #[must_use]
     pub const fn now(&self) -> Micros {
-        self.now
+        self.agenda.now
     }
 
     /// A whole number below `bound`, by chance.
@@ -132,21 +128,16 @@ impl Workshop {
 
     /// Switches a cell off in a while.
     pub fn switch_off_in(&mut self, span: Span, place: usize) {
-        self.schedule(self.now + span, Event::Off(place));
+        self.agenda.enter_in(span, Event::Off(place));
     }
 
     /// Switches a cell on in a while; off before, if it is on.
     pub fn switch_on_in(&mut self, span: Span, place: usize) {
-        self.schedule(self.now + span, Event::On(place));
-    }
-
-    fn schedule(&mut self, at: Micros, event: Event) {
-        self.scheduled += 1;
-        self.events.insert((at.max(self.now), self.scheduled), event);
+        self.agenda.enter_in(span, Event::On(place));
     }
 
     fn switch_on(&mut self, place: usize) {
-        let (now, format) = (self.now, self.format);
+        let (now, format) = (self.agenda.now, self.format);
         if let Some(piece) = self.pieces.get_mut(place) {
             piece.node = Some(Node::new(piece.identity, format, &piece.flash, true, now));
         }
@@ -154,11 +145,11 @@ impl Workshop {
 
     /// Lets cells be for some time, with nobody who commissions them.
     pub fn rest(&mut self, span: Span) {
-        let until = self.now + span;
+        let until = self.agenda.now + span;
         while let Some(at) = self.next().filter(|&at| at <= until) {
             self.step(at, &mut |_, _| {});
         }
-        self.now = until;
+        self.agenda.now = until;
     }
 
     /// Commissions until it is over, or is killed after a time.
@@ -166,18 +157,18 @@ impl Workshop {
     /// # Panics
     /// When it does not end.
     pub fn commission(&mut self, skin: &Skin, wish: Wish, killed_after: Option<Span>) -> Report {
-        let mut commission = Commission::new(skin, 0, wish, 1_000, self.now);
+        let mut commission = Commission::new(skin, 0, wish, 1_000, self.agenda.now);
         let mut decoder = Decoder::new(Some(self.format));
-        let (began, end) = (self.now, killed_after.map(|span| self.now + span));
+        let (began, end) = (self.agenda.now, killed_after.map(|span| self.agenda.now + span));
         loop {
-            commission.handle_time(self.now);
+            commission.handle_time(self.agenda.now);
             while let Some(message) = commission.poll_transmit() {
                 self.say(&message);
             }
             let Some(timeout) = commission.poll_timeout() else { return commission.report() };
-            let at = timeout.min(self.next().unwrap_or(timeout)).max(self.now);
+            let at = timeout.min(self.next().unwrap_or(timeout)).max(self.agenda.now);
             if let Some(end) = end.filter(|&end| end <= at) {
-                self.now = end;
+                self.agenda.now = end;
                 return commission.report();
             }
             assert!(at.since(began) < PATIENCE, "it does not end: {commission:#?}");
@@ -192,14 +183,14 @@ impl Workshop {
     /// When something happens next.
     fn next(&self) -> Option<Micros> {
         let timers = self.pieces.iter().filter_map(|piece| Some(piece.node.as_ref()?.poll_timeout()));
-        timers.chain(self.events.keys().next().map(|(at, _)| *at)).min()
+        timers.chain(self.agenda.next()).min()
     }
 
     fn step(&mut self, at: Micros, gateway: &mut impl FnMut(Micros, Frame)) {
-        self.now = at.max(self.now);
-        let now = self.now;
-        while let Some(entry) = self.events.first_entry().filter(|entry| entry.key().0 <= now) {
-            match entry.remove() {
+        self.agenda.now = at.max(self.agenda.now);
+        let now = self.agenda.now;
+        while let Some(event) = self.agenda.take_until(now) {
+            match event {
                 Event::ToGateway(frame) => gateway(now, frame),
                 Event::ToCell(place, frame) => {
                     let node = self.pieces.get_mut(place).and_then(|piece| piece.node.as_mut());
@@ -277,19 +268,19 @@ impl Workshop {
             for frame in self.fate(frame) {
                 let at = self.arrival(self.pieces.get(place).map(|piece| piece.newest));
                 self.pieces.get_mut(place).into_iter().for_each(|piece| piece.newest = at);
-                self.schedule(at, Event::ToCell(place, frame));
+                self.agenda.enter(at, Event::ToCell(place, frame));
             }
         }
         if from.is_some() {
             for frame in self.fate(frame) {
                 self.gateway_newest = self.arrival(Some(self.gateway_newest));
-                self.schedule(self.gateway_newest, Event::ToGateway(frame));
+                self.agenda.enter(self.gateway_newest, Event::ToGateway(frame));
             }
         }
     }
 
     fn arrival(&mut self, newest: Option<Micros>) -> Micros {
-        let at = self.now + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        let at = self.agenda.now + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         newest.map_or(at, |newest| at.max(newest))
     }
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 
 use protocol::bus::Filter;
-use protocol::can::{EXTENDED, EXTENDED_MASK, REMOTE};
+use protocol::can::{EXTENDED, REMOTE};
 use protocol::id::Id;
 use protocol::wire::{FLAG, Lane};
 
@@ -47,14 +47,11 @@ impl Ears {
         let ids: BTreeSet<_> = self.by_id.keys().copied().collect();
         let lanes: BTreeSet<_> = self.by_lane.keys().copied().collect();
         if ids.len() + lanes.len() <= Filter::MAX {
-            let lane = |lane: Lane| Filter { id: lane.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE };
-            return ids.into_iter().map(Filter::exact).chain(lanes.into_iter().map(lane)).collect();
+            return ids.into_iter().map(Filter::exact).chain(lanes.into_iter().map(Filter::lane)).collect();
         }
         let kinds: BTreeSet<_> = ids.into_iter().map(|id| id.kind).collect();
-        let of_kind =
-            |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
         let wires = (!lanes.is_empty()).then_some(ALL_WIRES);
-        kinds.into_iter().map(of_kind).chain(wires).collect()
+        kinds.into_iter().map(Filter::kind).chain(wires).collect()
     }
 }
 

@@ -10,17 +10,20 @@
 //! exploration. A cell without a parent asks the nearest port whose label is better than every label that it had
 //! itself (join, grant). Labels only improve, and a parent's is better than its child's: so there is never a
 //! circle, whatever is lost or late. While no sums go up, a cell moves to a port that is nearer than its parent, so
-//! that the tree does not stay deeper than it must. Where no label is good enough, the cell asks for a new round (seek), which
-//! goes up to the gateway and comes down as better labels for all.
+//! that the tree does not stay deeper than it must. Where no label is good enough, the cell asks for a new round
+//! (seek), which goes up to the gateway and comes down as better labels for all.
 
+mod numbers;
 mod port;
+mod way;
 
 use heapless::Deque;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK, Walk};
+use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK};
 
+use numbers::Walking;
 use port::Port;
 
 /// From one hello to the next.
@@ -51,14 +54,6 @@ pub enum Lost {
 struct Parent {
     port: usize,
     label: Label,
-}
-
-/// A walk that gives numbers, while it is with this cell and those below it.
-#[derive(Clone, Copy, Debug)]
-struct Walking {
-    walk: Walk,
-    /// The port that has it now.
-    at: usize,
 }
 
 /// A cell's part of the network.
@@ -146,10 +141,10 @@ impl Network {
         self.busy = busy;
     }
 
-    /// Whether a port hears nothing.
+    /// Whether something can come in through a port: it is wired, and not deaf.
     #[must_use]
-    pub const fn is_deaf(&self, port: usize) -> bool {
-        self.deaf >> port & 1 != 0
+    pub const fn hears(&self, port: usize) -> bool {
+        self.wired & !self.deaf & 1 << port != 0
     }
 
     /// The port whose other end hears this cell's sums.
@@ -303,15 +298,8 @@ impl Network {
         }
     }
 
-    fn is_unnumbered(&self) -> bool {
-        self.number == 0 || self.ports.iter().any(Port::is_unnumbered)
-    }
-
-    /// Takes what came in through a port, except what is about sums: `State` and `Missed`.
+    /// Takes what came in through a port that hears, except what is about sums: `State` and `Missed`.
     pub fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
-        if self.wired >> port & 1 == 0 || self.is_deaf(port) {
-            return;
-        }
         match message {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
             PortMessage::Join => self.let_in(now, port),
@@ -367,174 +355,6 @@ impl Network {
             },
             Some(parent) => self.improve(now, port, parent),
             None => self.search(now),
-        }
-    }
-
-    /// A port that is nearer than the parent is asked, when nothing is lost by moving.
-    fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
-        let label = self.ports.get(port).and_then(|port| port.label(now));
-        let nearer = label.is_some_and(|label| label.is_better_than(parent.label));
-        if nearer && !self.busy && self.joining.is_none() {
-            self.joining = Some((port, now));
-            self.say(port, PortMessage::Join);
-        }
-    }
-
-    /// The parent's label is this: those below hear it when that is news.
-    fn follow(&mut self, now: Micros, port: usize, label: Label) {
-        let news = self.parent.is_none_or(|parent| parent.label != label);
-        self.parent = Some(Parent { port, label });
-        if news {
-            self.best = Some(label.below());
-            self.tree_changed = true;
-            self.hello_to_all(now);
-        }
-    }
-
-    fn let_in(&mut self, now: Micros, port: usize) {
-        let label = self.parent.filter(|parent| parent.port != port).map(|parent| parent.label.below());
-        let number = self.number_at(port);
-        match label {
-            Some(label) => {
-                // Two wires may lead to the same cell, whose sums come by one of them.
-                for (other, there) in self.ports.iter_mut().enumerate() {
-                    if other == port {
-                        there.adopt(now);
-                    } else if number.is_some() && there.number() == number {
-                        there.disown();
-                    }
-                }
-                self.tree_changed = true;
-                self.say(port, PortMessage::Grant(label));
-            }
-            None => self.say(port, PortMessage::Refuse),
-        }
-    }
-
-    fn is_good(&self, label: Label) -> bool {
-        self.best.is_none_or(|best| label.is_better_than(best))
-    }
-
-    fn join(&mut self, now: Micros, port: usize, label: Label) {
-        if self.up() == Some(port) {
-            return;
-        }
-        let moves = self.parent.is_none_or(|parent| !self.busy && label.is_better_than(parent.label));
-        if !moves || !self.is_good(label) {
-            return self.say(port, PortMessage::Leave);
-        }
-        if let Some(before) = self.parent {
-            self.left = Some((before.port, false));
-            self.say(before.port, PortMessage::Leave);
-        }
-        self.joining = None;
-        self.orphan = None;
-        self.seek = None;
-        self.changes = self.changes.wrapping_add(1);
-        self.follow(now, port, label);
-    }
-
-    /// The parent does not take this cell's sums any more: another way has to be found.
-    pub fn lose_parent(&mut self, now: Micros, how: Lost) {
-        let Some(parent) = self.parent.take() else { return };
-        self.tree_changed = true;
-        self.orphan = Some((now, false));
-        self.left = Some((parent.port, how == Lost::Done));
-        self.say(parent.port, PortMessage::Leave);
-        self.distrust(now, parent.port);
-        self.search(now);
-    }
-
-    fn distrust(&mut self, now: Micros, port: usize) {
-        self.ports.get_mut(port).into_iter().for_each(|port| port.distrust(now));
-    }
-
-    /// Asks the nearest port that is good enough, or for a new round where none is.
-    fn search(&mut self, now: Micros) {
-        if self.parent.is_some() {
-            return;
-        }
-        if self.orphan.is_none() {
-            self.orphan = Some((now, false));
-        }
-        if let Some((asked, at)) = self.joining {
-            if now.since(at) < JOIN_PATIENCE {
-                return;
-            }
-            self.joining = None;
-            self.distrust(now, asked);
-        }
-        let labelled = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.label(now)?)));
-        let good = labelled().filter(|(_, label)| self.is_good(*label));
-        let nearest =
-            good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
-        if let Some((port, _)) = nearest {
-            self.joining = Some((port, now));
-            return self.say(port, PortMessage::Join);
-        }
-        // Who never had a way has nothing to compare: the first hello with a label is good enough.
-        let Some(best) = self.best else { return };
-        let (at, wait) = self.seek.unwrap_or((now, SEEK.0));
-        if now >= at {
-            self.seek = Some((now + wait, Span(wait.0 * 2).min(SEEK.1)));
-            for port in 0..ALL {
-                if self.ports.get(port).is_some_and(|port| port.label(now).is_some()) {
-                    self.say(port, PortMessage::Seek(best.round));
-                }
-            }
-        }
-    }
-
-    /// Somebody needs a round later than this one.
-    fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
-        let Some(parent) = self.parent.filter(|parent| parent.port != port) else { return };
-        if parent.label.round.wrapping_sub(round).cast_signed() > 0 {
-            return self.hello(now, port);
-        }
-        if self.passed_on.is_some_and(|(of, at)| of == round && now.since(at) < SEEK.0) {
-            return;
-        }
-        self.passed_on = Some((round, now));
-        self.say(parent.port, PortMessage::Seek(round));
-    }
-
-    /// Numbers are given away: this cell takes the first if it has none, and then each child's turn comes.
-    fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
-        if self.last_walk.replace(walk.walk) == Some(walk.walk) {
-            return;
-        }
-        if self.number == 0 && walk.first <= walk.last {
-            self.number = walk.first;
-            self.given = Some(walk.first);
-            walk.first += 1;
-            self.hello_to_all(now);
-        }
-        self.walk_from(0, walk);
-    }
-
-    fn go_on_walking(&mut self, port: usize, walk: Walk) {
-        if self.walking.is_some_and(|walking| walking.at == port && walking.walk.walk == walk.walk) {
-            self.walk_from(port + 1, walk);
-        }
-    }
-
-    fn walk_from(&mut self, first: usize, walk: Walk) {
-        let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
-        let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
-        self.walking = next.map(|at| Walking { walk, at });
-        match (next, self.up()) {
-            (Some(port), _) => self.say(port, PortMessage::Number(walk)),
-            (None, Some(up)) => self.say(up, PortMessage::Return(walk)),
-            (None, None) => {}
-        }
-    }
-
-    fn tell_unnumbered(&mut self, now: Micros) {
-        let unnumbered = self.is_unnumbered();
-        if core::mem::replace(&mut self.was_unnumbered, unnumbered) != unnumbered
-            && let Some(up) = self.up()
-        {
-            self.hello(now, up);
         }
     }
 

@@ -33,7 +33,7 @@ use crate::contact::Torque;
 use crate::flash::Kept;
 use crate::kernel::Kernel;
 use crate::network::Network;
-use crate::sum::{Begin, Sum, Words};
+use crate::sum::{Sum, Words};
 use configuration::{Configuration, Written};
 use sensing::Sensing;
 use stimuli::{Arrival, Stimuli};
@@ -447,8 +447,7 @@ impl Node {
                 force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));
             let period = Span(in_use.parameters.period_us.into());
             self.active = force.is_active();
-            let begin = Begin { at: now - age, period, ..self.freeze(epoch) };
-            return self.begin_sum(now, &begin, torque);
+            return self.begin_sum(now, age, (epoch, period), torque);
         }
         if !force.is_active() {
             self.end_contact();

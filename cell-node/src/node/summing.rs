@@ -17,7 +17,7 @@ const MISSES: u8 = 2;
 impl Node {
     /// Takes what came in through a port.
     pub fn handle_port(&mut self, now: Micros, port: usize, message: PortMessage) {
-        if !self.network.exists() || self.network.is_deaf(port) {
+        if !self.network.hears(port) {
             return;
         }
         self.network.set_busy(self.sums.is_busy());
@@ -27,14 +27,11 @@ impl Node {
             }
             PortMessage::Missed(epoch) if self.network.up() == Some(port) => self.was_missed(now, epoch),
             PortMessage::State(_) | PortMessage::Missed(_) => {}
-            PortMessage::Leave => {
-                self.sums.disown(port);
-                self.network.handle(now, port, message);
-            }
             PortMessage::Hello(_)
             | PortMessage::Join
             | PortMessage::Grant(_)
             | PortMessage::Refuse
+            | PortMessage::Leave
             | PortMessage::Left
             | PortMessage::Seek(_)
             | PortMessage::Number(_)
@@ -92,13 +89,12 @@ impl Node {
         }
     }
 
-    /// The tree as it is for the sums of an epoch.
-    pub(super) fn freeze(&mut self, epoch: Epoch) -> Begin {
+    /// The tree as it is for the sums of an epoch whose joints stood on the bus at a time.
+    fn freeze(&mut self, epoch: Epoch, at: Micros, period: Span) -> Begin {
         self.said_before = self.sums.said().is_some_and(|(of, _)| of.next() == epoch);
         let up = self.network.up();
         // A parent that was left and may not know it takes no sum from who was silent for an epoch.
-        let was_silent = self.sums.said().is_none_or(|(of, _)| of.next() != epoch);
-        if was_silent {
+        if !self.said_before {
             self.network.forget_left();
         }
         let number = up.and_then(|up| CellId::new(self.network.number_at(up)?.into()).ok());
@@ -106,16 +102,24 @@ impl Node {
         self.heard_parent = false;
         Begin {
             epoch,
-            at: Micros(0),
-            period: Span(0),
+            at,
+            period,
             depth: self.network.depth(),
             speaks: up.is_some() && self.network.is_let_go(),
             children: self.network.children(),
         }
     }
 
-    pub(super) fn begin_sum(&mut self, now: Micros, begin: &Begin, own: Option<Torque>) {
-        self.sums.begin(begin, own.map(|torque| torque.exact()).as_ref());
+    /// New joints, which stood on the bus `age` ago.
+    pub(super) fn begin_sum(
+        &mut self,
+        now: Micros,
+        age: Span,
+        (epoch, period): (Epoch, Span),
+        own: Option<Torque>,
+    ) {
+        let begin = self.freeze(epoch, now - age, period);
+        self.sums.begin(&begin, own.map(|torque| torque.exact()).as_ref());
         if self.misses.1 > 0 {
             self.sums.watch();
         }
@@ -128,9 +132,9 @@ impl Node {
             && parent == from
         {
             // A late sum of an earlier epoch is a sign of life too.
-            self.heard_parent |= !self.network.is_deaf(port);
+            self.heard_parent |= self.network.hears(port);
         } else if let Some(port) = self.network.child_with(from.get())
-            && !self.network.is_deaf(port)
+            && self.network.hears(port)
         {
             self.sums.take(now, port, epoch, words);
             self.handle_sums(now);

@@ -134,10 +134,8 @@ impl Cells {
 
 /// Opens a bus to hear cells and gateways; a classic interface too.
 fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
-    let of_kind =
-        |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
     let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
-    let mut filters: Vec<_> = kinds.map(of_kind).collect();
+    let mut filters: Vec<_> = kinds.map(Filter::kind).collect();
     filters.push(Filter::exact(Id::command(Command::Joints)));
     let options = |fd| Options {
         fd,

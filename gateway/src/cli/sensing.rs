@@ -8,7 +8,7 @@ use gateway::decode::{Decoded, Decoder};
 use gateway::generate::Format;
 use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
 use protocol::can;
-use protocol::id::{CellId, Id, Kind, Node};
+use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::parameters::{Parameter, Sensing as Mode};
 use protocol::skin::sensing::continuous;
@@ -70,9 +70,7 @@ impl Sensing {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let mode = self.mode().map_err(Failure::usage)?;
         let format = ack::wire(self.format);
-        let hears =
-            |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
-        let filters = [Kind::Network, Kind::Configured].map(hears).to_vec();
+        let filters = [Kind::Network, Kind::Configured].map(Filter::kind).to_vec();
         let options = Options { filters, fd: format == can::Format::Fd, ..Options::default() };
         let bus = Bus::open(&self.bus, self.bus_kind, &options).map_err(Failure::usage)?;
         let answers = self.ask(&bus, format, mode)?;

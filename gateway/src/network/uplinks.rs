@@ -88,13 +88,6 @@ impl Uplinks {
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
-    /// Whether the sums of a root are for the gateway. A root may also be the child of another cell: then its sums
-    /// are in that one's.
-    #[must_use]
-    pub fn takes(&self, root: usize) -> bool {
-        self.wires.get(root).is_some_and(|wire| wire.is_child)
-    }
-
     /// Whether the sums of a root are for the gateway; else another cell takes them.
     #[must_use]
     pub fn is_child(&self, root: usize) -> bool {

@@ -216,13 +216,7 @@ impl Buses {
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, RunError> {
         let mut heard = vec![BTreeSet::new(); self.lanes.len()];
         let wanted = BusOptions {
-            filters: vec![
-                Filter::exact(Id::command(Command::Joints)),
-                Filter {
-                    id: u32::from(Id { kind: Kind::Network, node: 0 }.to_bits()),
-                    mask: Filter::EXACT_MASK & !0xFF,
-                },
-            ],
+            filters: vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)],
             ..BusOptions::default()
         };
         let mut open = Vec::new();

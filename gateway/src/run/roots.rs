@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, Filter};
-use protocol::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
+use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
 use protocol::skin::{Reply, Skin};
@@ -58,10 +58,7 @@ impl Ears {
         };
         // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
-        let wires = roots.iter().map(|(_, lane)| Filter {
-            id: lane.reversed().raw_id(),
-            mask: EXTENDED | REMOTE | EXTENDED_MASK,
-        });
+        let wires = roots.iter().map(|(_, lane)| Filter::lane(lane.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
         let all_sums = everything || few.len() + others.len() > Filter::MAX;

@@ -1,7 +1,8 @@
 //! Which frames a socket wants, by the rule of the kernel's `CAN_RAW`.
 
-use crate::can::{ERROR, EXTENDED, REMOTE, STANDARD_MASK};
-use crate::id::Id;
+use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
+use crate::id::{Id, Kind};
+use crate::wire::Lane;
 
 /// A frame passes when `identifier & mask == id & mask`; with [`Filter::INVERTED`] in `id`, when not.
 ///
@@ -32,6 +33,18 @@ impl Filter {
         Self { id: id.to_bits() as u32, mask: Self::EXACT_MASK }
     }
 
+    /// The data frames of a kind, whatever their node.
+    #[must_use]
+    pub const fn kind(kind: Kind) -> Self {
+        Self { id: Id { kind, node: 0 }.to_bits() as u32, mask: Self::EXACT_MASK & !0xFF }
+    }
+
+    /// Exactly the data frames of one direction of a simulated wire.
+    #[must_use]
+    pub const fn lane(lane: Lane) -> Self {
+        Self { id: lane.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
+    }
+
     /// What this one does not let pass, and only that.
     #[must_use]
     pub const fn inverted(self) -> Self {
@@ -49,5 +62,8 @@ mod tests {
         let filter = Filter::exact(Id::command(Command::Joints));
         assert_eq!(filter, Filter { id: 0x001, mask: 0xC000_07FF });
         assert_eq!(filter.inverted().inverted(), filter);
+        assert_eq!(Filter::kind(Kind::Network), Filter { id: 0x400, mask: 0xC000_0700 });
+        let lane = Lane { wire: 3, back: true };
+        assert_eq!(Filter::lane(lane), Filter { id: 0x9000_0007, mask: 0xDFFF_FFFF });
     }
 }

@@ -14,10 +14,9 @@ use gateway::generate::{Wanted, generate};
 use mcap::read::{Summary, attachment, metadata};
 use mcap::{MessageStream, Schema};
 use protocol::candump::{Line, parse};
-use protocol::id::{Id, Kind};
 use serde_json::{Map, Value, json};
 
-use crate::process::vcan::{Candump, by_identifier};
+use crate::process::vcan::{Candump, same_by_sender};
 use crate::process::{PRESSED, Place};
 
 /// One message.
@@ -221,13 +220,5 @@ pub(crate) fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f
     assert_eq!(ours.len() as u64, counted, "the recording has what is counted");
     assert!(counted > 4 * cells as u64, "{:#}", summary.0);
 
-    let (ours, theirs) = (by_identifier(&ours), by_identifier(&theirs));
-    assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());
-    for (id, theirs) in &theirs {
-        let ours = &ours[id];
-        // Cells that are being ended may still say a heartbeat when the gateway no longer listens.
-        let kind = Id::from_bits(u16::try_from(*id).unwrap()).kind;
-        assert!(theirs.len() == ours.len() || kind == Kind::Network, "frames of {id:03X}");
-        assert!(theirs.starts_with(ours), "{id:03X} comes in another order");
-    }
+    same_by_sender(&ours, &theirs);
 }

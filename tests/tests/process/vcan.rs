@@ -13,7 +13,7 @@ use std::process::{Child, Command, Output, Stdio};
 use gateway::generate::{Wanted, generate};
 use protocol::can::Frame;
 use protocol::candump::{Line, parse, parse_frame};
-use protocol::id::Node;
+use protocol::id::{Id, Kind, Node};
 use protocol::message::{Message, NetworkPage, State};
 
 use super::{Guest, Place, until};
@@ -250,4 +250,17 @@ pub(crate) fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
         all.entry(frame.raw_id()).or_default().push(*frame);
     }
     all
+}
+
+/// What the gateway keeps is what `candump` sees, in the same order by sender; but cells that are being ended may still
+/// say a heartbeat when the gateway no longer listens.
+pub(crate) fn same_by_sender(ours: &[Frame], theirs: &[Frame]) {
+    let (ours, theirs) = (by_identifier(ours), by_identifier(theirs));
+    assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());
+    for (id, theirs) in &theirs {
+        let ours = &ours[id];
+        let kind = Id::from_bits(u16::try_from(*id).unwrap()).kind;
+        assert!(theirs.len() == ours.len() || kind == Kind::Network, "frames of {id:03X}");
+        assert!(theirs.starts_with(ours), "{id:03X} comes in another order");
+    }
 }

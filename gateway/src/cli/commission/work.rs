@@ -8,7 +8,7 @@ use gateway::commission::{Commission, Progress, Report, Wish};
 use gateway::decode::{Decoded, Decoder};
 use gateway::network::Uplinks;
 use protocol::bus::{Bus, BusError, Filter, GATEWAY_RECEIVE_BUFFER, Inbox, Kinds, Options};
-use protocol::can::{EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
+use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::Message;
 use protocol::skin::{Reply, Skin};
@@ -50,12 +50,9 @@ pub(super) fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, Bu
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let sums = described.is_some_and(|bus| matches!(bus.reply, Reply::Sum { .. }));
     let mut roots: Vec<_> = skin.wires(index).roots().map(|(_, lane)| lane).filter(|_| sums).collect();
-    let of_kind =
-        |kind| Filter { id: u32::from(Id { kind, node: 0 }.to_bits()), mask: Filter::EXACT_MASK & !0xFF };
-    let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(of_kind).to_vec();
+    let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
-    let wire = |lane: &Lane| Filter { id: lane.reversed().raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE };
-    filters.extend(roots.iter().map(wire));
+    filters.extend(roots.iter().map(|lane| Filter::lane(lane.reversed())));
     let options = Options {
         filters,
         fd: format == Format::Fd,

@@ -1,0 +1,153 @@
+use super::*;
+
+const PERIOD: Span = Span(16_000);
+
+fn sum(carry: bool) -> Sum {
+    let mut sum = Sum::default();
+    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 3, carry }));
+    sum
+}
+
+fn begin(epoch: u8, depth: u8) -> Begin {
+    let at = Micros(u64::from(epoch) * PERIOD.0);
+    Begin { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), speaks: true, children: 0b1111 }
+}
+
+/// In steps of Q7.8 and thousandths of them.
+fn own(thousandths: i64) -> [Acc<30>; WORDS] {
+    [Acc::from_steps(thousandths * (1 << SHORTENED) / 1_000); WORDS]
+}
+
+fn words(word: i16, count: u8) -> Words {
+    Words { torque: [Q7_8::from_bits(word); WORDS], count }
+}
+
+fn at(epoch: u8, micros: u64) -> Micros {
+    Micros(u64::from(epoch) * PERIOD.0 + micros)
+}
+
+/// What it says from now to the end of the epoch, and when.
+fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
+    let mut said = Vec::new();
+    for micros in (0..PERIOD.0).step_by(100) {
+        if let Some((of, words, anew)) = sum.say(at(epoch, micros)) {
+            assert_eq!(of, Epoch(epoch));
+            said.push((micros, words.torque[0].to_bits(), words.count, anew));
+        }
+    }
+    said
+}
+
+#[test]
+fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 1), Some(&own(2_400)));
+    assert_eq!(says(&mut sum, 1), [(2_000, 2, 1, true)]);
+    sum.begin(&begin(2, 1), Some(&own(2_600)));
+    assert_eq!(says(&mut sum, 2), [(2_000, 3, 1, false)]);
+    sum.begin(&begin(3, 1), None);
+    assert_eq!(says(&mut sum, 3), [(2_000, 0, 0, false)]);
+    sum.begin(&begin(4, 1), None);
+    assert_eq!(says(&mut sum, 4), []);
+    sum.begin(&begin(5, 1), Some(&own(1_000)));
+    assert_eq!(says(&mut sum, 5), [(2_000, 1, 1, true)], "stated anew");
+}
+
+#[test]
+fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
+    for (carry, wanted) in [(true, [0, 1, 0, 1, 0]), (false, [0; 5])] {
+        let mut sum = sum(carry);
+        let mut got = Vec::new();
+        for epoch in 0..5 {
+            sum.begin(&begin(epoch, 0), Some(&own(400)));
+            got.extend(says(&mut sum, epoch).first().map(|said| said.1));
+        }
+        assert_eq!(got, wanted);
+    }
+    let mut sum = sum(true);
+    sum.begin(&begin(0, 0), Some(&own(400)));
+    sum.begin(&begin(1, 0), None);
+    sum.begin(&begin(2, 0), Some(&own(400)));
+    assert_eq!(says(&mut sum, 2).first().map(|said| said.1), Some(0), "nothing was left");
+}
+
+#[test]
+fn a_late_child_makes_one_more_sum_of_all_in_the_next_slot() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), Some(&own(1_000)));
+    sum.state(at(1, 10), 0, Epoch(1));
+    sum.take(at(1, 500), 0, Epoch(1), words(10, 3));
+    assert_eq!(sum.say(at(1, 1_000)), Some((Epoch(1), words(11, 4), true)));
+    sum.take(at(1, 1_700), 0, Epoch(1), words(12, 4));
+    sum.take(at(1, 1_800), 0, Epoch(1), words(9, 2));
+    assert_eq!(sum.say(at(1, 1_900)), None);
+    assert_eq!(sum.say(at(1, 2_000)), Some((Epoch(1), words(13, 5), false)));
+    assert_eq!((sum.sent, sum.taken, sum.dropped), (2, 2, 0));
+}
+
+#[test]
+fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), None);
+    sum.take(at(1, 500), 1, Epoch(1), words(10, 1));
+    assert_eq!((sum.taken, sum.dropped), (0, 1), "not said whom it is for");
+    sum.state(at(1, 600), 1, Epoch(1));
+    assert_eq!((sum.taken, sum.dropped), (1, 0), "said late");
+    sum.begin(&begin(2, 2), None);
+    sum.take(at(2, 500), 1, Epoch(2), words(10, 1));
+    assert_eq!(sum.taken, 2);
+    sum.begin(&begin(3, 2), None);
+    assert_eq!(sum.judge(), Some((Epoch(3), 0b10)), "it did not come");
+    sum.begin(&begin(4, 2), None);
+    assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "it is looked in time");
+    assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (Check::NotYet, Check::Now));
+    sum.take(at(4, 500), 1, Epoch(4), words(10, 1));
+    assert_eq!(sum.taken, 2, "after a gap");
+    sum.disown(1);
+    sum.begin(&begin(5, 2), None);
+    sum.state(at(5, 0), 1, Epoch(4));
+    sum.take(at(5, 500), 1, Epoch(5), words(10, 1));
+    assert_eq!(sum.taken, 2, "stated for another epoch");
+}
+
+#[test]
+fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), None);
+    sum.state(at(1, 0), 1, Epoch(1));
+    sum.take(at(1, 100), 1, Epoch(1), words(10, 1));
+    sum.begin(&begin(2, 2), None);
+    sum.begin(&begin(3, 2), None);
+    sum.take(at(3, 100), 1, Epoch(2), words(10, 1));
+    assert_eq!((sum.taken, sum.dropped), (1, 1));
+    sum.take(at(3, 200), 1, Epoch(3), words(10, 1));
+    assert_eq!((sum.taken, sum.dropped), (2, 1));
+    assert_eq!(sum.judge(), Some((Epoch(3), 0)));
+}
+
+#[test]
+fn an_end_closes_the_lease_without_a_word() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), None);
+    sum.state(at(1, 0), 1, Epoch(1));
+    sum.take(at(1, 100), 1, Epoch(1), Words::END);
+    sum.begin(&begin(2, 2), None);
+    assert_eq!((sum.poll_timeout(), sum.judge()), (None, Some((Epoch(2), 0))), "nobody is missed");
+}
+
+#[test]
+fn saturation_passes_upwards_word_by_word() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), Some(&own(-1_000_000)));
+    sum.state(at(1, 0), 0, Epoch(1));
+    let mut saturated = words(5, 2);
+    saturated.torque[1] = Q7_8::MAX;
+    saturated.torque[2] = Q7_8::MIN;
+    sum.take(at(1, 0), 0, Epoch(1), saturated);
+    let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
+    assert_eq!(said.torque.map(Q7_8::to_bits), [-995, i16::MAX, i16::MIN, -995, -995, -995]);
+    sum.begin(&begin(2, 2), Some(&own(i64::from(i16::MAX) * 1_000)));
+    sum.take(at(2, 0), 0, Epoch(2), words(1, 1));
+    let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
+    assert_eq!(said.torque, [Q7_8::MAX; WORDS]);
+}
