@@ -14,6 +14,7 @@ pub mod listing;
 pub mod network;
 pub mod record;
 pub mod replay;
+pub mod report;
 pub mod robot;
 pub mod ros2;
 pub mod run;

@@ -1,0 +1,15 @@
+//! Reports: what was found, as a page with figures.
+//!
+//! ```text
+//!   a recording ─> run ─┐
+//!                       ├─> figure::Page ─> page::html ─> one HTML file
+//!   experiments ────────┘        └────────> svg::draw ──> an SVG file for each figure
+//! ```
+//!
+//! [`figure`] is what is said, [`svg`] draws it, [`page`] sets it; all three are pure.
+
+pub mod figure;
+pub mod page;
+mod scale;
+pub mod svg;
+pub mod thin;

@@ -1,0 +1,197 @@
+//! From values to places and back, and round numbers to write beside an axis.
+
+use std::ops::Range;
+
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
+
+use super::figure::{Axis, Scale};
+
+/// One axis with its ends.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Span {
+    from: f64,
+    to: f64,
+    scale: Scale,
+}
+
+impl Span {
+    /// An axis' ends: its own, or those of all that is drawn and a little more.
+    pub(crate) fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
+        let scale = axis.scale;
+        let usable = |value: &f64| value.is_finite() && (scale == Scale::Linear || *value > 0.0);
+        let (from, to) = axis.range.unwrap_or_else(|| {
+            let ends = values.filter(usable).fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), value| {
+                (from.min(value), to.max(value))
+            });
+            wider(ends, scale, room)
+        });
+        if usable(&from) && usable(&to) && from < to {
+            Self { from, to, scale }
+        } else {
+            let (from, to) = wider((from, to), scale, room);
+            Self { from, to, scale }
+        }
+    }
+
+    /// Where a value stands: 0 at the axis' beginning, 1 at its end; not a number where it cannot stand.
+    pub(crate) fn place(&self, value: f64) -> f64 {
+        match self.scale {
+            Scale::Linear => (value - self.from) / (self.to - self.from),
+            Scale::Log if value > 0.0 => (value / self.from).ln() / (self.to / self.from).ln(),
+            Scale::Log => f64::NAN,
+        }
+    }
+
+    /// What stands at a place.
+    pub(crate) fn value(&self, place: f64) -> f64 {
+        match self.scale {
+            Scale::Linear => self.from + place * (self.to - self.from),
+            Scale::Log => self.from * (self.to / self.from).powf(place),
+        }
+    }
+
+    /// Round numbers along the axis, at most `most`, by 1, 2 or 5 times a power of ten.
+    pub(crate) fn ticks(&self, most: usize) -> Vec<f64> {
+        match self.scale {
+            Scale::Linear => linear_ticks(self.from, self.to, most),
+            Scale::Log => log_ticks(self.from, self.to, most),
+        }
+    }
+
+    /// How a tick is written: with the digits that tell neighbours apart.
+    pub(crate) fn label(&self, tick: f64, most: usize) -> String {
+        let size = self.from.abs().max(self.to.abs());
+        match self.scale {
+            Scale::Log if (0.01..1e5).contains(&tick) => format!("{}", round(tick)),
+            Scale::Log => power(tick),
+            Scale::Linear if !(1e-3..1e6).contains(&size) => power(tick),
+            Scale::Linear => {
+                let step = step(self.from, self.to, most);
+                let digits = (0..9).find(|digits| step * 10_f64.powi(*digits) > 0.999).unwrap_or(9);
+                format!("{:.*}", usize::try_from(digits).unwrap_or(0), tick + 0.0)
+            }
+        }
+    }
+}
+
+impl Ranged for Span {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a place in a picture; what is beyond it is at its edge"
+    )]
+    fn map(&self, value: &f64, (from, to): (i32, i32)) -> i32 {
+        let place = f64::from(from) + self.place(*value) * f64::from(to - from);
+        place.round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        self.ticks(hint.bold_points())
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.from..self.to
+    }
+}
+
+/// Ends with some room beyond them; something where there is nothing.
+fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
+    let nothing = !(from.is_finite() && to.is_finite() && from <= to);
+    match scale {
+        Scale::Linear if nothing => (0.0, 1.0),
+        Scale::Log if nothing || from <= 0.0 => (1.0, 10.0),
+        Scale::Linear if to - from <= 1e-12 * to.abs() => {
+            let half = if to == 0.0 { 0.5 } else { 0.1 * to.abs() };
+            (from - half, to + half)
+        }
+        Scale::Linear => {
+            let more = room * (to - from);
+            // What never goes below 0 is drawn from 0 on.
+            let below = if from >= 0.0 && from < more { 0.0 } else { from - more };
+            (below, to + more)
+        }
+        Scale::Log if to / from < 1.01 => (from / 2.0, to * 2.0),
+        Scale::Log => {
+            let more = (to / from).powf(room);
+            (from / more, to * more)
+        }
+    }
+}
+
+/// The smallest of 1, 2 or 5 times a power of ten that needs no more than `most` ticks.
+fn step(from: f64, to: f64, most: usize) -> f64 {
+    let most = u32::try_from(most.max(1)).unwrap_or(u32::MAX);
+    let least = (to - from) / f64::from(most);
+    let power = 10_f64.powf(least.log10().floor());
+    [1.0, 2.0, 5.0]
+        .map(|times| times * power)
+        .into_iter()
+        .find(|step| *step >= 0.999_999 * least)
+        .unwrap_or(10.0 * power)
+}
+
+fn linear_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
+    let step = step(from, to, most);
+    let little = 1e-9 * (to - from);
+    let first = ((from - little) / step).ceil();
+    (0_u32..1000).map(|n| (first + f64::from(n)) * step).take_while(|tick| *tick <= to + little).collect()
+}
+
+fn log_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
+    let (first, last) = (from.log10().floor(), to.log10().ceil());
+    let decades = last - first;
+    let fits = |tick: &f64| (from * 0.999_999..=to * 1.000_001).contains(tick);
+    let every = |steps: &[f64]| {
+        let exponents = (0_u32..700).map(|n| first + f64::from(n)).take_while(|exponent| *exponent <= last);
+        let ticks = exponents.flat_map(|exponent| steps.iter().map(move |step| step * 10_f64.powf(exponent)));
+        ticks.filter(fits).collect::<Vec<_>>()
+    };
+    for steps in [&[1.0, 2.0, 5.0][..], &[1.0, 3.0], &[1.0]] {
+        let ticks = every(steps);
+        if (2..=most).contains(&ticks.len()) {
+            return ticks;
+        }
+    }
+    if decades <= 1.0 {
+        return linear_ticks(from, to, most);
+    }
+    let ticks = every(&[1.0]);
+    let skip = ticks.len().div_ceil(most.max(1)).max(1);
+    ticks.into_iter().step_by(skip).collect()
+}
+
+/// A number without the last digits that come of arithmetic.
+fn round(tick: f64) -> f64 {
+    format!("{tick:.9}").parse().unwrap_or(tick)
+}
+
+/// A number by its power of ten: `2·10⁻⁵`.
+fn power(tick: f64) -> String {
+    if tick == 0.0 {
+        return "0".to_owned();
+    }
+    let text = format!("{tick:.3e}");
+    let Some((digits, exponent)) = text.split_once('e') else { return text };
+    let digits = digits.trim_end_matches('0').trim_end_matches('.');
+    let exponent: String = exponent.chars().map(raised).collect();
+    if digits == "1" { format!("10{exponent}") } else { format!("{digits}·10{exponent}") }
+}
+
+const fn raised(digit: char) -> char {
+    match digit {
+        '0' => '⁰',
+        '1' => '¹',
+        '2' => '²',
+        '3' => '³',
+        '4' => '⁴',
+        '5' => '⁵',
+        '6' => '⁶',
+        '7' => '⁷',
+        '8' => '⁸',
+        '9' => '⁹',
+        '-' => '⁻',
+        other => other,
+    }
+}

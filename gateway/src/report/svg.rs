@@ -1,0 +1,397 @@
+//! Draws a figure as SVG.
+//!
+//! Colours stand in the drawing as they are on paper, so that every program shows it; and each has a class beside it,
+//! by which [`DARK`] gives it another one on a dark screen.
+
+use std::fmt::Write as _;
+
+use plotters::chart::{ChartBuilder, ChartContext};
+use plotters::coord::Shift;
+use plotters::coord::cartesian::Cartesian2d;
+use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
+use plotters::element::{Circle, PathElement, Polygon, Rectangle, Text};
+use plotters::series::DashedLineSeries;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
+use plotters_svg::SVGBackend;
+
+use super::figure::{Figure, Mark, On, Series, Shape, Size};
+use super::scale::Span;
+use super::thin::thinned;
+
+/// How many units of the drawing are one pixel of its natural size: places are whole units.
+const UNIT: i32 = 8;
+/// Of letters, in pixels.
+const LETTERS: f64 = 13.0;
+
+const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
+const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
+const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
+/// On paper: Okabe and Ito's, that can be told apart by everybody, without the yellow that nobody sees on white.
+const SERIES: [RGBColor; Figure::COLOURS] = [
+    RGBColor(0x00, 0x72, 0xB2),
+    RGBColor(0xD5, 0x5E, 0x00),
+    RGBColor(0x00, 0x9E, 0x73),
+    RGBColor(0xCC, 0x79, 0xA7),
+    RGBColor(0xE6, 0x9F, 0x00),
+    RGBColor(0x56, 0xB4, 0xE9),
+    RGBColor(0x33, 0x33, 0x33),
+];
+
+/// Colour, class, and the colour on a dark screen.
+const CLASSES: [(RGBColor, &str, &str); 10] = [
+    (INK, "ink", "#E4E4E4"),
+    (FAINT, "faint", "#A6A6A6"),
+    (GRID, "grid", "#3A3D42"),
+    (SERIES[0], "c0", "#5AB4F0"),
+    (SERIES[1], "c1", "#FF8A3D"),
+    (SERIES[2], "c2", "#35C79A"),
+    (SERIES[3], "c3", "#E59AC8"),
+    (SERIES[4], "c4", "#F5C04A"),
+    (SERIES[5], "c5", "#A8DCFF"),
+    (SERIES[6], "c6", "#DDDDDD"),
+];
+
+/// The rules that give a drawing its colours on a dark screen.
+#[must_use]
+pub fn dark() -> String {
+    let mut rules = "@media screen and (prefers-color-scheme:dark){".to_owned();
+    for (_, class, colour) in CLASSES {
+        let _ = write!(rules, ".{class}-f{{fill:{colour}}}.{class}-s{{stroke:{colour}}}");
+    }
+    rules.push('}');
+    rules
+}
+
+/// A figure's natural width and height in pixels.
+#[must_use]
+pub const fn natural(size: Size) -> (u32, u32) {
+    match size {
+        Size::Wide => (960, 320),
+        Size::Half => (470, 270),
+    }
+}
+
+/// A file of its own, for a paper or a document.
+#[must_use]
+pub fn draw(figure: &Figure) -> String {
+    let (width, height) = natural(figure.size);
+    let style = format!("<style>{}</style>\n", dark());
+    let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
+    document(figure, (width, height), &attributes, &style)
+}
+
+/// A part of a page that has the rules of [`dark`], `size` pixels wide and high when the page shows it as it is.
+#[must_use]
+pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
+    document(figure, size, &format!("class=\"{class}\""), "")
+}
+
+fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, style: &str) -> String {
+    let unit = UNIT.unsigned_abs();
+    let mut drawing = String::new();
+    let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
+    // A drawing in memory: there is nothing that could fail but what is too small to draw in.
+    let drawn = drawing_of(figure, &area).and_then(|()| area.present());
+    drop(area);
+    let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
+    let body = if drawn.is_ok() { classed(body) } else { "</svg>\n".to_owned() };
+    let title = escaped(&figure.title);
+    format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" role=\"img\" {attributes} \
+         stroke-linejoin=\"round\">\n<title>{title}</title>\n{style}{body}",
+        width * unit,
+        height * unit
+    )
+}
+
+/// Gives every colour its class.
+fn classed(body: &str) -> String {
+    let mut body = body.replace(" opacity=\"1\"", "").replace(" font-family=\"sans-serif\"", "");
+    for (RGBColor(r, g, b), class, _) in CLASSES {
+        for (attribute, kind) in [("fill", 'f'), ("stroke", 's')] {
+            let colour = format!("{attribute}=\"#{r:02X}{g:02X}{b:02X}\"");
+            body = body.replace(&colour, &format!("class=\"{class}-{kind}\" {colour}"));
+        }
+    }
+    body
+}
+
+/// Text as XML has it.
+pub(crate) fn escaped(text: &str) -> String {
+    let mut safe = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => safe.push_str("&amp;"),
+            '<' => safe.push_str("&lt;"),
+            '>' => safe.push_str("&gt;"),
+            '"' => safe.push_str("&quot;"),
+            '\'' => safe.push_str("&#39;"),
+            // XML has no other control characters, not even escaped.
+            letter if letter.is_control() && !matches!(letter, '\n' | '\t') => {
+                safe.push(char::REPLACEMENT_CHARACTER)
+            }
+            letter => safe.push(letter),
+        }
+    }
+    safe
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<Span, Span>>;
+type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
+
+fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
+    let all = || figure.series.iter().flat_map(|series| &series.points);
+    let marks = |on| figure.marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
+    let x = Span::new(
+        &figure.x,
+        all().filter(|point| point.1.is_finite()).map(|point| point.0).chain(marks(On::X)),
+        0.0,
+    );
+    let y = Span::new(&figure.y, all().map(|point| point.1).chain(marks(On::Y)), 0.06);
+
+    let (width, height) = area.dim_in_pixel();
+    let (x_most, y_most) = ((width / pixels(80)) as usize, (height / pixels(42)) as usize);
+    let digits = y.ticks(y_most).iter().map(|tick| y.label(*tick, y_most).chars().count()).max().unwrap_or(1);
+    let left = pixels(34) + in_pixels(0.62 * LETTERS * digits as f64).unsigned_abs();
+
+    let rows = legend(figure, width);
+    let top = pixels(8) + pixels(20) * u32::try_from(rows.len()).unwrap_or(0);
+    let (above, below) = area.split_vertically(top);
+    let mut chart = ChartBuilder::on(&below)
+        .margin_right(pixels(14))
+        .margin_top(pixels(4))
+        .x_label_area_size(pixels(44))
+        .y_label_area_size(left)
+        .build_cartesian_2d(x, y)?;
+    chart
+        .configure_mesh()
+        .x_labels(x_most)
+        .y_labels(y_most)
+        .max_light_lines(1)
+        .light_line_style(GRID.mix(0.0))
+        .bold_line_style(GRID.stroke_width(pixels(1)))
+        .axis_style(FAINT.stroke_width(pixels(1)))
+        .label_style(letters(&INK, LETTERS))
+        .axis_desc_style(letters(&INK, LETTERS))
+        .set_all_tick_mark_size(pixels(5))
+        .x_label_formatter(&|tick| x.label(*tick, x_most))
+        .y_label_formatter(&|tick| y.label(*tick, y_most))
+        .x_desc(figure.x.to_string())
+        .y_desc(figure.y.to_string())
+        .draw()?;
+    let (columns, lines) = chart.plotting_area().dim_in_pixel();
+    let grain = (columns / UNIT.unsigned_abs(), lines / UNIT.unsigned_abs());
+    for (series, colour) in figure.series.iter().zip(SERIES.iter().cycle()) {
+        series_of(&mut chart, series, *colour, (&x, &y), grain)?;
+    }
+    for mark in &figure.marks {
+        mark_of(&mut chart, mark, (&x, &y))?;
+    }
+    for (row, entries) in (0..).zip(&rows) {
+        for (at, entry) in entries {
+            entry_of(&above, &figure.series, *entry, (*at, row))?;
+        }
+    }
+    Ok(())
+}
+
+fn series_of(
+    chart: &mut Chart<'_, '_>,
+    series: &Series,
+    colour: RGBColor,
+    (x, y): (&Span, &Span),
+    (columns, lines): (u32, u32),
+) -> Drawn {
+    let placed = series.points.iter().map(|point| (x.place(point.0), y.place(point.1)));
+    let style = colour.stroke_width(in_pixels(1.6).unsigned_abs());
+    let back = |points: Vec<(f64, f64)>| -> Vec<(f64, f64)> {
+        points.into_iter().map(|(across, up)| (x.value(across), y.value(up))).collect()
+    };
+    match series.shape {
+        Shape::Line | Shape::Dashed | Shape::Steps => {
+            for run in runs(placed) {
+                let run = thinned(&run, columns);
+                let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
+                for piece in clipped(&run) {
+                    let points = back(piece);
+                    if series.shape == Shape::Dashed {
+                        let dashes = DashedLineSeries::new(points, pixels(7), pixels(5), style);
+                        chart.draw_series(dashes)?;
+                    } else {
+                        chart.draw_series([PathElement::new(points, style)])?;
+                    }
+                }
+            }
+        }
+        Shape::Points => {
+            let inside =
+                |point: &(f64, f64)| (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1);
+            let mut points: Vec<_> = placed.filter(inside).collect();
+            // Dots that cover each other are one.
+            let cell = |point: &(f64, f64)| {
+                ((point.0 * f64::from(columns)).floor(), (point.1 * f64::from(lines)).floor())
+            };
+            if points.len() > 500 {
+                points.sort_by(|a, b| cell(a).partial_cmp(&cell(b)).unwrap_or(std::cmp::Ordering::Equal));
+                points.dedup_by(|a, b| cell(a) == cell(b));
+            }
+            let radius = if points.len() > 300 { in_pixels(1.2) } else { in_pixels(2.6) };
+            chart.draw_series(
+                back(points).into_iter().map(|point| Circle::new(point, radius, colour.filled())),
+            )?;
+        }
+        Shape::Band => {
+            let held = placed.filter(|point| point.0.is_finite() && point.1.is_finite());
+            let points = held.map(|point| (point.0.clamp(0.0, 1.0), point.1.clamp(0.0, 1.0))).collect();
+            chart.draw_series([Polygon::new(back(points), colour.mix(0.25).filled())])?;
+        }
+    }
+    Ok(())
+}
+
+/// The pieces of a line between its gaps.
+fn runs(points: impl Iterator<Item = (f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+    let mut runs = vec![Vec::new()];
+    for point in points {
+        if !(point.0.is_finite() && point.1.is_finite()) {
+            runs.push(Vec::new());
+        } else if let Some(run) = runs.last_mut() {
+            run.push(point);
+        }
+    }
+    runs.retain(|run| !run.is_empty());
+    runs
+}
+
+/// A line that holds each value until the next one.
+fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let mut stairs = Vec::with_capacity(points.len() * 2);
+    for point in points {
+        if let Some(&(_, held)) = stairs.last() {
+            stairs.push((point.0, held));
+        }
+        stairs.push(*point);
+    }
+    stairs
+}
+
+/// The pieces of a line inside of the picture, which is from 0 to 1 both ways.
+fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
+    if let [point] = points {
+        // A point alone is a line of no length, and would not be seen.
+        let inside = (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1);
+        let dash = vec![(point.0 - 0.001, point.1), (point.0 + 0.001, point.1)];
+        return if inside { vec![dash] } else { Vec::new() };
+    }
+    let mut pieces: Vec<Vec<(f64, f64)>> = Vec::new();
+    for pair in points.windows(2) {
+        let [a, b] = pair else { continue };
+        let (mut from, mut to) = (0.0_f64, 1.0_f64);
+        for (at, way) in [(a.0, b.0 - a.0), (a.1, b.1 - a.1)] {
+            if way == 0.0 {
+                if !(0.0..=1.0).contains(&at) {
+                    to = -1.0;
+                }
+            } else {
+                let (low, high) = (-at / way, (1.0 - at) / way);
+                from = from.max(low.min(high));
+                to = to.min(low.max(high));
+            }
+        }
+        if from > to {
+            continue;
+        }
+        let point = |part: f64| (a.0 + part * (b.0 - a.0), a.1 + part * (b.1 - a.1));
+        let end = if to < 1.0 { point(to) } else { *b };
+        match pieces.last_mut() {
+            Some(piece) if from == 0.0 && piece.last() == Some(a) => piece.push(end),
+            _ => pieces.push(vec![if from > 0.0 { point(from) } else { *a }, end]),
+        }
+    }
+    pieces
+}
+
+fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Drawn {
+    let place = if mark.on == On::X { x.place(mark.at) } else { y.place(mark.at) };
+    if !(0.0..=1.0).contains(&place) {
+        return Ok(());
+    }
+    let ends = if mark.on == On::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
+    let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
+    let style = FAINT.stroke_width(pixels(1));
+    chart.draw_series(DashedLineSeries::new(line, pixels(2), pixels(3), style))?;
+    // The words stand on the side where there is room.
+    let (across, up, side, end) = match mark.on {
+        On::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
+        On::X => (place, 1.0, HPos::Left, VPos::Top),
+        On::Y if place > 0.9 => (1.0, place, HPos::Right, VPos::Top),
+        On::Y => (1.0, place, HPos::Right, VPos::Bottom),
+    };
+    let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
+    let style = letters(&FAINT, LETTERS - 1.0).pos(Pos::new(side, end));
+    let at = (x.value(across + gap), y.value(up - if mark.on == On::X { 0.02 } else { 0.0 }));
+    chart.draw_series([Text::new(mark.label.clone(), at, style)])?;
+    Ok(())
+}
+
+/// Rows of the legend: where each entry begins, and which series it is.
+fn legend(figure: &Figure, width: u32) -> Vec<Vec<(i32, usize)>> {
+    let named = figure.series.iter().enumerate().filter(|(_, series)| !series.label.is_empty());
+    let mut rows: Vec<Vec<(i32, usize)>> = Vec::new();
+    let mut at = i32::MAX;
+    for (which, series) in named {
+        let room = in_pixels(48.0 + 0.56 * LETTERS * series.label.chars().count() as f64);
+        if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
+            rows.push(Vec::new());
+            at = in_pixels(12.0);
+        }
+        if let Some(row) = rows.last_mut() {
+            row.push((at, which));
+        }
+        at = at.saturating_add(room);
+    }
+    rows
+}
+
+fn entry_of(area: &Area<'_>, series: &[Series], which: usize, (at, row): (i32, i32)) -> Drawn {
+    let (Some(series), Some(colour)) = (series.get(which), SERIES.iter().cycle().nth(which)) else {
+        return Ok(());
+    };
+    let middle = in_pixels(15.0) + row * in_pixels(20.0);
+    let end = at + in_pixels(22.0);
+    let style: ShapeStyle = colour.stroke_width(in_pixels(2.4).unsigned_abs());
+    match series.shape {
+        Shape::Line | Shape::Steps => area.draw(&PathElement::new([(at, middle), (end, middle)], style))?,
+        Shape::Dashed => {
+            for from in [at, at + in_pixels(13.0)] {
+                area.draw(&PathElement::new([(from, middle), (from + in_pixels(9.0), middle)], style))?;
+            }
+        }
+        Shape::Points => {
+            area.draw(&Circle::new((at + in_pixels(11.0), middle), in_pixels(3.0), colour.filled()))?;
+        }
+        Shape::Band => {
+            let half = in_pixels(5.0);
+            let corners = [(at, middle - half), (end, middle + half)];
+            area.draw(&Rectangle::new(corners, colour.mix(0.25).filled()))?;
+        }
+    }
+    let style = letters(&INK, LETTERS).pos(Pos::new(HPos::Left, VPos::Center));
+    area.draw(&Text::new(series.label.clone(), (end + in_pixels(6.0), middle), style))
+}
+
+/// Letters of a size in pixels: the backend makes them smaller by 1.24.
+fn letters<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
+    ("sans-serif", size * 1.24 * f64::from(UNIT)).into_font().color(colour)
+}
+
+const fn pixels(count: u32) -> u32 {
+    count * UNIT.unsigned_abs()
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "a length in a picture")]
+fn in_pixels(count: f64) -> i32 {
+    (count * f64::from(UNIT)).round() as i32
+}
