@@ -35,6 +35,18 @@ pub const CLASSIC_BYTES: usize = 16;
 /// Bytes of `struct canfd_frame`.
 pub const FD_BYTES: usize = 72;
 
+/// The length on the wire of so many bytes in an FD frame: the next one that CAN FD has, up to 64.
+#[must_use]
+pub const fn fd_len(len: usize) -> usize {
+    match len {
+        0..=8 => len,
+        9..=24 => len.next_multiple_of(4),
+        25..=32 => 32,
+        33..=48 => 48,
+        _ => 64,
+    }
+}
+
 /// Classic CAN or CAN FD.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Format {
@@ -213,6 +225,17 @@ impl Frame {
     pub fn data(&self) -> &[u8] {
         let len = if self.is_remote() { 0 } else { usize::from(self.len) };
         self.data.get(..len).unwrap_or_default()
+    }
+
+    /// The bytes between control field and checksum on a wire: an FD frame of a length that CAN FD does not have is
+    /// filled up with zeros, and its remote flag means nothing.
+    pub(crate) fn on_wire(&self) -> &[u8] {
+        let len = match self.format {
+            Format::Classic if self.is_remote() => 0,
+            Format::Classic => usize::from(self.len),
+            Format::Fd => fd_len(usize::from(self.len)),
+        };
+        self.data.get(..len).unwrap_or(&self.data)
     }
 
     /// The kernel's struct; only the first [`Frame::byte_len`] bytes are its own.

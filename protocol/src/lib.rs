@@ -19,3 +19,4 @@ pub mod touch;
 #[cfg(feature = "host")]
 pub mod usage;
 pub mod wire;
+pub mod wire_time;

@@ -1,0 +1,214 @@
+//! Bit rates, as people write them and as CAN has them.
+
+use core::fmt;
+use core::str::FromStr;
+
+use thiserror::Error;
+
+/// The two bit rates of a bus, within what CAN allows.
+///
+/// Written `1M/5M`, or `1M` alone when nothing goes quicker (classic CAN).
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub struct BitRates {
+    nominal: u32,
+    data: u32,
+}
+
+/// What is no bit rate of CAN's.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum BitRatesError {
+    /// Not a number of bits in a second.
+    #[error("not a bit rate: write bit/s, as 1000000, 500k or 1M")]
+    Text,
+    /// Outside what a nominal bit rate may be.
+    #[error(
+        "nominal bit rate {got} bit/s: CAN allows {} to {} (10k to 1M)",
+        BitRates::LEAST_NOMINAL,
+        BitRates::GREATEST_NOMINAL
+    )]
+    Nominal {
+        /// Bits in a second.
+        got: u32,
+    },
+    /// Outside what a data bit rate may be.
+    #[error(
+        "data bit rate {got} bit/s: CAN FD allows {least} (the nominal one) to {} (8M)",
+        BitRates::GREATEST_DATA
+    )]
+    Data {
+        /// Bits in a second.
+        got: u32,
+        /// The nominal bit rate beside it.
+        least: u32,
+    },
+}
+
+impl BitRates {
+    /// The least nominal bit rate, in bit/s; so has a skin's description.
+    pub const LEAST_NOMINAL: u32 = 10_000;
+    /// The greatest nominal bit rate, in bit/s.
+    pub const GREATEST_NOMINAL: u32 = 1_000_000;
+    /// The greatest data bit rate, in bit/s.
+    pub const GREATEST_DATA: u32 = 8_000_000;
+
+    /// Both rates, in bit/s.
+    ///
+    /// # Errors
+    /// When the nominal one is not in [10 000, 1 000 000], or the data one not between it and 8 000 000.
+    pub const fn new(nominal: u32, data: u32) -> Result<Self, BitRatesError> {
+        if nominal < Self::LEAST_NOMINAL || nominal > Self::GREATEST_NOMINAL {
+            return Err(BitRatesError::Nominal { got: nominal });
+        }
+        if data < nominal || data > Self::GREATEST_DATA {
+            return Err(BitRatesError::Data { got: data, least: nominal });
+        }
+        Ok(Self { nominal, data })
+    }
+
+    /// One rate for everything, in bit/s: a classic bus.
+    ///
+    /// # Errors
+    /// When it is not in [10 000, 1 000 000].
+    pub const fn classic(nominal: u32) -> Result<Self, BitRatesError> {
+        Self::new(nominal, nominal)
+    }
+
+    /// Bits in a second while identifiers are compared, and of all of a frame that does not switch.
+    #[must_use]
+    pub const fn nominal(self) -> u32 {
+        self.nominal
+    }
+
+    /// Bits in a second of the data of a frame that switches.
+    #[must_use]
+    pub const fn data(self) -> u32 {
+        self.data
+    }
+}
+
+/// Reads one bit rate: `1000000`, `500k`, `1M`, `2.5M`. Whether CAN allows it is [`BitRates::new`]'s business.
+///
+/// # Errors
+/// When it is not a whole number of bits in a second in [0, 2^32).
+pub fn bit_rate(text: &str) -> Result<u32, BitRatesError> {
+    let (number, unit) = match text.as_bytes().last() {
+        Some(b'k' | b'K') => (text.get(..text.len() - 1).unwrap_or(""), 1_000),
+        Some(b'M') => (text.get(..text.len() - 1).unwrap_or(""), 1_000_000),
+        _ => (text, 1),
+    };
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, "0"));
+    let is_number = |digits: &str| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit());
+    if !is_number(whole) || !is_number(fraction) {
+        return Err(BitRatesError::Text);
+    }
+    let mut rate =
+        whole.parse().ok().and_then(|whole: u32| whole.checked_mul(unit)).ok_or(BitRatesError::Text)?;
+    let mut place = unit;
+    for digit in fraction.bytes().map(|byte| u32::from(byte - b'0')) {
+        if place < 10 && digit > 0 {
+            return Err(BitRatesError::Text);
+        }
+        place /= 10;
+        rate = rate.checked_add(digit * place).ok_or(BitRatesError::Text)?;
+    }
+    Ok(rate)
+}
+
+impl FromStr for BitRates {
+    type Err = BitRatesError;
+
+    fn from_str(text: &str) -> Result<Self, BitRatesError> {
+        let (nominal, data) = text.split_once('/').unwrap_or((text, text));
+        Self::new(bit_rate(nominal)?, bit_rate(data)?)
+    }
+}
+
+impl fmt::Display for BitRates {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write_rate(f, self.nominal)?;
+        if self.data != self.nominal {
+            f.write_str("/")?;
+            write_rate(f, self.data)?;
+        }
+        Ok(())
+    }
+}
+
+fn write_rate(f: &mut fmt::Formatter<'_>, rate: u32) -> fmt::Result {
+    match rate {
+        _ if rate.is_multiple_of(1_000_000) => write!(f, "{}M", rate / 1_000_000),
+        _ if rate.is_multiple_of(1_000) => write!(f, "{}k", rate / 1_000),
+        _ => write!(f, "{rate}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bit_rates_are_read_as_people_write_them() {
+        for (text, rate) in [
+            ("1000000", 1_000_000),
+            ("1M", 1_000_000),
+            ("500k", 500_000),
+            ("500K", 500_000),
+            ("2.5M", 2_500_000),
+            ("83.333k", 83_333),
+            ("0.125M", 125_000),
+            ("1.0", 1),
+            ("4294967295", u32::MAX),
+        ] {
+            assert_eq!(bit_rate(text), Ok(rate), "{text}");
+        }
+        for text in [
+            "",
+            "M",
+            "k",
+            "1m",
+            "1 M",
+            "-1M",
+            "+1M",
+            "1.",
+            ".5M",
+            "1.05",
+            "1.2345k",
+            "5000M",
+            "4294967296",
+            "1M/5M",
+        ] {
+            assert_eq!(bit_rate(text), Err(BitRatesError::Text), "{text}");
+        }
+    }
+
+    #[test]
+    fn both_rates_are_written_as_they_are_read() {
+        for text in ["1M/5M", "500k/2M", "1M", "83333/83k"] {
+            let rates: Result<BitRates, _> = text.parse();
+            if text == "83333/83k" {
+                assert_eq!(rates, Err(BitRatesError::Data { got: 83_000, least: 83_333 }));
+            } else {
+                assert_eq!(rates.unwrap().to_string(), text);
+            }
+        }
+        assert_eq!("125000/2500000".parse::<BitRates>().unwrap().to_string(), "125k/2500k");
+    }
+
+    #[test]
+    fn what_can_does_not_allow_is_refused_with_its_range() {
+        let error = |text: &str| text.parse::<BitRates>().unwrap_err().to_string();
+        assert_eq!(error("2M/5M"), "nominal bit rate 2000000 bit/s: CAN allows 10000 to 1000000 (10k to 1M)");
+        assert_eq!(error("9999"), "nominal bit rate 9999 bit/s: CAN allows 10000 to 1000000 (10k to 1M)");
+        assert_eq!(
+            error("500k/10M"),
+            "data bit rate 10000000 bit/s: CAN FD allows 500000 (the nominal one) to 8000000 (8M)"
+        );
+        assert_eq!(
+            error("1M/500k"),
+            "data bit rate 500000 bit/s: CAN FD allows 1000000 (the nominal one) to 8000000 (8M)"
+        );
+        assert_eq!(error("fast"), "not a bit rate: write bit/s, as 1000000, 500k or 1M");
+        assert!(BitRates::new(10_000, 8_000_000).is_ok());
+    }
+}
