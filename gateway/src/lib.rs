@@ -9,6 +9,7 @@ pub mod dbc;
 pub mod decode;
 pub mod explain;
 pub mod external;
+pub mod fit;
 pub mod generate;
 pub mod listing;
 pub mod network;

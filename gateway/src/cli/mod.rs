@@ -8,6 +8,7 @@ mod convert;
 mod dbc;
 mod dump;
 mod explain;
+mod fit;
 mod frame;
 mod input;
 mod output;
@@ -48,6 +49,7 @@ enum Command {
     Skin(skin::Skin),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
+    Fit(fit::Fit),
 }
 
 impl Command {
@@ -67,6 +69,7 @@ impl Command {
             Self::Skin(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),
+            Self::Fit(command) => command.run(),
         }
     }
 }

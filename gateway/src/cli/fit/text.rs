@@ -1,0 +1,224 @@
+//! What `gateway fit` prints for people.
+
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use gateway::fit::case::{Answers, Case};
+use gateway::fit::limits::{Limit, NODES, Need};
+use gateway::fit::{BusFit, Judged, Row, Whole, name};
+use protocol::parameters::Sensing;
+use protocol::skin::Skin;
+
+use super::super::print::Rows;
+
+/// A line for each of several bit rates.
+pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
+    let Some(first) = rows.first() else { return String::new() };
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    table.set_header([
+        "bit rates",
+        "packet\nµs",
+        "load\n%",
+        "last\nms",
+        "cells\na bus",
+        "buses\nneeded",
+        "roots:\nload %",
+        "roots:\nlast ms",
+    ]);
+    for row in rows {
+        let BusFit { judged, most, answers, .. } = &row.fullest;
+        let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
+        table.add_row([
+            name(judged.case.format, judged.case.rates),
+            micros(judged.case.packet_ns()),
+            percent(judged.load.total()),
+            judged.times.last_ns().map_or_else(|| "-".to_owned(), millis),
+            most.in_time().to_string(),
+            needed_shortly(&row.need),
+            roots.map_or_else(String::new, |it| percent(it.load.total())),
+            roots.and_then(|it| it.times.last_ns()).map_or_else(|| "-".to_owned(), millis),
+        ]);
+    }
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let case = &first.fullest.judged.case;
+    let cells = skin.cells.len();
+    let bus = match skin.buses.len() {
+        1 => format!("{cells} cells on one bus"),
+        buses => format!("{cells} cells on {buses} buses, here the fullest with {}", case.answers.cells()),
+    };
+    format!(
+        "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
+         load   joints, {} of all cells, heartbeats{}; more than 100 % does not fit\n\
+         last   from the joints' turn on the bus to the end of the last answer, at most; - has no bound\n\
+         cells  that one bus has time for; transceivers drive about {}\n\
+         buses  for {cells} cells, and what asks for so many: time, or nodes electrically\n\
+         roots  sums along the tree with only the roots on this bus (sums of all cells save no frame)\n",
+        skin.name,
+        millis(case.period_ns),
+        micros(case.computation_ns),
+        what(case),
+        sensors(case),
+        NODES - 1,
+    )
+}
+
+/// Buses at their bit rates: a section for each, and one for all cells of the skin.
+pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> String {
+    let Some(first) = buses.first() else { return String::new() };
+    let case = &first.judged.case;
+    let period = format!("joints every {} ms", millis(case.period_ns));
+    let computation = format!("a cell computes {} µs", micros(case.computation_ns));
+    let mut rows = Rows::new([skin.name.clone(), period, computation]);
+    for bus in buses {
+        section(&mut rows, bus);
+    }
+    // Of one bus its own section says the same.
+    if let Some(whole) = whole.filter(|_| buses.len() > 1) {
+        rows.section(format!("{} cells in all", whole.cells), "on the fullest bus", "");
+        for (buses, judged) in &whole.spread {
+            let on = format!("{} of {} cells", count(*buses), judged.case.answers.cells());
+            rows.row(on, figures(judged), verdict(judged));
+        }
+        rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
+    }
+    format!("{}\n", rows.table())
+}
+
+fn section(rows: &mut Rows, bus: &BusFit) {
+    let BusFit { name: bus_name, judged, most, need, answers, remedies } = bus;
+    let Judged { case, load, times, .. } = judged;
+    let cells = case.answers.cells();
+    let rates = name(case.format, case.rates);
+    rows.section(format!("{bus_name}, {rates}"), verdict(judged), format!("{cells} cells, {}", what(case)));
+    let parts = [
+        ("joints", load.joints),
+        (what(case), load.answers),
+        ("sensors", load.sensors),
+        ("heartbeats", load.heartbeats),
+    ];
+    let parts =
+        parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", percent(*share)));
+    rows.row("load", format!("{} %", percent(load.total())), parts.collect::<Vec<_>>().join(", "));
+    let bounds =
+        [("chain", times.chain_ns), ("response-time analysis", times.response_ns.map(|it| it.worst_ns))];
+    let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
+    let bounds = bounds.collect::<Vec<_>>().join(", ");
+    rows.row("last answer after joints", last(judged), bounds);
+    rows.row("  it has to be there after", format!("{} ms", millis(case.deadline_ns())), "");
+    let heartbeat =
+        times.heartbeat_ns.map_or_else(|| "no bound".to_owned(), |ns| format!("{} ms", millis(ns)));
+    rows.row("a heartbeat takes", heartbeat, "600 ms of silence make a dead cell");
+    let others =
+        format!("bandwidth {}, deadline {}, nodes about {}", most.bandwidth, most.deadline, most.nodes);
+    rows.row("cells that one bus takes", most.in_time().min(most.nodes), others);
+    rows.row("buses needed", needed(need), each_need(need));
+    if !remedies.is_empty() {
+        rows.section("  what to change", "", "");
+        for remedy in remedies {
+            rows.row(format!("  {}", remedy.change), figures(&remedy.after), verdict(&remedy.after));
+        }
+    }
+    rows.section("  instead of these answers", "", "");
+    for remedy in answers {
+        rows.row(format!("  {}", remedy.change), figures(&remedy.after), verdict(&remedy.after));
+    }
+    if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
+        rows.row("  sums", "not possible", "no wires lead from a root to every cell");
+    }
+}
+
+fn is_of_roots(case: &Case) -> bool {
+    matches!(case.answers, Answers::Sums { shared: false, .. })
+}
+
+const fn what(case: &Case) -> &'static str {
+    match case.answers {
+        Answers::Torques { .. } => "torques",
+        Answers::Sums { .. } => "sums",
+    }
+}
+
+const fn sensors(case: &Case) -> &'static str {
+    match case.sensing {
+        Sensing::Off => "",
+        Sensing::Continuous { .. } => ", sensors",
+        Sensing::Event => ", sensors while nothing changes",
+    }
+}
+
+/// Load and last answer.
+fn figures(judged: &Judged) -> String {
+    format!("{} %, {}", percent(judged.load.total()), last(judged))
+}
+
+fn last(judged: &Judged) -> String {
+    let Judged { case, load, times, .. } = judged;
+    match times.last_ns() {
+        Some(last_ns) => format!("{} ms", millis(last_ns)),
+        None if load.total() > 1.0 => "no bound".to_owned(),
+        None => format!("above {} ms", millis(case.period_ns)),
+    }
+}
+
+fn verdict(judged: &Judged) -> String {
+    let nodes = judged.case.answers.cells() + 1;
+    let exceeded = &judged.exceeded;
+    match (judged.is_in_time(), exceeded.contains(&Limit::Nodes)) {
+        (true, false) => "fits".to_owned(),
+        (true, true) => format!("in time; too many nodes: {nodes}"),
+        (false, _) if exceeded.contains(&Limit::Bandwidth) => "does not fit: bandwidth".to_owned(),
+        (false, _) => "does not fit: deadline".to_owned(),
+    }
+}
+
+/// As [`needed`], in fewer words: bandwidth and deadline are both a matter of time.
+fn needed_shortly(need: &Need) -> String {
+    let word = |limit| match limit {
+        Limit::Bandwidth | Limit::Deadline => "time",
+        Limit::Nodes => "nodes",
+    };
+    let mut words: Vec<_> = need.binding().into_iter().map(word).collect();
+    words.dedup();
+    let buses = need.buses().map_or_else(|| "none".to_owned(), |buses| buses.to_string());
+    if buses == "1" { buses } else { format!("{buses} {}", words.join(", ")) }
+}
+
+fn needed(need: &Need) -> String {
+    let why: Vec<_> = need.binding().into_iter().map(Limit::name).collect();
+    need.buses().map_or_else(
+        || format!("none: {}", why.join(", ")),
+        |buses| if buses == 1 { "1".to_owned() } else { format!("{buses}: {}", why.join(", ")) },
+    )
+}
+
+fn each_need(need: &Need) -> String {
+    let of = |name: &str, buses: Option<u32>| {
+        buses.map_or_else(|| format!("{name} no number"), |buses| format!("{name} {buses}"))
+    };
+    [of("bandwidth", need.bandwidth), of("deadline", need.deadline), of("nodes", need.nodes)].join(", ")
+}
+
+fn count(buses: u32) -> String {
+    if buses == 1 { "1 bus".to_owned() } else { format!("{buses} buses") }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn millis(ns: u64) -> String {
+    trimmed(ns as f64 / 1e6, 2)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn micros(ns: u64) -> String {
+    trimmed(ns as f64 / 1e3, 1)
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1}", 100.0 * share)
+}
+
+/// So many decimals at most, and no zeros at the end.
+fn trimmed(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}

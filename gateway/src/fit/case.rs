@@ -1,0 +1,321 @@
+//! One bus, what its cells say on it, and how long that takes at most.
+
+use protocol::can::Format;
+use protocol::parameters::Sensing;
+use protocol::skin::{Reply, Skin};
+use protocol::wire_time::{BitRates, Coding, Shape};
+
+use super::response::{Response, Stream, response};
+
+/// A cell says how it is this often, in ns.
+const HEARTBEAT_NS: u64 = 250_000_000;
+/// With sensors on, a frame of acceleration follows every fourth heartbeat.
+const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
+/// How much of the period `gateway skin generate` gives to slots, in hundredths.
+const SLOTS_SHARE: u64 = 75;
+
+/// What the cells of a bus answer joints with, all of them in contact.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Answers {
+    /// Each cell its own torque.
+    Torques {
+        /// So many cells.
+        cells: u32,
+    },
+    /// Each cell on the bus one sum.
+    Sums {
+        /// Cells on the bus by their distance from a root in wires; roots first.
+        by_depth: Vec<u32>,
+        /// Width of a slot in ns.
+        slot_ns: u64,
+        /// Whether those below the roots are on the bus too; else they speak over wires of their own.
+        shared: bool,
+    },
+}
+
+impl Answers {
+    /// How many cells are on the bus: each of them answers.
+    #[must_use]
+    pub fn cells(&self) -> u32 {
+        match self {
+            Self::Torques { cells } => *cells,
+            Self::Sums { by_depth, shared: true, .. } => by_depth.iter().sum(),
+            Self::Sums { by_depth, shared: false, .. } => by_depth.first().copied().unwrap_or(0),
+        }
+    }
+
+    /// The same skin with more or fewer cells: of sums the tree keeps its shape.
+    #[must_use]
+    pub fn with_cells(&self, cells: u32) -> Self {
+        match self {
+            Self::Torques { .. } => Self::Torques { cells },
+            Self::Sums { by_depth, slot_ns, shared } => {
+                let (all, mut given, mut before) = (u64::from(self.cells().max(1)), 0, 0);
+                let scaled = by_depth.iter().map(|&here| {
+                    before += u64::from(here);
+                    let so_far = (before * u64::from(cells)).div_ceil(all);
+                    let here = so_far - given;
+                    given = so_far;
+                    u32::try_from(here).unwrap_or(u32::MAX)
+                });
+                Self::Sums { by_depth: scaled.collect(), slot_ns: *slot_ns, shared: *shared }
+            }
+        }
+    }
+}
+
+/// One bus with its rates and its cells.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Case {
+    /// One FD frame a packet, or two classic ones.
+    pub format: Format,
+    /// Its bit rates.
+    pub rates: BitRates,
+    /// From joints to joints in ns.
+    pub period_ns: u64,
+    /// The longest that a cell takes from the end of the joints until its answer is ready, in ns.
+    pub computation_ns: u64,
+    /// When cells say what they measure without being asked.
+    pub sensing: Sensing,
+    /// What they answer with.
+    pub answers: Answers,
+}
+
+/// Shares of a bus' time, each of the longest frames there can be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Load {
+    /// Joints.
+    pub joints: f64,
+    /// Torques or sums.
+    pub answers: f64,
+    /// What cells measure.
+    pub sensors: f64,
+    /// Heartbeats.
+    pub heartbeats: f64,
+}
+
+impl Load {
+    /// Of everything.
+    #[must_use]
+    pub fn total(&self) -> f64 {
+        self.joints + self.answers + self.sensors + self.heartbeats
+    }
+}
+
+/// How long things take on a bus, at most; `None` where there is no bound.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Times {
+    /// From the broadcast's turn to its end, in ns.
+    pub joints_ns: Option<u64>,
+    /// From the broadcast's turn to the end of the last answer by [`Case::chain_ns`].
+    pub chain_ns: Option<u64>,
+    /// The same by response-time analysis, for torques.
+    pub response_ns: Option<Response>,
+    /// From when a heartbeat is due to its end, in ns.
+    pub heartbeat_ns: Option<u64>,
+}
+
+impl Times {
+    /// The last answer by the smaller of the bounds.
+    #[must_use]
+    pub fn last_ns(&self) -> Option<u64> {
+        self.chain_ns.into_iter().chain(self.response_ns.map(|it| it.worst_ns)).min()
+    }
+}
+
+impl Case {
+    /// One bus of a skin as it is described, at these rates.
+    #[must_use]
+    pub fn of(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
+        let described = skin.buses.get(bus)?;
+        let period_ns = u64::from(skin.timing.ticks_per_broadcast) * skin.timing.tick_nanos();
+        let answers = match described.reply {
+            Reply::Torque => torques(skin, bus),
+            Reply::Sum { slot_us, .. } => sums(skin, bus, period_ns, Some(slot_us), true)?,
+        };
+        Some(Self { format, rates, period_ns, computation_ns, sensing: described.sensing, answers })
+    }
+
+    /// The longest frame of 16 bytes (classic: of 8), in ns.
+    #[must_use]
+    pub fn frame_ns(&self) -> u64 {
+        let (coding, len) = match self.format {
+            Format::Fd => (Coding::FdSwitched, 16),
+            Format::Classic => (Coding::Classic, 8),
+        };
+        Shape { coding, extended: false, len }.worst().nanoseconds(self.rates)
+    }
+
+    /// Frames that a packet takes.
+    const fn frames(&self) -> u32 {
+        match self.format {
+            Format::Fd => 1,
+            Format::Classic => 2,
+        }
+    }
+
+    /// The longest packet in ns.
+    #[must_use]
+    pub fn packet_ns(&self) -> u64 {
+        u64::from(self.frames()) * self.frame_ns()
+    }
+
+    /// The time of the answers of so many cells in ns.
+    fn packets_ns(&self, cells: u32) -> u64 {
+        self.packet_ns().saturating_mul(u64::from(cells))
+    }
+
+    /// A bit of the arbitration in ns, rounded up.
+    fn bit_ns(&self) -> u64 {
+        1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal()))
+    }
+
+    /// What is on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
+    ///
+    /// Heartbeats and what goes with them may be said up to a period of the joints early.
+    fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
+        let (cells, early_ns, frame_ns) = (self.answers.cells(), self.period_ns, self.frame_ns());
+        let stream = |senders: u32, period_ns, jitter_ns| {
+            let count = senders.saturating_mul(self.frames());
+            Stream { count, period_ns, jitter_ns, frame_ns }
+        };
+        let none = stream(0, ACCELERATION_NS, early_ns);
+        let acceleration = stream(cells, ACCELERATION_NS, early_ns);
+        let [page_0, page_1] = match self.sensing {
+            Sensing::Off => [none; 2],
+            Sensing::Continuous { period_ms } => {
+                let period_ns = u64::from(period_ms) * 1_000_000;
+                let early_ns = if period_ns > self.period_ns { early_ns } else { 0 };
+                [stream(cells, period_ns, early_ns), acceleration]
+            }
+            Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), acceleration],
+        };
+        [
+            stream(1, self.period_ns, 0),
+            stream(cells, self.period_ns, answers_jitter_ns),
+            page_0,
+            page_1,
+            stream(cells, HEARTBEAT_NS, early_ns),
+        ]
+    }
+
+    /// What the bus is loaded with; of events only those that come when nothing changes.
+    #[must_use]
+    pub fn load(&self) -> Load {
+        let [joints, answers, page_0, page_1, heartbeats] = self.streams(0).map(|it| it.load());
+        Load { joints, answers, sensors: page_0 + page_1, heartbeats }
+    }
+
+    /// The longest times.
+    #[must_use]
+    pub fn times(&self) -> Times {
+        let joints_ns = self.joints_ns();
+        let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
+        Times {
+            joints_ns,
+            chain_ns: joints_ns.and_then(|it| self.chain_ns(it)),
+            response_ns: self.response_ns(joints_ns),
+            heartbeat_ns: heartbeat.map(|it| it.worst_ns),
+        }
+    }
+
+    /// Whether the last answer is there by [`Case::deadline_ns`], by one of the bounds.
+    #[must_use]
+    pub fn is_in_time(&self) -> bool {
+        let joints_ns = self.joints_ns();
+        let is_early = |last_ns: u64| last_ns <= self.deadline_ns();
+        joints_ns.and_then(|it| self.chain_ns(it)).is_some_and(is_early)
+            || self.response_ns(joints_ns).is_some_and(|it| is_early(it.worst_ns))
+    }
+
+    fn joints_ns(&self) -> Option<u64> {
+        response(&self.streams(0), 0, self.bit_ns()).map(|it| it.worst_ns)
+    }
+
+    /// By how much answers may come at different times after the joints' turn.
+    fn jitter_ns(&self, joints_ns: Option<u64>) -> u64 {
+        joints_ns.unwrap_or(0).saturating_add(self.computation_ns)
+    }
+
+    fn response_ns(&self, joints_ns: Option<u64>) -> Option<Response> {
+        match self.answers {
+            Answers::Torques { .. } => response(&self.streams(self.jitter_ns(joints_ns)), 1, self.bit_ns()),
+            // Their releases depend on each other, which response-time analysis does not know.
+            Answers::Sums { .. } => None,
+        }
+    }
+
+    /// From the broadcast's turn to the end of the last answer, in ns, one after the other.
+    ///
+    /// ```text
+    ///   torques         blocking + joints + computation + blocking + N * reply
+    ///   sums            blocking + joints + (computation + blocking) * (deepest + 1) + N * reply
+    ///   roots' alone    blocking + joints + slot * deepest + computation + blocking + N * reply
+    /// ```
+    ///
+    /// A frame of lower priority can be in the way twice: one of the joints, and, as the bus is idle while cells compute,
+    /// another of the answers. From then on the bus sends nothing but answers until there are none. Of sums, nothing is
+    /// sent only while every cell that has not spoken waits for one that computes, which happens once for each wire down
+    /// the tree at most. `None` when it is longer than a period: what is left then delays the next answers.
+    fn chain_ns(&self, joints_ns: u64) -> Option<u64> {
+        // Answers that are ready when the joints end let nobody pass.
+        let blocking_ns = if self.computation_ns > 0 { self.frame_ns() } else { 0 };
+        let step_ns = self.computation_ns.saturating_add(blocking_ns);
+        let ready_ns = match &self.answers {
+            Answers::Torques { .. } => step_ns,
+            Answers::Sums { by_depth, shared: true, .. } => {
+                let deep = by_depth.iter().rposition(|&here| here > 0).unwrap_or(0);
+                step_ns.saturating_mul(u64::try_from(deep).unwrap_or(u64::MAX).saturating_add(1))
+            }
+            Answers::Sums { by_depth, slot_ns, shared: false } => {
+                let deepest = u64::try_from(by_depth.len().saturating_sub(1)).unwrap_or(u64::MAX);
+                slot_ns.saturating_mul(deepest).saturating_add(step_ns)
+            }
+        };
+        let last_ns = joints_ns.checked_add(ready_ns)?.checked_add(self.packets_ns(self.answers.cells()))?;
+        (last_ns <= self.period_ns).then_some(last_ns)
+    }
+
+    /// When the last answer has to be there, in ns from the broadcast: at the next one; a cell waits for others' sums for
+    /// 7/8 of the period.
+    #[must_use]
+    pub const fn deadline_ns(&self) -> u64 {
+        match self.answers {
+            Answers::Torques { .. } => self.period_ns,
+            Answers::Sums { .. } => self.period_ns / 8 * 7,
+        }
+    }
+
+    /// The same bus with more or fewer cells.
+    #[must_use]
+    pub fn with_cells(&self, cells: u32) -> Self {
+        Self { answers: self.answers.with_cells(cells), ..self.clone() }
+    }
+}
+
+fn torques(skin: &Skin, bus: usize) -> Answers {
+    Answers::Torques { cells: u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX) }
+}
+
+/// The tree as the wires of a bus allow it; `None` when a cell has no way to a root. Without a described slot, one as
+/// `gateway skin generate` would choose.
+pub(super) fn sums(
+    skin: &Skin,
+    bus: usize,
+    period_ns: u64,
+    slot_us: Option<u32>,
+    shared: bool,
+) -> Option<Answers> {
+    let depths = skin.wires(bus).depths();
+    let mut by_depth = Vec::new();
+    for cell in skin.cells_of(bus) {
+        let depth = usize::from((*depths.get(cell.node.index())?)?);
+        if by_depth.len() <= depth {
+            by_depth.resize(depth + 1, 0);
+        }
+        *by_depth.get_mut(depth)? += 1;
+    }
+    let slots = u64::try_from(by_depth.len().max(1)).unwrap_or(u64::MAX);
+    let slot_ns = slot_us.map_or_else(|| period_ns * SLOTS_SHARE / 100 / slots, |us| u64::from(us) * 1_000);
+    Some(Answers::Sums { by_depth, slot_ns, shared })
+}

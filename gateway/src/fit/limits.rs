@@ -1,0 +1,181 @@
+//! How many cells a bus takes, how many buses so many cells take, and which limit says so.
+
+use serde::Serialize;
+
+use super::case::Case;
+
+/// About as many nodes as common transceivers drive on one bus; the gateway is one of them.
+pub const NODES: u32 = 110;
+
+/// Nobody has more cells than this on one bus, whatever fits.
+const ENDLESS: u32 = 1 << 20;
+
+/// What keeps more cells from a bus.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Limit {
+    /// All frames together take longer than there is time.
+    Bandwidth,
+    /// The last answer comes after the next joints.
+    Deadline,
+    /// Transceivers do not drive more.
+    Nodes,
+}
+
+impl Limit {
+    /// What people call it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bandwidth => "bandwidth",
+            Self::Deadline => "deadline",
+            Self::Nodes => "nodes",
+        }
+    }
+}
+
+/// The most cells that each limit lets onto one bus.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+pub struct Most {
+    /// With heartbeats and everything, at most 100 % load.
+    pub bandwidth: u32,
+    /// So that the last answer is there in time.
+    pub deadline: u32,
+    /// Electrically, [`NODES`] less the gateway.
+    pub nodes: u32,
+}
+
+impl Most {
+    /// Of a bus like this one.
+    #[must_use]
+    pub fn of(case: &Case) -> Self {
+        Self {
+            bandwidth: greatest(|cells| has_room(&case.with_cells(cells))),
+            deadline: greatest(|cells| case.with_cells(cells).is_in_time()),
+            nodes: NODES - 1,
+        }
+    }
+
+    /// In time: by the tighter of bandwidth and deadline.
+    #[must_use]
+    pub fn in_time(&self) -> u32 {
+        self.bandwidth.min(self.deadline)
+    }
+
+    /// The limit that is reached first, of bandwidth and deadline.
+    #[must_use]
+    pub const fn tighter(&self) -> Limit {
+        if self.deadline < self.bandwidth { Limit::Deadline } else { Limit::Bandwidth }
+    }
+}
+
+/// Whether all frames find their time.
+fn has_room(case: &Case) -> bool {
+    case.load().total() <= 1.0
+}
+
+/// What is too much on a bus.
+#[must_use]
+pub fn exceeded(case: &Case) -> Vec<Limit> {
+    let checks = [
+        (Limit::Bandwidth, has_room(case)),
+        (Limit::Deadline, case.is_in_time()),
+        (Limit::Nodes, case.answers.cells() < NODES),
+    ];
+    checks.into_iter().filter(|(_, holds)| !holds).map(|(limit, _)| limit).collect()
+}
+
+/// The greatest number that something holds for which holds for all lesser ones; 0 when it does not even for 1.
+fn greatest(holds: impl Fn(u32) -> bool) -> u32 {
+    let mut beyond = 1;
+    while beyond < ENDLESS && holds(beyond) {
+        beyond *= 2;
+    }
+    let mut least = beyond / 2;
+    while beyond - least > 1 {
+        let middle = least.midpoint(beyond);
+        if holds(middle) {
+            least = middle;
+        } else {
+            beyond = middle;
+        }
+    }
+    least
+}
+
+/// Buses that so many cells take, by each limit; `None` where not even one cell fits.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+pub struct Need {
+    /// By bandwidth.
+    pub bandwidth: Option<u32>,
+    /// By the last answer.
+    pub deadline: Option<u32>,
+    /// Electrically.
+    pub nodes: Option<u32>,
+}
+
+impl Need {
+    /// Of so many cells, spread evenly.
+    #[must_use]
+    pub fn of(most: &Most, cells: u32) -> Self {
+        let buses = |most: u32| (most > 0).then(|| cells.div_ceil(most));
+        Self { bandwidth: buses(most.bandwidth), deadline: buses(most.deadline), nodes: buses(most.nodes) }
+    }
+
+    /// In time, whatever the transceivers.
+    #[must_use]
+    pub fn in_time(&self) -> Option<u32> {
+        Some(self.bandwidth?.max(self.deadline?))
+    }
+
+    /// By all limits.
+    #[must_use]
+    pub fn buses(&self) -> Option<u32> {
+        Some(self.in_time()?.max(self.nodes?))
+    }
+
+    /// The limits that ask for that many.
+    #[must_use]
+    pub fn binding(&self) -> Vec<Limit> {
+        let needs = [
+            (Limit::Bandwidth, self.bandwidth),
+            (Limit::Deadline, self.deadline),
+            (Limit::Nodes, self.nodes),
+        ];
+        // None is more than any number.
+        let key = |buses: Option<u32>| buses.unwrap_or(u32::MAX);
+        let most = needs.iter().map(|&(_, buses)| key(buses)).max();
+        needs.into_iter().filter(|&(_, buses)| Some(key(buses)) == most).map(|(limit, _)| limit).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_greatest_is_found_wherever_it_is() {
+        for limit in [0, 1, 2, 3, 4, 5, 63, 64, 65, 253, 1_000] {
+            assert_eq!(greatest(|number| number <= limit), limit);
+        }
+        assert!(greatest(|_| true) >= ENDLESS / 2);
+    }
+    #[test]
+    fn the_larger_need_binds_and_equal_ones_both() {
+        let need = |bandwidth, deadline| Need::of(&Most { bandwidth, deadline, nodes: 109 }, 253);
+        assert_eq!((need(212, 223).buses(), need(212, 223).binding()), (Some(3), vec![Limit::Nodes]));
+        assert_eq!(need(212, 223).in_time(), Some(2));
+        assert_eq!(
+            (need(58, 57).buses(), need(58, 57).binding()),
+            (Some(5), vec![Limit::Bandwidth, Limit::Deadline])
+        );
+        assert_eq!((need(2, 0).buses(), need(2, 0).binding()), (None, vec![Limit::Deadline]));
+        assert_eq!(need(90, 91).binding(), Limit::all());
+    }
+
+    impl Limit {
+        fn all() -> Vec<Self> {
+            vec![Self::Bandwidth, Self::Deadline, Self::Nodes]
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! Would it fit on a real bus: load, the longest time from joints to the last answer, and how many cells and buses that makes.
+//!
+//! All frames are taken as long as stuffing can make them ([`protocol::wire_time`]), all cells as in contact, and the bus
+//! as free of errors. Every node sends its lowest identifier first. Joints, answers, sensors and heartbeats are counted;
+//! stimuli, commands, configuration and simulated wires are not: they are the bench's, or rare.
+//!
+//! ```text
+//!   skin, rates ──> Case ──> streams ──> response   ┐
+//!                      └───> chain ─────────────────┴─> Times ──> limits ──> remedies
+//! ```
+
+pub mod case;
+mod json;
+pub mod limits;
+pub mod remedy;
+pub mod response;
+
+use protocol::can::Format;
+use protocol::skin::Skin;
+use protocol::wire_time::BitRates;
+
+pub use json::json;
+
+use case::{Case, Load, Times};
+use limits::{Limit, Most, Need, exceeded};
+use remedy::Remedy;
+
+/// The paper's cell computes 68.5 µs: 1096 instructions at 16 MIPS.
+pub const COMPUTATION_NS: u64 = 68_500;
+
+/// Common bit rates, in bit/s: nominal and data.
+pub const COMMON: [Common; 7] = [
+    Common(Format::Classic, 500_000, 500_000),
+    Common(Format::Classic, 1_000_000, 1_000_000),
+    Common(Format::Fd, 500_000, 2_000_000),
+    Common(Format::Fd, 500_000, 5_000_000),
+    Common(Format::Fd, 1_000_000, 2_000_000),
+    Common(Format::Fd, 1_000_000, 5_000_000),
+    Common(Format::Fd, 1_000_000, 8_000_000),
+];
+
+/// A format and its bit rates, nominal and data in bit/s.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Common(pub Format, pub u32, pub u32);
+
+impl Common {
+    /// The rates, checked.
+    #[must_use]
+    pub fn rates(&self) -> Option<BitRates> {
+        BitRates::new(self.1, self.2).ok()
+    }
+}
+
+/// How people write a format with its rates: `1M/5M`, `classic 1M`.
+#[must_use]
+pub fn name(format: Format, rates: BitRates) -> String {
+    match format {
+        Format::Fd => rates.to_string(),
+        Format::Classic => format!("classic {rates}"),
+    }
+}
+
+/// A bus with these rates and cells, judged.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Judged {
+    /// What was looked at.
+    pub case: Case,
+    /// Shares of its time.
+    pub load: Load,
+    /// Longest times.
+    pub times: Times,
+    /// What is too much.
+    pub exceeded: Vec<Limit>,
+}
+
+impl Judged {
+    /// Looks at a bus.
+    #[must_use]
+    pub fn of(case: &Case) -> Self {
+        Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
+    }
+
+    /// Whether everything has its time, whatever the transceivers.
+    #[must_use]
+    pub fn is_in_time(&self) -> bool {
+        self.exceeded.iter().all(|&limit| limit == Limit::Nodes)
+    }
+}
+
+/// One bus of the skin.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BusFit {
+    /// Its name.
+    pub name: String,
+    /// As it is described.
+    pub judged: Judged,
+    /// The most cells that it takes.
+    pub most: Most,
+    /// Buses that its cells take.
+    pub need: Need,
+    /// What its cells could answer with instead.
+    pub answers: Vec<Remedy>,
+    /// What else can be done when it is too much.
+    pub remedies: Vec<Remedy>,
+}
+
+/// Looks at one bus of a skin, given as an index into [`Skin::buses`]; `None` when there is none.
+#[must_use]
+pub fn bus(
+    skin: &Skin,
+    index: usize,
+    format: Format,
+    rates: BitRates,
+    computation_ns: u64,
+) -> Option<BusFit> {
+    let name = skin.buses.get(index)?.name.clone();
+    let case = Case::of(skin, index, format, rates, computation_ns)?;
+    let most = Most::of(&case);
+    Some(BusFit {
+        name,
+        judged: Judged::of(&case),
+        most,
+        need: Need::of(&most, case.answers.cells()),
+        answers: remedy::answers(skin, index, &case),
+        remedies: remedy::remedies(skin, &case),
+    })
+}
+
+/// All cells of a skin, evenly on several buses.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Whole {
+    /// So many cells.
+    pub cells: u32,
+    /// Buses that they take.
+    pub need: Need,
+    /// The fullest bus of so many.
+    pub spread: Vec<(u32, Judged)>,
+}
+
+/// Spreads all cells of a skin over more and more buses that are like the fullest one of it.
+#[must_use]
+pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
+    let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
+    let need = Need::of(&fullest.most, cells);
+    let numbers = 1..=need.buses().unwrap_or(1);
+    // Of many only those that say something: all that is less than needed is too little.
+    let told = |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
+    let spread = numbers
+        .filter(told)
+        .map(|buses| (buses, Judged::of(&fullest.judged.case.with_cells(cells.div_ceil(buses)))));
+    Whole { cells, need, spread: spread.collect() }
+}
+
+/// The skin at one format and its rates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Row {
+    /// The fullest bus as it is described.
+    pub fullest: BusFit,
+    /// Buses that all cells of the skin take.
+    pub need: Need,
+}
+
+/// Looks at the fullest bus of a skin at all common rates, or those of one format.
+#[must_use]
+pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
+    let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
+    let rows = COMMON.iter().filter(|it| format.is_none_or(|format| format == it.0));
+    let row = |common: &Common| {
+        let rates = common.rates()?;
+        let buses =
+            (0..skin.buses.len()).filter_map(|index| bus(skin, index, common.0, rates, computation_ns));
+        let fullest = fullest(buses)?;
+        let need = Need::of(&fullest.most, cells);
+        Some(Row { fullest, need })
+    };
+    rows.filter_map(row).collect()
+}
+
+/// The bus with the greatest load.
+#[must_use]
+pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
+    buses.max_by(|one, other| one.judged.load.total().total_cmp(&other.judged.load.total()))
+}
+
+#[cfg(test)]
+mod tests;

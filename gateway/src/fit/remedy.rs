@@ -1,0 +1,130 @@
+//! What to change where a bus does not hold what it should, each with what comes of it.
+
+use protocol::can::Format;
+use protocol::parameters::Sensing;
+use protocol::skin::{Reply, Skin};
+
+use super::case::{self, Answers, Case};
+use super::limits::{Limit, Most, Need, exceeded};
+use super::{COMMON, Judged};
+
+/// The longest period of joints that the wire protocol has a word for, in ns.
+const LONGEST_NS: u64 = 65_535_000;
+
+/// A change and the bus after it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Remedy {
+    /// What to change.
+    pub change: String,
+    /// What comes of it; of several buses, of the fullest.
+    pub after: Judged,
+}
+
+/// What can be done about a bus; nothing when it holds all limits.
+#[must_use]
+pub fn remedies(skin: &Skin, case: &Case) -> Vec<Remedy> {
+    let exceeded = exceeded(case);
+    if exceeded.is_empty() {
+        return Vec::new();
+    }
+    let mut remedies = more_buses(case);
+    // Transceivers do not care how fast it goes.
+    if exceeded != [Limit::Nodes] {
+        remedies.extend(faster(case));
+        remedies.extend(slower_joints(skin, case));
+        remedies.extend(events(case));
+    }
+    remedies
+}
+
+fn remedy(change: String, case: &Case) -> Remedy {
+    Remedy { change, after: Judged::of(case) }
+}
+
+/// As many as its time takes, and as many as transceivers take.
+fn more_buses(case: &Case) -> Vec<Remedy> {
+    let cells = case.answers.cells();
+    let need = Need::of(&Most::of(case), cells);
+    let mut numbers: Vec<_> =
+        [need.in_time(), need.buses()].into_iter().flatten().filter(|&it| it > 1).collect();
+    numbers.dedup();
+    let spread = |buses: u32| {
+        let each = cells.div_ceil(buses);
+        remedy(format!("{buses} buses of {each} cells"), &case.with_cells(each))
+    };
+    numbers.into_iter().map(spread).collect()
+}
+
+/// The slowest common rates at which it is in time: of the same format, and CAN FD in the place of classic CAN.
+fn faster(case: &Case) -> Vec<Remedy> {
+    let at = |format: Format| {
+        let mut slowest: Option<Case> = None;
+        for rates in COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates()) {
+            let other = Case { format, rates, ..case.clone() };
+            let quicker = slowest.as_ref().is_none_or(|it| it.frame_ns() < other.frame_ns());
+            if is_in_time(&other) && quicker {
+                slowest = Some(other);
+            }
+        }
+        slowest
+    };
+    let formats: &[Format] = match case.format {
+        Format::Fd => &[Format::Fd],
+        Format::Classic => &[Format::Classic, Format::Fd],
+    };
+    formats
+        .iter()
+        .filter_map(|&format| at(format))
+        .map(|it| remedy(super::name(it.format, it.rates), &it))
+        .collect()
+}
+
+fn is_in_time(case: &Case) -> bool {
+    exceeded(case).iter().all(|&limit| limit == Limit::Nodes)
+}
+
+/// The shortest period of whole ticks in which everything has its time.
+fn slower_joints(skin: &Skin, case: &Case) -> Option<Remedy> {
+    let tick_ns = skin.timing.tick_nanos();
+    let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= LONGEST_NS);
+    let slower = periods.map(|period_ns| Case { period_ns, ..case.clone() }).find(is_in_time)?;
+    Some(remedy(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
+}
+
+#[expect(clippy::cast_precision_loss, reason = "below 1e8")]
+fn hertz(period_ns: u64) -> f64 {
+    (1e9 / period_ns as f64 * 1e6).round() / 1e6
+}
+
+/// Sensors that speak when something changes.
+fn events(case: &Case) -> Option<Remedy> {
+    match case.sensing {
+        Sensing::Off | Sensing::Event => None,
+        Sensing::Continuous { .. } => {
+            let quiet = Case { sensing: Sensing::Event, ..case.clone() };
+            Some(remedy("sensing = \"event\", as long as nothing changes".to_owned(), &quiet))
+        }
+    }
+}
+
+/// What the cells of a bus can answer with instead of what they do: torques, sums with all cells on the bus, and sums
+/// with only the roots on it, where its wires lead everywhere.
+#[must_use]
+pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Remedy> {
+    let slot_us = match skin.buses.get(bus).map(|it| it.reply) {
+        Some(Reply::Sum { slot_us, .. }) => Some(slot_us),
+        Some(Reply::Torque) | None => None,
+    };
+    let sums = |shared| case::sums(skin, bus, case.period_ns, slot_us, shared);
+    let torques = Answers::Torques { cells: case.answers.cells() };
+    let others = [
+        (Some(torques), "torques"),
+        (sums(true), "sums, all cells on this bus"),
+        (sums(false), "sums, only roots on this bus"),
+    ];
+    let other = |(answers, change): (Option<Answers>, &str)| {
+        let other = Case { answers: answers?, ..case.clone() };
+        (other.answers != case.answers).then(|| remedy(change.to_owned(), &other))
+    };
+    others.into_iter().filter_map(other).collect()
+}
