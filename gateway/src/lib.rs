@@ -1,5 +1,6 @@
 #![doc = include_str!("../README.md")]
 
+pub mod bus_model;
 pub mod capture;
 pub mod central;
 pub mod commission;

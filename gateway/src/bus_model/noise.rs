@@ -1,0 +1,124 @@
+//! Bits that arrive wrong.
+
+use protocol::wire_time::Bits;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use thiserror::Error;
+
+/// Bits of an error frame and of the intermission behind it, at the nominal bit rate: flags of 6 bits, the last of which begins
+/// when the first one ends, a delimiter of 8, and 3.
+pub const ERROR_FRAME: u32 = 12 + 8 + 3;
+/// The intermission, in which nothing can be damaged.
+const INTERMISSION: u32 = 3;
+/// Bits of an FD frame's tail that are at the nominal bit rate, the intermission among them.
+const FD_TAIL: u32 = 12;
+
+/// A bit-error rate that is none, or too high for a frame to come through.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+#[error("bit-error rate {got}: 0 to {} are possible", BitErrors::GREATEST)]
+pub struct BitErrorsError {
+    /// What was asked for.
+    pub got: f64,
+}
+
+/// Which bits are damaged: each by itself with the same probability, drawn from a seed.
+#[derive(Clone, Debug)]
+pub struct BitErrors {
+    dice: Pcg64Mcg,
+    /// The logarithm of the probability that a bit is not damaged.
+    sound: f64,
+    /// Good bits that come before the next one that is damaged.
+    good: u64,
+}
+
+impl BitErrors {
+    /// The greatest rate: a frame of 200 bits then comes through in one of seven attempts.
+    pub const GREATEST: f64 = 0.01;
+
+    /// Errors by their rate, in [0, [`BitErrors::GREATEST`]].
+    ///
+    /// # Errors
+    /// When the rate is outside.
+    pub fn new(rate: f64, seed: u64) -> Result<Self, BitErrorsError> {
+        if !(0.0..=Self::GREATEST).contains(&rate) {
+            return Err(BitErrorsError { got: rate });
+        }
+        let mut errors = Self { dice: Pcg64Mcg::seed_from_u64(seed), sound: (-rate).ln_1p(), good: 0 };
+        errors.draw();
+        Ok(errors)
+    }
+
+    /// The distance to the next damaged bit, geometrically distributed.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "above 0; what is too great is the greatest"
+    )]
+    fn draw(&mut self) {
+        let uniform: f64 = self.dice.random();
+        // In (0, 1]; without errors the distance has no end.
+        self.good = if self.sound < 0.0 { ((1.0 - uniform).ln() / self.sound) as u64 } else { u64::MAX };
+    }
+
+    /// What is sent of a frame, and the error frame after it, if one of its bits is damaged.
+    pub(super) fn spoils(&mut self, bits: Bits) -> Option<Bits> {
+        let exposed = bits.total().saturating_sub(INTERMISSION);
+        if self.good >= u64::from(exposed) {
+            self.good = self.good.saturating_sub(u64::from(exposed));
+            return None;
+        }
+        let sent = u32::try_from(self.good).unwrap_or(exposed) + 1;
+        self.draw();
+        let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL) } else { bits.nominal };
+        let data = sent.saturating_sub(head).min(bits.data);
+        Some(Bits { nominal: sent - data + ERROR_FRAME, data })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FRAME: Bits = Bits { nominal: 30, data: 170 };
+
+    #[test]
+    fn frames_are_damaged_as_often_as_the_rate_says() {
+        const FRAMES: u32 = 200_000;
+        let rate = 1e-3;
+        let mut errors = BitErrors::new(rate, 7).unwrap();
+        let damaged = (0..FRAMES).filter(|_| errors.spoils(FRAME).is_some()).count();
+        // A frame is damaged if one of its first 197 bits is. Six standard deviations: once in 500 million seeds.
+        let (frames, one) = (f64::from(FRAMES), 1.0 - (1.0 - rate).powi(197));
+        let deviation = (frames * one * (1.0 - one)).sqrt();
+        assert!((damaged as f64 - frames * one).abs() < 6.0 * deviation, "{damaged}");
+    }
+
+    #[test]
+    fn what_was_sent_of_a_damaged_frame_takes_its_bits_at_their_rates() {
+        let mut errors = BitErrors::new(0.01, 1).unwrap();
+        let mut seen = [false; 3];
+        for _ in 0..10_000 {
+            let Some(Bits { nominal, data }) = errors.spoils(FRAME) else { continue };
+            let sent = nominal - ERROR_FRAME;
+            // Head: 18 nominal bits. Tail: 9 before the intermission.
+            match (sent, data) {
+                (1..=18, 0) => seen[0] = true,
+                (18, 1..170) => seen[1] = true,
+                (18..=27, 170) => seen[2] = true,
+                other => panic!("{other:?}"),
+            }
+        }
+        assert_eq!(seen, [true; 3]);
+    }
+
+    #[test]
+    fn without_a_rate_nothing_is_damaged_and_no_other_rate_is_taken() {
+        let mut errors = BitErrors::new(0.0, 3).unwrap();
+        assert!((0..1_000).all(|_| errors.spoils(FRAME).is_none()));
+        for got in [-1e-9, 0.011, f64::NAN, f64::INFINITY] {
+            assert!(BitErrors::new(got, 0).is_err(), "{got}");
+        }
+        let error = BitErrors::new(0.5, 0).unwrap_err();
+        assert_eq!(error.to_string(), "bit-error rate 0.5: 0 to 0.01 are possible");
+    }
+}
