@@ -111,7 +111,7 @@ pub struct Times {
     pub chain_ns: Option<u64>,
     /// The same by response-time analysis, for torques.
     pub response_ns: Option<Response>,
-    /// From when a heartbeat is due to its end, in ns.
+    /// From when a heartbeat is due to its end, in ns; it may be said a period early.
     pub heartbeat_ns: Option<u64>,
 }
 
@@ -210,12 +210,13 @@ impl Case {
     #[must_use]
     pub fn times(&self) -> Times {
         let joints_ns = self.joints_ns();
+        // From the earliest that it may be said, which is a period before it is due.
         let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
         Times {
             joints_ns,
             chain_ns: joints_ns.and_then(|it| self.chain_ns(it)),
             response_ns: self.response_ns(joints_ns),
-            heartbeat_ns: heartbeat.map(|it| it.worst_ns),
+            heartbeat_ns: heartbeat.map(|it| it.worst_ns.saturating_sub(self.period_ns)),
         }
     }
 

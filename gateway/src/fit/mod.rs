@@ -184,3 +184,5 @@ pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_simulated;

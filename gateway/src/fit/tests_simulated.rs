@@ -1,0 +1,279 @@
+//! Buses in virtual time, with exact stuffing, against what is computed for them.
+
+use std::collections::BTreeMap;
+
+use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
+use protocol::parameters::Sensing;
+use protocol::wire_time::Bits;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use super::COMPUTATION_NS;
+use super::case::{Answers, Case};
+use crate::bus_model::{BusModel, Priority, Request};
+
+/// How long the cells of an epoch compute.
+#[derive(Clone, Copy, Debug)]
+enum Computation {
+    /// All as long as they may.
+    Longest,
+    /// Each time anything up to that.
+    Any,
+    /// All but one at once.
+    Straggler,
+}
+
+/// When the cells' heartbeats fall due.
+#[derive(Clone, Copy, Debug)]
+enum Heartbeats {
+    /// Spread over their period by node number, cells started together.
+    Spread,
+    /// Each cell as it was started.
+    Any,
+    /// All within the time that cells compute after some joints.
+    Together,
+}
+
+/// What words hold.
+#[derive(Clone, Copy, Debug)]
+enum Data {
+    /// Anything.
+    Any,
+    /// Anything, and zeros as in torques of joints beyond the cell.
+    Zeros,
+}
+
+/// One simulation: the longest times in it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Longest {
+    /// From the broadcast's turn to the end of the last answer in ns.
+    last_ns: u64,
+    /// From when a heartbeat is due to its end in ns; nothing when it was early enough.
+    heartbeat_ns: u64,
+}
+
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+enum Sent {
+    Joints,
+    Torque(u32),
+    Sensors(u32),
+    Acceleration(u32),
+    Heartbeat(u32),
+}
+
+impl Sent {
+    const fn id(self) -> u32 {
+        match self {
+            Self::Joints => 0x001,
+            Self::Torque(node) => 0x200 | node,
+            Self::Sensors(node) | Self::Acceleration(node) => 0x300 | node,
+            Self::Heartbeat(node) => 0x400 | node,
+        }
+    }
+}
+
+/// A bus with its cells.
+struct Bench<'a> {
+    case: &'a Case,
+    data: Data,
+    dice: Pcg64Mcg,
+    bus: BusModel,
+    /// What will be sent, by time; of what is due, since when.
+    agenda: BTreeMap<(u64, u32), (Sent, u64)>,
+    entered: u32,
+    /// By tag: what it is, since when it is due, and whether it is the packet's last frame.
+    on_the_way: Vec<(Sent, u64, bool)>,
+}
+
+impl Bench<'_> {
+    fn enter(&mut self, at: u64, sent: Sent, due: u64) {
+        self.agenda.insert((at, self.entered), (sent, due));
+        self.entered += 1;
+    }
+
+    fn bytes(&mut self) -> [u8; 16] {
+        let mut bytes: [u8; 16] = self.dice.random();
+        if let Data::Zeros = self.data {
+            let zeros = 2 * self.dice.random_range(0..=6);
+            bytes[zeros..12].fill(0);
+        }
+        bytes
+    }
+
+    fn send(&mut self, at: u64, sent: Sent, due: u64) {
+        let bytes = self.bytes();
+        let frames = match self.case.format {
+            Format::Fd => vec![Frame::fd(sent.id(), BIT_RATE_SWITCH, &bytes).unwrap()],
+            Format::Classic => bytes.chunks(8).map(|half| Frame::classic(sent.id(), half).unwrap()).collect(),
+        };
+        for (index, frame) in frames.iter().enumerate() {
+            let tag = u64::try_from(self.on_the_way.len()).unwrap();
+            self.on_the_way.push((sent, due, index + 1 == frames.len()));
+            let (priority, bits) = (Priority::of(frame), Bits::of(frame).unwrap());
+            self.bus.request(Request { at, priority, bits, queue: None, tag });
+        }
+    }
+}
+
+/// Runs so many epochs of a bus whose cells are all in contact.
+fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, Data)) -> Longest {
+    let (computation, heartbeats, data) = how;
+    let (cells, period) = (case.answers.cells(), case.period_ns);
+    let mut bench = Bench {
+        case,
+        data,
+        dice: Pcg64Mcg::seed_from_u64(seed),
+        bus: BusModel::new(case.rates),
+        agenda: BTreeMap::new(),
+        entered: 0,
+        on_the_way: Vec::new(),
+    };
+    let end = epochs * period;
+    for epoch in 0..epochs {
+        bench.enter(epoch * period, Sent::Joints, epoch * period);
+    }
+    let start = bench.dice.random_range(0..250_000_000);
+    for node in 1..=cells {
+        let phase = match heartbeats {
+            Heartbeats::Spread => (start + 250_000_000 * u64::from(node) / 255) % 250_000_000,
+            Heartbeats::Any => bench.dice.random_range(0..250_000_000),
+            Heartbeats::Together => period + bench.dice.random_range(0..2 * case.frame_ns()),
+        };
+        for due in (0..).map(|it| phase + it * 250_000_000).take_while(|&due| due < end) {
+            // As long as early as the rules allow: up to a period.
+            let early = if bench.dice.random() { bench.dice.random_range(0..period) } else { 0 };
+            bench.enter(due.saturating_sub(early), Sent::Heartbeat(node), due);
+        }
+        if let Sensing::Continuous { period_ms } = case.sensing {
+            let every = u64::from(period_ms) * 1_000_000;
+            let phase = bench.dice.random_range(0..every);
+            for due in (0..).map(|it| phase + it * every).take_while(|&due| due < end) {
+                bench.enter(due, Sent::Sensors(node), due);
+            }
+            bench.enter(bench.dice.random_range(0..end), Sent::Acceleration(node), 0);
+        }
+    }
+    let straggler = bench.dice.random_range(1..=cells);
+    let (mut longest, mut answered) = (Longest::default(), BTreeMap::<u64, u32>::new());
+    loop {
+        let next = bench.agenda.first_key_value().map(|(&(at, _), _)| at);
+        let passes = bench.bus.poll_timeout();
+        match (next, passes) {
+            (None, None) => break,
+            (Some(at), passes) if passes.is_none_or(|passes| at < passes) => {
+                let ((at, _), (sent, due)) = bench.agenda.pop_first().unwrap();
+                bench.send(at, sent, due);
+            }
+            (_, Some(at)) => bench.bus.run_until(at),
+            (Some(_), None) => unreachable!("the guard above takes it"),
+        }
+        while let Some(attempt) = bench.bus.poll() {
+            let (sent, due, is_whole) = bench.on_the_way[usize::try_from(attempt.tag).unwrap()];
+            match sent {
+                _ if !is_whole => {}
+                Sent::Joints => {
+                    for node in 1..=cells {
+                        let took = match computation {
+                            Computation::Longest => case.computation_ns,
+                            Computation::Any => bench.dice.random_range(0..=case.computation_ns),
+                            Computation::Straggler if node == straggler => case.computation_ns,
+                            Computation::Straggler => 0,
+                        };
+                        bench.enter(attempt.end + took, Sent::Torque(node), due);
+                    }
+                }
+                Sent::Torque(_) => {
+                    *answered.entry(due).or_default() += 1;
+                    longest.last_ns = longest.last_ns.max(attempt.end - due);
+                }
+                Sent::Heartbeat(_) => {
+                    longest.heartbeat_ns = longest.heartbeat_ns.max(attempt.end.saturating_sub(due));
+                }
+                Sent::Sensors(_) | Sent::Acceleration(_) => {}
+            }
+        }
+    }
+    let all = |epoch: u64| answered.get(&(epoch * period)) == Some(&cells);
+    assert!((0..epochs).all(all), "every cell answered every epoch");
+    longest
+}
+
+fn case(rates: &str, cells: u32) -> Case {
+    let (format, rates) = match rates.strip_prefix("classic ") {
+        Some(rates) => (Format::Classic, rates),
+        None => (Format::Fd, rates),
+    };
+    Case {
+        format,
+        rates: rates.parse().unwrap(),
+        period_ns: 16_000_000,
+        computation_ns: COMPUTATION_NS,
+        sensing: Sensing::Off,
+        answers: Answers::Torques { cells },
+    }
+}
+
+/// The longest over many seeds, each with another way to be slow; and that it never is above what is computed.
+fn longest(case: &Case, seeds: u64, epochs: u64) -> Longest {
+    let times = case.times();
+    let mut all = Longest::default();
+    for seed in 0..seeds {
+        let pick = |of: u64, from: u64| usize::try_from(seed / of % from).unwrap();
+        let how = (
+            [Computation::Longest, Computation::Any, Computation::Straggler][pick(1, 3)],
+            [Heartbeats::Together, Heartbeats::Spread, Heartbeats::Any][pick(3, 3)],
+            [Data::Any, Data::Zeros][pick(9, 2)],
+        );
+        let longest = simulate(case, epochs, seed, how);
+        for computed in [times.chain_ns, times.response_ns.map(|it| it.worst_ns)].into_iter().flatten() {
+            assert!(longest.last_ns <= computed, "{} of {computed}, seed {seed}, {how:?}", longest.last_ns);
+        }
+        assert!(times.heartbeat_ns.is_none_or(|it| longest.heartbeat_ns <= it), "{longest:?} {times:?} {how:?}");
+        all.last_ns = all.last_ns.max(longest.last_ns);
+        all.heartbeat_ns = all.heartbeat_ns.max(longest.heartbeat_ns);
+    }
+    all
+}
+
+/// What part of the smaller bound the slowest simulation reached.
+fn reached(case: &Case, seeds: u64, epochs: u64) -> f64 {
+    let bound = case.times().last_ns().unwrap();
+    longest(case, seeds, epochs).last_ns as f64 / bound as f64
+}
+
+#[test]
+fn the_arm_on_one_bus_at_1m_8m_is_never_slower_than_computed_and_comes_close() {
+    let reached = reached(&case("1M/8M", 253), 18, 18);
+    assert!(reached >= 0.85, "{reached}");
+}
+
+#[test]
+fn the_arm_on_three_buses_at_1m_5m_is_never_slower_than_computed_and_comes_close() {
+    let reached = reached(&case("1M/5M", 85), 54, 18);
+    assert!(reached >= 0.85, "{reached}");
+}
+
+#[test]
+fn so_are_one_cell_sixty_cells_and_classic_ones() {
+    for (rates, cells) in
+        [("1M/5M", 1), ("500k/2M", 60), ("1M/2M", 110), ("classic 1M", 50), ("classic 500k", 20), ("1M", 60)]
+    {
+        let reached = reached(&case(rates, cells), 18, 18);
+        assert!(reached >= 0.85, "{rates} {cells}: {reached}");
+    }
+}
+
+#[test]
+fn sensors_do_not_delay_answers_by_more_than_is_computed() {
+    let sensing = Sensing::Continuous { period_ms: 20 };
+    let reached = reached(&Case { sensing, ..case("1M/5M", 85) }, 18, 18);
+    assert!(reached >= 0.85, "{reached}");
+}
+
+#[test]
+fn a_cell_that_takes_longer_to_compute_is_waited_for() {
+    for computation_ns in [0, 1_000, 2_000_000, 5_000_000] {
+        let reached = reached(&Case { computation_ns, ..case("1M/5M", 85) }, 18, 18);
+        assert!(reached >= 0.85, "{computation_ns} ns: {reached}");
+    }
+}
