@@ -21,6 +21,7 @@ pub mod robot;
 pub mod ros2;
 pub mod run;
 pub mod scenario;
+pub mod shadow;
 mod stimuli;
 pub mod summary;
 pub mod table;

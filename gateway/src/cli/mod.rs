@@ -17,6 +17,7 @@ mod recover;
 mod replay;
 mod run;
 mod sensing;
+mod shadow;
 mod skin;
 
 use std::process::ExitCode;
@@ -49,6 +50,7 @@ enum Command {
     Skin(skin::Skin),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
+    Shadow(shadow::ShadowCommand),
     Fit(fit::Fit),
 }
 
@@ -69,6 +71,7 @@ impl Command {
             Self::Skin(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),
+            Self::Shadow(command) => command.run(),
             Self::Fit(command) => command.run(),
         }
     }

@@ -1,0 +1,114 @@
+//! How fast a capture goes through the model of a real bus, and what memory that takes.
+//!
+//! ```text
+//!   cargo build --release -p gateway && cargo run --release -p gateway --example shadow_speed [MINUTES [FOLDER]]
+//! ```
+//!
+//! The capture (60 minutes unless told, 4 GB in FOLDER, gone afterwards) is a skin's: joints at 62.5 Hz, after which each of
+//! 253 cells answers, 16 thousand frames a second in all, with every fourth cell's heartbeat. Replies are spread as processes
+//! spread them, over 6 ms.
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    clippy::cast_precision_loss,
+    reason = "a measurement may stop"
+)]
+
+use std::fs::File;
+use std::io::{BufWriter, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use protocol::can::Format;
+use protocol::candump::{Record, Timestamp, write_record};
+use protocol::id::{self, CellId, Id};
+use protocol::packet::{Epoch, Packet, WORDS};
+
+/// From joints to joints, in µs.
+const PERIOD: u64 = 16_000;
+/// Cells.
+const CELLS: i64 = 253;
+
+/// The frames of one epoch, as candump writes them.
+fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) -> u64 {
+    let mut frames = 0;
+    let mut say = |micros: u64, id: Id, word: i16| {
+        let epoch = Epoch(number.to_le_bytes()[0]);
+        let packet = Packet { id, words: [word; WORDS], epoch, count: 1 };
+        for frame in packet.frames(Format::Fd) {
+            let nanos = (1_700_000_000_000_000 + number * PERIOD + micros) * 1_000;
+            let time = Timestamp { nanos, nine_digits: false };
+            line.clear();
+            write_record(line, &Record { time, interface: "vcan0", frame, direction: None }).unwrap();
+            line.push('\n');
+            log.write_all(line.as_bytes()).unwrap();
+            frames += 1;
+        }
+    };
+    say(0, Id::command(id::Command::Joints), 0);
+    for (cell, place) in (1..=CELLS).zip(0_u64..) {
+        let node = id::Node::Cell(CellId::new(cell).unwrap());
+        let word = (number * 31 + place * 977).to_le_bytes();
+        say(100 + place * 23, Id::new(id::Kind::Torque, node), i16::from_le_bytes([word[0], word[1]]));
+    }
+    // Heartbeats and the like: 2 in an epoch make 16 thousand frames a second.
+    for beat in 0..2 {
+        let cell = i64::try_from((number * 2 + beat) % 253).unwrap() + 1;
+        let node = id::Node::Cell(CellId::new(cell).unwrap());
+        say(9_000 + beat * 500, Id::new(id::Kind::Network, node), 0);
+    }
+    frames
+}
+
+/// Seconds, and the greatest memory of the process in MB.
+fn run(gateway: &Path, log: &Path, arguments: &[&str]) -> (f64, f64) {
+    let begun = Instant::now();
+    let mut command = Command::new(gateway);
+    command.arg("shadow").arg(log).args(arguments).stdout(Stdio::null());
+    let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");
+    let status = Path::new("/proc").join(child.id().to_string()).join("status");
+    let mut kib = 0.0_f64;
+    let done = loop {
+        let text = std::fs::read_to_string(&status).unwrap_or_default();
+        let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let peak = peak.and_then(|peak| peak.trim().trim_end_matches(" kB").parse().ok());
+        kib = kib.max(peak.unwrap_or(0.0));
+        if let Some(done) = child.try_wait().unwrap() {
+            break done;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    };
+    assert!(done.success(), "{command:?}");
+    (begun.elapsed().as_secs_f64(), kib / 1024.0)
+}
+
+fn main() {
+    let mut arguments = std::env::args().skip(1);
+    let minutes: u64 = arguments.next().map_or(60, |minutes| minutes.parse().expect("MINUTES is a number"));
+    let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
+    let program = std::env::current_exe().unwrap();
+    let gateway = program.parent().and_then(Path::parent).unwrap().join("gateway");
+    let place = tempfile::tempdir_in(folder).unwrap();
+    let log = place.path().join("run.log");
+    let mut out = BufWriter::with_capacity(1 << 20, File::create(&log).unwrap());
+    let mut line = String::new();
+    let epochs = minutes * 60_000_000 / PERIOD;
+    let frames: u64 = (0..epochs).map(|number| write_epoch(&mut out, &mut line, number)).sum();
+    out.flush().unwrap();
+    drop(out);
+    let lasts = (epochs * PERIOD) as f64 / 1e6;
+    println!(
+        "capture                  {frames} frames in {lasts:.0} s, {:.0} a second",
+        frames as f64 / lasts
+    );
+    for (name, arguments) in [
+        ("tables, 1M/8M", &["--data", "8M"][..]),
+        ("tables, 1M/5M (too slow)", &[]),
+        ("--json, 1M/8M", &["--data", "8M", "--json"]),
+    ] {
+        let (seconds, memory) = run(&gateway, &log, arguments);
+        let (rate, times) = (frames as f64 / seconds / 1e6, lasts / seconds);
+        println!("{name:25}{rate:.2} million frames/s, {times:.0} times real time, {memory:.0} MB");
+    }
+}

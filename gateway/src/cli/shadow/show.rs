@@ -1,0 +1,139 @@
+//! A shadow as JSON lines and as a table.
+
+use std::io::{self, Write};
+
+use gateway::shadow::{BusShadow, Delays, Loads, Most, Replies, Report, Shaded, Shadow, identifier};
+use protocol::wire_time::Bits;
+
+use crate::cli::print::Rows;
+
+/// Writes the frames of which it is known what became of them, one object a line.
+pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
+    while let Some(frame) = shadow.poll() {
+        write_frame(out, frame.bus.map(|bus| shadow.bus(bus)), &frame)?;
+    }
+    Ok(())
+}
+
+fn write_frame(out: &mut impl Write, bus: Option<&str>, frame: &Shaded) -> io::Result<()> {
+    let Shaded { nanos, id, extended, bits, sent, .. } = *frame;
+    write!(out, "{{\"time\":{},\"bus\":", Seconds(nanos))?;
+    serde_json::to_writer(&mut *out, &bus)?;
+    write!(out, ",\"id\":\"{}\"", identifier(id, extended))?;
+    match bits {
+        Some(Bits { nominal, data }) => write!(out, ",\"nominal_bits\":{nominal},\"data_bits\":{data}")?,
+        None => write!(out, ",\"nominal_bits\":null,\"data_bits\":null")?,
+    }
+    match sent {
+        Some((start, end)) => writeln!(out, ",\"start_s\":{},\"end_s\":{}}}", Seconds(start), Seconds(end)),
+        None => writeln!(out, ",\"start_s\":null,\"end_s\":null}}"),
+    }
+}
+
+/// Nanoseconds written as seconds with nine digits, which a double could not hold since 1970.
+struct Seconds(u64);
+
+impl std::fmt::Display for Seconds {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}.{:09}", self.0 / 1_000_000_000, self.0 % 1_000_000_000)
+    }
+}
+
+/// All of it as a table.
+pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
+    let head = format!("{what}, {} frames", report.frames);
+    let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
+    let mut rows = Rows::new([name.to_owned(), head, beside]);
+    for bus in &report.buses {
+        one(&mut rows, bus, report.bit_error_rate);
+    }
+    if report.frames_of_other_buses > 0 {
+        rows.row("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    }
+    format!("{}\n", rows.table())
+}
+
+fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
+    let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
+    let missing = if bus.missing > 0 { format!("{} more are missing", bus.missing) } else { String::new() };
+    rows.section(format!("{} at {}", bus.bus, bus.rates), count, missing);
+    load(rows, bus);
+    rows.row("delay, µs", "half / 99 % / greatest", "from wanting to send to the end");
+    rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
+    for kind in &bus.kinds {
+        let (name, delay) = (kind.kind, &kind.delay_us);
+        rows.row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+    }
+    if let Some(replies) = &bus.replies {
+        answers(rows, replies);
+    }
+    rows.row("most that waited", format!("{} frames", bus.queue.value), at(bus, bus.queue));
+    if bus.queue_of_one.value > 0.0 {
+        let of = format!("{} frames of {}", bus.queue_of_one.value, identifier(bus.queue_of_one_id, false));
+        rows.row("  of one identifier", of, at(bus, bus.queue_of_one));
+    }
+    if bit_error_rate > 0.0 {
+        let each = format!("of each bit {bit_error_rate:e}");
+        rows.row("damaged, and sent again", format!("{} attempts", bus.damaged), each);
+    }
+    let of_all =
+        |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
+    if bus.wires > 0 {
+        rows.row("left out: simulated wires", bus.wires, format!("{}; on no real bus", of_all(bus.wires)));
+    }
+    if bus.error_frames > 0 {
+        rows.row("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
+    }
+    if bus.out_of_order > 0 {
+        rows.row("out of order, and sorted", bus.out_of_order, of_all(bus.out_of_order));
+    }
+    if bus.too_late_to_sort > 0 {
+        rows.row("  too far for that", bus.too_late_to_sort, "they count at a later time");
+    }
+    if bus.no_room > 0 {
+        rows.row("never sent", bus.no_room, "4 million frames waited already");
+    }
+}
+
+fn load(rows: &mut Rows, bus: &BusShadow) {
+    let Loads { mean, worst_16_ms, worst_1_s, busy } = bus.load;
+    let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
+    let fits = match mean {
+        Some(mean) if mean > 1.0 => "more than the bus can carry",
+        _ if worst_1_s.value > 1.0 => "for a time more than the bus can carry",
+        _ => "",
+    };
+    rows.row("load that is asked for", share(mean), fits);
+    rows.row("  within any 16 ms, at most", percent(worst_16_ms.value), at(bus, worst_16_ms));
+    rows.row("  within any second, at most", percent(worst_1_s.value), at(bus, worst_1_s));
+    let stretches = &bus.stretches;
+    let longest = stretches.longest_s;
+    let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
+    rows.row("bus taken", share(busy), "");
+    let count = format!("{} times, {:.3} s", stretches.count, stretches.total_s);
+    rows.row("  without a pause for 16 ms", count, beside);
+}
+
+fn answers(rows: &mut Rows, replies: &Replies) {
+    let Replies { count, late_before, late, after_joints_us } = replies;
+    rows.row("answers after their joints, µs", delays(after_joints_us), "half / 99 % / greatest");
+    let before = if *late_before > 0 {
+        format!("{late_before} more were late in the recording already")
+    } else {
+        "after the next joints were to go out".to_owned()
+    };
+    rows.row("  late", format!("{late} of {count}"), before);
+}
+
+fn delays(delays: &Delays) -> String {
+    let Delays { p50, p99, max, .. } = delays;
+    format!("{p50:.0} / {p99:.0} / {max:.0}")
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
+
+fn at(bus: &BusShadow, most: Most) -> String {
+    format!("at {:.3} s", most.at_ns.saturating_sub(bus.first_ns) as f64 / 1e9)
+}

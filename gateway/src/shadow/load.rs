@@ -1,0 +1,128 @@
+//! How much is asked of a bus within any span of a length, and how long it is busy without a pause.
+
+use std::collections::VecDeque;
+
+use super::report::{Most, Stretches};
+
+/// Moments that are told apart within a span; more count at the last one's.
+const MOMENTS: usize = 1 << 16;
+
+/// The most that was asked for within a span of a length, wherever it begins.
+#[derive(Debug)]
+pub(super) struct Window {
+    span: u64,
+    /// When, and how much.
+    asked: VecDeque<(u64, u64)>,
+    sum: u64,
+    most: u64,
+    most_at: u64,
+}
+
+impl Window {
+    pub(super) const fn new(span: u64) -> Self {
+        Self { span, asked: VecDeque::new(), sum: 0, most: 0, most_at: 0 }
+    }
+
+    /// So many ns of the bus were asked for at a time, which never runs backwards.
+    pub(super) fn ask(&mut self, at: u64, nanos: u64) {
+        while let Some(&(then, gone)) = self.asked.front().filter(|(then, _)| then + self.span <= at) {
+            self.asked.pop_front();
+            self.sum -= gone;
+            debug_assert!(then <= at, "time runs forwards");
+        }
+        let is_full = self.asked.len() >= MOMENTS;
+        match self.asked.back_mut() {
+            Some((then, sum)) if *then == at || is_full => *sum += nanos,
+            _ => self.asked.push_back((at, nanos)),
+        }
+        self.sum += nanos;
+        if self.sum > self.most {
+            self.most = self.sum;
+            self.most_at = self.asked.front().map_or(at, |(first, _)| *first);
+        }
+    }
+
+    /// The most as a share of the span, and when the span began.
+    pub(super) fn most(&self) -> (f64, u64) {
+        (self.most as f64 / self.span as f64, self.most_at)
+    }
+}
+
+/// Times without a pause on the wire.
+#[derive(Debug, Default)]
+pub(super) struct Busy {
+    /// All of it, in ns.
+    pub(super) total: u64,
+    begin: u64,
+    end: u64,
+    stretches: Stretches,
+}
+
+impl Busy {
+    /// The wire was taken, in order of time.
+    pub(super) fn take(&mut self, start: u64, end: u64, saturated: u64) {
+        self.total += end - start;
+        if start > self.end {
+            self.close(saturated);
+            self.begin = start;
+        }
+        self.end = end;
+    }
+
+    fn close(&mut self, saturated: u64) {
+        let length = self.end - self.begin;
+        if length >= saturated {
+            self.stretches.count += 1;
+            self.stretches.total_s += length as f64 / 1e9;
+        }
+        let longest = length as f64 / 1e9;
+        if longest > self.stretches.longest_s.value {
+            self.stretches.longest_s = Most { value: longest, at_ns: self.begin };
+        }
+    }
+
+    /// All stretches; those that count as saturated have at least this length in ns.
+    pub(super) fn stretches(&self, saturated: u64) -> Stretches {
+        let mut last = Self { stretches: self.stretches, ..Self::default() };
+        (last.begin, last.end) = (self.begin, self.end);
+        last.close(saturated);
+        last.stretches
+    }
+
+    /// When the wire was last taken, in ns.
+    pub(super) const fn end(&self) -> u64 {
+        self.end
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn the_most_is_that_of_every_span_that_ends_with_a_request(steps in proptest::collection::vec((0..30_u64, 1..9_u64), 1..80)) {
+            let mut window = Window::new(50);
+            let mut now = 0;
+            let asked: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
+            asked.iter().for_each(|&(at, nanos)| window.ask(at, nanos));
+            let within = |end: u64| -> u64 { asked.iter().filter(|(at, _)| *at <= end && at + 50 > end).map(|(_, n)| n).sum() };
+            let most = asked.iter().map(|(at, _)| within(*at)).max().unwrap();
+            prop_assert!((window.most().0 - most as f64 / 50.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn stretches_end_where_the_wire_is_free() {
+        let mut busy = Busy::default();
+        for (start, end) in [(10, 20), (20, 45), (50, 55), (60, 90), (90, 100)] {
+            busy.take(start, end, 30);
+        }
+        let stretches = busy.stretches(30);
+        assert_eq!((busy.total, stretches.count, stretches.longest_s.at_ns), (80, 2, 60));
+        assert!(
+            (stretches.total_s - 75e-9).abs() < 1e-15 && (stretches.longest_s.value - 40e-9).abs() < 1e-15
+        );
+    }
+}

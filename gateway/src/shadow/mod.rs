@@ -1,0 +1,154 @@
+//! What a real bus would have made of some traffic: each frame's bits, when it would have gone out, and what that adds up to.
+//!
+//! ```text
+//!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
+//!                           one lane a bus: sorts,   who sends when └──> report: load, delays, late replies, queues
+//! ```
+//!
+//! A frame's time stamp is taken for the moment at which its sender wanted to send it, which on a bus without bit rate (vcan, the
+//! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
+//! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`GREATEST_QUEUE`] frames wait on a bus.
+
+mod lane;
+mod load;
+mod report;
+#[cfg(test)]
+mod tests;
+mod told;
+
+use protocol::can::{EXTENDED_MASK, Frame};
+use protocol::wire_time::{BitRates, Bits};
+
+use crate::bus_model::{BitErrors, BitErrorsError};
+use crate::decode::wired;
+use lane::Lane;
+use told::Told;
+
+pub use crate::replay::order::{WINDOW_FRAMES, WINDOW_NS};
+pub use lane::{GREATEST_QUEUE, SATURATED_NS};
+pub use report::{BusShadow, Delays, KindDelays, Loads, Most, Replies, Report, Stretches};
+pub use told::Shaded;
+
+/// Buses that are told apart.
+pub const BUSES: usize = 64;
+
+/// What the buses are like.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Bit rates of every bus that is not named.
+    pub rates: BitRates,
+    /// Bit rates by the name of the bus.
+    pub of_bus: Vec<(String, BitRates)>,
+    /// How many bits are damaged, as a share, in [0, [`BitErrors::GREATEST`]].
+    pub bit_errors: f64,
+    /// From what errors are drawn; each bus has its own.
+    pub seed: u64,
+    /// Whether each frame is wanted from [`Shadow::poll`].
+    pub each_frame: bool,
+}
+
+/// Traffic on its way through the model.
+#[derive(Debug)]
+pub struct Shadow {
+    options: Options,
+    lanes: Vec<Lane>,
+    told: Option<Told>,
+    frames: u64,
+    further: u64,
+}
+
+impl Shadow {
+    /// Nothing seen yet.
+    ///
+    /// # Errors
+    /// When the bit-error rate is outside its range.
+    pub fn new(options: Options) -> Result<Self, BitErrorsError> {
+        BitErrors::new(options.bit_errors, options.seed)?;
+        let told = options.each_frame.then(Told::default);
+        Ok(Self { options, lanes: Vec::new(), told, frames: 0, further: 0 })
+    }
+
+    /// Takes the next frame of a bus, with its time in ns.
+    pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let place = self.frames;
+        self.frames += 1;
+        let lane = self.lane(bus);
+        if let Some(told) = &mut self.told {
+            told.enter(lane, nanos, frame.id(), frame.is_extended());
+        }
+        let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
+            self.further += 1;
+            return;
+        };
+        lane.count(nanos);
+        if wired(frame).is_some() {
+            lane.wires += 1;
+            return;
+        }
+        let Some(bits) = Bits::of(frame) else {
+            lane.error_frames += 1;
+            return;
+        };
+        if let Some(told) = &mut self.told {
+            told.bits(place, bits);
+        }
+        lane.take(nanos, frame, bits, place, self.told.as_mut());
+    }
+
+    /// Frames that whoever took the capture lost.
+    pub fn missing(&mut self, bus: &str, frames: u64) {
+        if let Some(lane) = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane)) {
+            lane.missing += frames;
+        }
+    }
+
+    /// There is no more: all that waits goes out.
+    pub fn finish(&mut self) {
+        self.lanes.iter_mut().for_each(|lane| lane.finish(self.told.as_mut()));
+        self.told.iter_mut().for_each(Told::finish);
+    }
+
+    /// The next frame, in the order in which they came, once it is known what became of it.
+    pub fn poll(&mut self) -> Option<Shaded> {
+        self.told.as_mut()?.poll()
+    }
+
+    /// The name of a bus, by [`Shaded::bus`].
+    #[must_use]
+    pub fn bus(&self, bus: usize) -> &str {
+        self.lanes.get(bus).map_or("", |lane| &lane.name)
+    }
+
+    /// What it adds up to.
+    #[must_use]
+    pub fn report(&self) -> Report {
+        Report {
+            frames: self.frames,
+            frames_of_other_buses: self.further,
+            bit_error_rate: self.options.bit_errors,
+            buses: self.lanes.iter().map(Lane::report).collect(),
+        }
+    }
+
+    fn lane(&mut self, bus: &str) -> Option<usize> {
+        // Mostly the one of the frame before, or one of a few.
+        let known = self.lanes.iter().position(|lane| lane.name == bus);
+        if known.is_some() || self.lanes.len() >= BUSES {
+            return known;
+        }
+        let named = self.options.of_bus.iter().find(|(name, _)| name == bus);
+        let rates = named.map_or(self.options.rates, |(_, rates)| *rates);
+        let index = self.lanes.len();
+        let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
+        let errors = BitErrors::new(self.options.bit_errors, seed).ok();
+        let errors = errors.filter(|_| self.options.bit_errors > 0.0);
+        self.lanes.push(Lane::new(bus, rates, errors));
+        Some(index)
+    }
+}
+
+/// An identifier as candump prints it.
+#[must_use]
+pub fn identifier(id: u32, extended: bool) -> String {
+    if extended { format!("{:08X}", id & EXTENDED_MASK) } else { format!("{id:03X}") }
+}

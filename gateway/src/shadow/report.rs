@@ -1,0 +1,151 @@
+//! What a shadow adds up to.
+
+use hdrhistogram::Histogram;
+use protocol::wire_time::BitRates;
+use serde::{Serialize, Serializer};
+
+/// All buses.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Frames of any kind, on all buses.
+    pub frames: u64,
+    /// Of those, frames of buses beyond the 64 that are told apart; they are not modelled.
+    pub frames_of_other_buses: u64,
+    /// The share of bits that were damaged on purpose.
+    pub bit_error_rate: f64,
+    /// Each bus, in the order in which they were met.
+    pub buses: Vec<BusShadow>,
+}
+
+/// One bus.
+#[derive(Clone, Debug, Serialize)]
+pub struct BusShadow {
+    /// Its name.
+    pub bus: String,
+    /// Its bit rates.
+    #[serde(serialize_with = "as_text")]
+    pub rates: BitRates,
+    /// Frames of any kind.
+    pub frames: u64,
+    /// The time of the first one, in ns of the capture's clock.
+    pub first_ns: u64,
+    /// From the first to the last one.
+    pub duration_s: f64,
+    /// Frames that went through the model.
+    pub sent: u64,
+    /// Frames over simulated wires, which no real bus carries.
+    pub wires: u64,
+    /// The driver's error frames, which never were on a wire.
+    pub error_frames: u64,
+    /// Frames that whoever took the capture lost: the load is that much too low.
+    pub missing: u64,
+    /// Frames before the one before them, which were sorted.
+    pub out_of_order: u64,
+    /// Of those, so far out of order that they count at a later time.
+    pub too_late_to_sort: u64,
+    /// Frames for which no more room was to wait.
+    pub no_room: u64,
+    /// Attempts that were damaged.
+    pub damaged: u64,
+    /// What was asked of the bus.
+    pub load: Loads,
+    /// Times without a pause.
+    pub stretches: Stretches,
+    /// From wanting to send to the end of the intermission, in µs: all frames.
+    pub delay_us: Delays,
+    /// The same by kind; empty where the bus does not speak this project's protocol.
+    pub kinds: Vec<KindDelays>,
+    /// Answers to joints, where the bus speaks this project's protocol.
+    pub replies: Option<Replies>,
+    /// The most frames that waited at the same time.
+    pub queue: Most,
+    /// The most frames of one identifier of 11 bits that waited at the same time.
+    pub queue_of_one: Most,
+    /// That identifier.
+    pub queue_of_one_id: u32,
+}
+
+/// Shares of the bus that frames ask for, stuff bits and intermissions included; above 1 it cannot carry them.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Loads {
+    /// Over all of the time; none with less than two moments.
+    pub mean: Option<f64>,
+    /// Within any 16 ms.
+    pub worst_16_ms: Most,
+    /// Within any second.
+    pub worst_1_s: Most,
+    /// The share of the time in which the bus was taken, by whatever.
+    pub busy: Option<f64>,
+}
+
+/// The greatest of something, and when.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Most {
+    /// How much.
+    pub value: f64,
+    /// When that was or began, in ns of the capture's clock.
+    pub at_ns: u64,
+}
+
+/// Times in which the bus had no pause.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Stretches {
+    /// How many of 16 ms and longer.
+    pub count: u64,
+    /// How long those are together.
+    pub total_s: f64,
+    /// The longest of all.
+    pub longest_s: Most,
+}
+
+/// How long something took, in µs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Delays {
+    /// Of how many.
+    pub count: u64,
+    /// Half of them at most so long.
+    pub p50: f64,
+    /// 99 of 100 at most so long.
+    pub p99: f64,
+    /// The longest.
+    pub max: f64,
+}
+
+/// The delays of one kind.
+#[derive(Clone, Debug, Serialize)]
+pub struct KindDelays {
+    /// Its name.
+    pub kind: &'static str,
+    /// How long it took.
+    pub delay_us: Delays,
+}
+
+/// Answers to joints.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Replies {
+    /// How many were looked at.
+    pub count: u64,
+    /// Those that the next joints had overtaken in the recording already.
+    pub late_before: u64,
+    /// Those that came to their end only after the next joints were to go out, and had not been late before.
+    pub late: u64,
+    /// From when joints were to go out to the end of each answer, in µs.
+    pub after_joints_us: Delays,
+}
+
+impl Delays {
+    /// From a histogram of ns.
+    pub(super) fn of(histogram: &Histogram<u64>) -> Self {
+        let micros = |nanos: u64| nanos as f64 / 1e3;
+        if histogram.is_empty() {
+            return Self::default();
+        }
+        let quantile = |share| micros(histogram.value_at_quantile(share));
+        let max = micros(histogram.max());
+        Self { count: histogram.len(), p50: quantile(0.5).min(max), p99: quantile(0.99).min(max), max }
+    }
+}
+
+fn as_text<S: Serializer>(rates: &BitRates, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(rates)
+}

@@ -1,0 +1,76 @@
+//! What became of each frame, in the order in which they came.
+
+use std::collections::VecDeque;
+
+use protocol::wire_time::Bits;
+
+/// What a real bus would have made of a frame.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Shaded {
+    /// Its time in the capture, in ns.
+    pub nanos: u64,
+    /// Its bus, for [`super::Shadow::bus`]; none of a bus beyond those that are told apart.
+    pub bus: Option<usize>,
+    /// Its identifier.
+    pub id: u32,
+    /// Whether that has 29 bits.
+    pub extended: bool,
+    /// Its bits, intermission included; none when it is on no real bus: a simulated wire, a driver's error frame.
+    pub bits: Option<Bits>,
+    /// The first bit and the end of the intermission of the attempt that came through, in ns on the capture's clock; none
+    /// when it never went out.
+    pub sent: Option<(u64, u64)>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Entry {
+    shaded: Shaded,
+    is_open: bool,
+}
+
+/// Frames that wait for those before them.
+#[derive(Debug, Default)]
+pub(super) struct Told {
+    entries: VecDeque<Entry>,
+    /// The place of the first one.
+    first: u64,
+}
+
+impl Told {
+    pub(super) fn enter(&mut self, bus: Option<usize>, nanos: u64, id: u32, extended: bool) {
+        let shaded = Shaded { nanos, bus, id, extended, bits: None, sent: None };
+        self.entries.push_back(Entry { shaded, is_open: false });
+    }
+
+    /// It is on a real bus, and it is not known yet when.
+    pub(super) fn bits(&mut self, place: u64, bits: Bits) {
+        self.at(place, |entry| {
+            entry.shaded.bits = Some(bits);
+            entry.is_open = true;
+        });
+    }
+
+    /// When it went out; none if never.
+    pub(super) fn sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
+        self.at(place, |entry| {
+            entry.shaded.sent = sent;
+            entry.is_open = false;
+        });
+    }
+
+    pub(super) fn finish(&mut self) {
+        self.entries.iter_mut().for_each(|entry| entry.is_open = false);
+    }
+
+    pub(super) fn poll(&mut self) -> Option<Shaded> {
+        let shaded = self.entries.front().filter(|entry| !entry.is_open)?.shaded;
+        self.entries.pop_front();
+        self.first += 1;
+        Some(shaded)
+    }
+
+    fn at(&mut self, place: u64, change: impl FnMut(&mut Entry)) {
+        let index = usize::try_from(place - self.first).ok();
+        index.and_then(|index| self.entries.get_mut(index)).into_iter().for_each(change);
+    }
+}
