@@ -89,12 +89,12 @@ impl Delay {
     }
 
     fn record(&mut self, nanos: u64) {
-        self.histogram.saturating_record(nanos);
+        self.histogram.record(nanos).expect("it grows as it has to");
         self.most = self.most.max(nanos);
     }
 
     fn report(&self) -> Delays {
-        Delays { max: self.most as f64 / 1e3, ..Delays::of(&self.histogram) }
+        Delays::of(&self.histogram, self.most)
     }
 }
 

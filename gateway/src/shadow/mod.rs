@@ -16,7 +16,9 @@ mod report;
 mod tests;
 mod told;
 
-use protocol::can::{EXTENDED_MASK, Frame};
+use std::fmt::{self, Display, Formatter};
+
+use protocol::can::{ERROR, Frame};
 use protocol::wire_time::{BitRates, Bits};
 
 use crate::bus_model::{BitErrors, BitErrorsError};
@@ -74,7 +76,8 @@ impl Shadow {
         self.frames += 1;
         let lane = self.lane(bus);
         if let Some(told) = &mut self.told {
-            told.enter(lane, nanos, frame.id(), frame.is_extended());
+            let flag = frame.raw_id() & ERROR;
+            told.enter(lane, nanos, frame.id() | flag, frame.is_extended() || frame.is_error());
         }
         let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
             self.further += 1;
@@ -147,8 +150,13 @@ impl Shadow {
     }
 }
 
-/// An identifier as candump prints it.
-#[must_use]
-pub fn identifier(id: u32, extended: bool) -> String {
-    if extended { format!("{:08X}", id & EXTENDED_MASK) } else { format!("{id:03X}") }
+/// An identifier as candump prints it; whether it has more than 11 bits.
+#[derive(Clone, Copy, Debug)]
+pub struct Identifier(pub u32, pub bool);
+
+impl Display for Identifier {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self(id, extended) = *self;
+        if extended { write!(f, "{id:08X}") } else { write!(f, "{id:03X}") }
+    }
 }

@@ -134,15 +134,11 @@ pub struct Replies {
 }
 
 impl Delays {
-    /// From a histogram of ns.
-    pub(super) fn of(histogram: &Histogram<u64>) -> Self {
+    /// From a histogram of ns, and the exact greatest of them.
+    pub(super) fn of(histogram: &Histogram<u64>, most: u64) -> Self {
         let micros = |nanos: u64| nanos as f64 / 1e3;
-        if histogram.is_empty() {
-            return Self::default();
-        }
-        let quantile = |share| micros(histogram.value_at_quantile(share));
-        let max = micros(histogram.max());
-        Self { count: histogram.len(), p50: quantile(0.5).min(max), p99: quantile(0.99).min(max), max }
+        let quantile = |share| micros(histogram.value_at_quantile(share).min(most));
+        Self { count: histogram.len(), p50: quantile(0.5), p99: quantile(0.99), max: micros(most) }
     }
 }
 

@@ -67,6 +67,8 @@ fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
     assert_eq!((can0.sent, can1.sent, report.frames), (3, 1, 4));
     assert_eq!((can0.queue.value, can0.queue_of_one.value, can0.queue_of_one_id), (3.0, 2.0, 0x700));
     assert!((can0.delay_us.max - (2 * a + b - 5) as f64 / 1e3).abs() < 1e-9);
+    // In three digits.
+    assert!((can0.delay_us.p50 / ((a + b - 6) as f64 / 1e3) - 1.0).abs() < 2e-3, "{:?}", can0.delay_us);
     assert!(can0.kinds.is_empty() && can0.replies.is_none(), "no packets of this protocol");
 }
 

@@ -11,9 +11,9 @@ pub struct Shaded {
     pub nanos: u64,
     /// Its bus, for [`super::Shadow::bus`]; none of a bus beyond those that are told apart.
     pub bus: Option<usize>,
-    /// Its identifier.
+    /// Its identifier; of a driver's error frame with its flag.
     pub id: u32,
-    /// Whether that has 29 bits.
+    /// Whether that is more than 11 bits.
     pub extended: bool,
     /// Its bits, intermission included; none when it is on no real bus: a simulated wire, a driver's error frame.
     pub bits: Option<Bits>,
