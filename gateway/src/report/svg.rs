@@ -1,7 +1,7 @@
 //! Draws a figure as SVG.
 //!
 //! Colours stand in the drawing as they are on paper, so that every program shows it; and each has a class beside it,
-//! by which [`DARK`] gives it another one on a dark screen.
+//! by which [`dark()`] gives it another one on a dark screen.
 
 use std::fmt::Write as _;
 
@@ -81,7 +81,7 @@ pub fn draw(figure: &Figure) -> String {
     document(figure, (width, height), &attributes, &style)
 }
 
-/// A part of a page that has the rules of [`dark`], `size` pixels wide and high when the page shows it as it is.
+/// A part of a page that has the rules of [`dark()`], `size` pixels wide and high when the page shows it as it is.
 #[must_use]
 pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
     document(figure, size, &format!("class=\"{class}\""), "")
