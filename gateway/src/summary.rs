@@ -154,7 +154,7 @@ pub struct AccuracySummary {
 
 impl From<Accuracy> for AccuracySummary {
     fn from(accuracy: Accuracy) -> Self {
-        let Accuracy { single, unquantised, whole, sums, sums_averaged, saturated } = accuracy;
+        let Accuracy { single, unquantised, whole, sums, sums_averaged, saturated, .. } = accuracy;
         Self {
             single: single.into(),
             unquantised: unquantised.into(),

@@ -16,7 +16,7 @@ mod mcap;
 mod reader;
 
 pub use mcap::ORIGIN;
-pub use reader::{CaptureError, Extras, Format, InForce, Reader, Topic};
+pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, Topic};
 
 use protocol::candump::Record;
 
@@ -27,6 +27,28 @@ pub enum Entry<'a> {
     Frame(Record<'a>),
     /// Something that is no frame, and has its place between them.
     Note(Note<'a>),
+}
+
+/// One thing of a recording that is read with all its topics.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Item<'a> {
+    /// A frame, or what stands between frames.
+    Entry(Entry<'a>),
+    /// A message of another topic.
+    Other(Other<'a>),
+}
+
+/// A message that is neither a frame nor a note.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Other<'a> {
+    /// Its topic.
+    pub topic: &'a str,
+    /// Its type.
+    pub schema: &'a str,
+    /// When, in ns since 1970.
+    pub nanos: u64,
+    /// The message as the recording has it.
+    pub message: &'a [u8],
 }
 
 /// What stands between frames.

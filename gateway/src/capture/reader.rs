@@ -8,10 +8,10 @@ use std::path::Path;
 use protocol::can::Frame;
 use thiserror::Error;
 
-use super::Entry;
 use super::log::LogReader;
 use super::magic::{self, Kind};
 use super::mcap::{Fault, McapReader, ORIGIN, SOURCE};
+use super::{Entry, Item};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -123,12 +123,7 @@ impl Reader {
         if path.as_os_str() == "-" {
             return Self::from_read("standard input", io::stdin());
         }
-        let name = path.display().to_string();
-        let failed = |source| CaptureError::Io { name: name.clone(), source };
-        let file = File::open(path).map_err(failed)?;
-        if file.metadata().map_err(failed)?.is_dir() {
-            return Err(failed(io::ErrorKind::IsADirectory.into()));
-        }
+        let (name, file) = file(path)?;
         Self::from_read(name, file)
     }
 
@@ -141,10 +136,14 @@ impl Reader {
         name: impl Into<String>,
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
-        let (name, mut input) = (name.into(), Box::new(input));
+        Self::begin(name.into(), input, false)
+    }
+
+    fn begin(name: String, input: impl Read + Send + 'static, others: bool) -> Result<Self, CaptureError> {
+        let mut input = Box::new(input);
         let source = match magic::look(&mut input) {
             Ok((Kind::Text, head)) => Source::Log(LogReader::new(&head, input)),
-            Ok((Kind::Mcap, head)) => Source::Mcap(Box::new(McapReader::new(&head, input))),
+            Ok((Kind::Mcap, head)) => Source::Mcap(Box::new(McapReader::new(&head, input, others))),
             Ok((Kind::Other(what, remedy), _)) => return Err(CaptureError::Other { name, what, remedy }),
             Err(source) => return Err(CaptureError::Io { name, source }),
         };
@@ -175,10 +174,18 @@ impl Reader {
         reason = "an entry borrows from the reader; an iterator's cannot"
     )]
     pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
+        // Only what was opened as `Items` has others.
+        Ok(match self.next_item()? {
+            Some(Item::Entry(entry)) => Some(entry),
+            Some(Item::Other(_)) | None => None,
+        })
+    }
+
+    fn next_item(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
         let Self { name, source, entries } = self;
         let next = match source {
             Source::Log(log) => match log.next() {
-                Ok(next) => next,
+                Ok(next) => next.map(Item::Entry),
                 Err(source) => return Err(CaptureError::Io { name: name.clone(), source }),
             },
             Source::Mcap(mcap) => match mcap.next() {
@@ -189,7 +196,7 @@ impl Reader {
                 }
             },
         };
-        *entries += u64::from(next.is_some());
+        *entries += u64::from(matches!(next, Some(Item::Entry(_))));
         Ok(next)
     }
 
@@ -239,4 +246,54 @@ impl Reader {
             Source::Mcap(mcap) => mcap.extras(),
         }
     }
+}
+
+/// Reads a recording with the messages of all its topics, in bounded memory.
+#[derive(Debug)]
+pub struct Items(Reader);
+
+impl Items {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// When it cannot be opened or is no capture.
+    pub fn open(path: &Path) -> Result<Self, CaptureError> {
+        let (name, file) = file(path)?;
+        Reader::begin(name, file, true).map(Self)
+    }
+
+    /// What it is written in.
+    #[must_use]
+    pub const fn format(&self) -> Format {
+        self.0.format()
+    }
+
+    /// The next entry, or message of another topic, in the order of the file; `None` after the last one. Never panics.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is damaged: then nothing more comes.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "an item borrows from the reader; an iterator's cannot"
+    )]
+    pub fn next(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
+        self.0.next_item()
+    }
+
+    /// What it has beside messages, as [`Reader::extras`].
+    #[must_use]
+    pub fn extras(&self) -> &Extras {
+        self.0.extras()
+    }
+}
+
+/// A file and its name for errors.
+fn file(path: &Path) -> Result<(String, File), CaptureError> {
+    let name = path.display().to_string();
+    let failed = |source| CaptureError::Io { name: name.clone(), source };
+    let file = File::open(path).map_err(failed)?;
+    if file.metadata().map_err(failed)?.is_dir() {
+        return Err(failed(io::ErrorKind::IsADirectory.into()));
+    }
+    Ok((name, file))
 }

@@ -15,6 +15,7 @@ mod output;
 mod print;
 mod recover;
 mod replay;
+mod report;
 mod run;
 mod sensing;
 mod shadow;
@@ -42,6 +43,7 @@ enum Command {
     Dump(dump::Dump),
     Convert(convert::Convert),
     Replay(replay::Replay),
+    Report(report::Report),
     Frame(frame::Frame),
     Commission(commission::Commission),
     Cells(cells::Cells),
@@ -63,6 +65,7 @@ impl Command {
             Self::Dump(command) => command.run(),
             Self::Convert(command) => command.run(),
             Self::Replay(command) => command.run(),
+            Self::Report(command) => command.run(),
             Self::Frame(command) => command.run(),
             Self::Commission(command) => command.run(),
             Self::Cells(command) => command.run(),

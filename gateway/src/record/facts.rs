@@ -10,6 +10,7 @@ use rustix::thread::ClockId;
 use rustix::time::{clock_getres, clock_gettime};
 
 use crate::decode::parameter::Words;
+use crate::summary::Quantiles;
 
 /// Facts by name.
 pub type Facts = BTreeMap<String, String>;
@@ -25,9 +26,9 @@ pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
     ])
 }
 
-/// The kernel, and the clock that everything is timed by.
+/// The kernel, the clock that everything is timed by, and how late the machine wakes an idle thread.
 #[must_use]
-pub fn machine() -> Facts {
+pub fn machine(idle: &Quantiles) -> Facts {
     let about = uname();
     let text = |text: &std::ffi::CStr| text.to_string_lossy().into_owned();
     let clocks = "/sys/devices/system/clocksource/clocksource0/";
@@ -44,6 +45,9 @@ pub fn machine() -> Facts {
         ("clocksources", read(&format!("{clocks}available_clocksource"))),
         ("realtime_minus_monotonic_ns", realtime_minus_monotonic().to_string()),
         ("realtime_resolution_ns", clock_getres(ClockId::Realtime).tv_nsec.to_string()),
+        ("idle_late_p50_us", format!("{:.1}", idle.p50)),
+        ("idle_late_p99_us", format!("{:.1}", idle.p99)),
+        ("idle_late_max_us", format!("{:.1}", idle.max)),
     ])
 }
 

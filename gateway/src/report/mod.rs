@@ -10,6 +10,7 @@
 
 pub mod figure;
 pub mod page;
+pub mod run;
 mod scale;
 pub mod svg;
 pub mod thin;

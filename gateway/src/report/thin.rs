@@ -165,3 +165,59 @@ pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
         })
         .collect()
 }
+
+/// Sums over equal times in bounded memory: how much came in each; when there are too many, each two become one.
+#[derive(Clone, Debug)]
+pub struct Binned {
+    most: usize,
+    width: f64,
+    from: Option<f64>,
+    bins: Vec<f64>,
+}
+
+impl Binned {
+    /// Nothing yet: at most `most` bins (at least 2), `width` wide at first.
+    #[must_use]
+    pub fn new(most: usize, width: f64) -> Self {
+        Self { most: most.max(2), width, from: None, bins: Vec::new() }
+    }
+
+    /// Adds `amount` at `x`; what lies before the first belongs to its bin.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "not negative; far ones saturate, and merge"
+    )]
+    pub fn add(&mut self, x: f64, amount: f64) {
+        if !x.is_finite() {
+            return;
+        }
+        let distance = (x - *self.from.get_or_insert(x)).max(0.0);
+        while distance / self.width >= self.most as f64 {
+            self.width *= 2.0;
+            self.bins = self.bins.chunks(2).map(|pair| pair.iter().sum()).collect();
+        }
+        let at = (distance / self.width) as usize;
+        if self.bins.len() <= at {
+            self.bins.resize(at + 1, 0.0);
+        }
+        if let Some(bin) = self.bins.get_mut(at) {
+            *bin += amount;
+        }
+    }
+
+    /// How wide bins are now.
+    #[must_use]
+    pub const fn width(&self) -> f64 {
+        self.width
+    }
+
+    /// Each bin's beginning and its sum by its width; the last one, which may not be full, is left out, unless it is the only one.
+    #[must_use]
+    pub fn rates(&self) -> Vec<(f64, f64)> {
+        let from = self.from.unwrap_or(0.0);
+        let whole = self.bins.len().saturating_sub(1).max(1);
+        let bins = self.bins.iter().take(whole).enumerate();
+        bins.map(|(at, sum)| (from + at as f64 * self.width, sum / self.width)).collect()
+    }
+}

@@ -32,7 +32,7 @@ use crate::record::series::Head;
 use crate::record::{Mcap, Outputs, Recorder, facts};
 use crate::robot::SimulatedArm;
 use crate::scenario::FaultKind;
-use crate::summary::histogram;
+use crate::summary::{Quantiles, histogram};
 use crate::table::{Notice, Table};
 
 /// How long stimuli and commands may wait for a full bus; the loop's own frames never wait.
@@ -128,7 +128,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         lines.push(line);
         feeds.extend(feed);
     }
-    let (recorder, recorded) = record(options, outputs, feeds, &lanes)?;
+    let (recorder, recorded) = record(options, outputs, feeds, &lanes, &idle)?;
     let processes = Processes::default();
     let first_epoch = Epoch(0);
     let mut bench = Bench {
@@ -232,12 +232,14 @@ fn record(
     outputs: Outputs,
     feeds: Vec<feed::Lane>,
     lanes: &[Lane],
+    idle: &Histogram<u64>,
 ) -> Result<(Option<Recorder>, Option<rtrb::Producer<Timed>>), RunError> {
     if outputs.is_empty() {
         return Ok((None, None));
     }
     let (recorded, ticks) = outputs.wants_all().then(|| rtrb::RingBuffer::new(feed::TICKS)).unzip();
-    let head = options.record.mcap.as_ref().map_or_else(Head::default, |mcap| head(options, mcap, lanes));
+    let head =
+        options.record.mcap.as_ref().map_or_else(Head::default, |mcap| head(options, mcap, lanes, idle));
     let feed = Feed { lanes: feeds, ticks };
     let recorder = outputs.start(feed, Layout::new(&options.skin), head);
     let recorder = recorder.map_err(|error| RunError::Failed(format!("cannot start a thread: {error}")))?;
@@ -245,7 +247,7 @@ fn record(
 }
 
 /// What each file of a recording begins with.
-fn head(options: &Options, mcap: &Mcap, lanes: &[Lane]) -> Head {
+fn head(options: &Options, mcap: &Mcap, lanes: &[Lane], idle: &Histogram<u64>) -> Head {
     let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let nanos = u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX);
     let mut run = vec![
@@ -269,7 +271,7 @@ fn head(options: &Options, mcap: &Mcap, lanes: &[Lane]) -> Head {
     }
     let metadata = vec![
         ("program", facts::program(&mcap.command_line, nanos)),
-        ("machine", facts::machine()),
+        ("machine", facts::machine(&Quantiles::of(idle, 1e-3))),
         ("configuration", facts::configuration(&options.skin, run)),
         ("configuration_hashes", facts::hashes(&options.skin)),
     ];

@@ -65,6 +65,10 @@ pub struct Accuracy {
     pub sums_averaged: Errors,
     /// Words that were left out because they were saturated.
     pub saturated: u64,
+    /// `single` joint by joint.
+    pub single_by_joint: [Errors; WORDS],
+    /// `whole` joint by joint.
+    pub whole_by_joint: [Errors; WORDS],
 }
 
 impl Accuracy {
@@ -77,28 +81,40 @@ impl Accuracy {
     ) -> [f64; WORDS] {
         let mut errors = [0.0; WORDS];
         let both = expected.quantised.iter().zip(&expected.unquantised);
-        for ((error, &word), (quantised, unquantised)) in errors.iter_mut().zip(words).zip(both).take(joint) {
+        let joints = errors.iter_mut().zip(&mut self.single_by_joint);
+        for (((error, of_joint), &word), (quantised, unquantised)) in joints.zip(words).zip(both).take(joint)
+        {
             if word == i32::from(i16::MAX) || word == i32::from(i16::MIN) {
                 self.saturated += 1;
                 continue;
             }
             *error = word_to_nm(word) - quantised;
             self.single.add(*error);
+            of_joint.add(*error);
             self.unquantised.add(word_to_nm(word) - unquantised);
         }
         errors
     }
 
     pub(super) fn whole_skin(&mut self, errors: &[f64; WORDS]) {
-        for &error in errors {
+        for (&error, of_joint) in errors.iter().zip(&mut self.whole_by_joint) {
             self.whole.add(error);
+            of_joint.add(error);
         }
     }
 
     /// The accuracy of several buses together.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
+        let joint_by_joint = |mut sum: [Errors; WORDS], other: [Errors; WORDS]| {
+            for (sum, other) in sum.iter_mut().zip(other) {
+                *sum = sum.with(other);
+            }
+            sum
+        };
         Self {
+            single_by_joint: joint_by_joint(self.single_by_joint, other.single_by_joint),
+            whole_by_joint: joint_by_joint(self.whole_by_joint, other.whole_by_joint),
             single: self.single.with(other.single),
             unquantised: self.unquantised.with(other.unquantised),
             whole: self.whole.with(other.whole),

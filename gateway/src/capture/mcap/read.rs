@@ -10,7 +10,7 @@ use protocol::candump::Timestamp;
 
 use super::foreign::Foreign;
 use crate::capture::log::read_some;
-use crate::capture::{Entry, Extras, InForce, Note, NoteKind, Topic};
+use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
 use crate::record::TOPIC_OF_STATE;
 use crate::ros2::Message;
 use crate::ros2::messages::{CanFrame, CaptureNote};
@@ -45,6 +45,8 @@ pub(crate) struct McapReader {
     /// Bytes that came in.
     bytes: u64,
     any_frame: bool,
+    /// Whether messages that are only counted are wanted too.
+    others: bool,
     /// What was read when it was opened: the channel and time of the first message, or why there is none.
     first: Option<Result<(u16, u64), Fault>>,
     over: bool,
@@ -70,8 +72,8 @@ enum What {
 }
 
 impl McapReader {
-    /// Goes on behind `head`, which has been read already.
-    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
+    /// Goes on behind `head`, which has been read already; `others` if messages of other topics are wanted too.
+    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, others: bool) -> Self {
         // A chunk is checked before anything of it is believed.
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
@@ -92,6 +94,7 @@ impl McapReader {
             message: Vec::new(),
             bytes: u64::try_from(head.len()).unwrap_or(0),
             any_frame: false,
+            others,
             first: None,
             over: false,
         };
@@ -104,16 +107,29 @@ impl McapReader {
         &self.extras
     }
 
-    /// The next entry. Never panics.
-    pub(crate) fn next(&mut self) -> Result<Option<Entry<'_>>, Fault> {
+    /// The next entry, or message of another topic where these are wanted. Never panics.
+    pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
         let message = match self.first.take() {
             Some(first) => Some(first?),
             None => self.advance()?,
         };
-        Ok(message.map(|(channel, log_time)| self.entry(channel, log_time)))
+        Ok(message.map(|(channel, log_time)| self.item(channel, log_time)))
     }
 
-    /// Reads up to the next entry's message; its channel and its time.
+    fn item(&mut self, channel: u16, log_time: u64) -> Item<'_> {
+        let topic = match self.channels.get(&channel) {
+            Some(Lane { what: What::Counted(topic), .. }) => *topic,
+            _ => return Item::Entry(self.entry(channel, log_time)),
+        };
+        let (topic, schema) = self
+            .extras
+            .topics
+            .get(topic)
+            .map_or(("", ""), |topic| (topic.name.as_str(), topic.schema.as_str()));
+        Item::Other(Other { topic, schema, nanos: log_time, message: &self.message })
+    }
+
+    /// Reads up to the next message that is wanted; its channel and its time.
     fn advance(&mut self) -> Result<Option<(u16, u64)>, Fault> {
         while !self.over {
             match self.step() {
@@ -128,7 +144,7 @@ impl McapReader {
         Ok(None)
     }
 
-    /// Reads on; an entry's message is in `message` then: its channel and its time.
+    /// Reads on; a message that is wanted is in `message` then: its channel and its time.
     fn step(&mut self) -> Result<Option<(u16, u64)>, Fault> {
         match self.linear.next_event() {
             None => self.over = true,
@@ -157,7 +173,9 @@ impl McapReader {
                         if let Some(topic) = self.extras.topics.get_mut(topic) {
                             topic.messages += 1;
                         }
-                        return Ok(None);
+                        if !self.others {
+                            return Ok(None);
+                        }
                     }
                     What::InForce => {
                         let time = Timestamp { nanos: log_time, nine_digits: true };

@@ -1,0 +1,116 @@
+//! `gateway report`.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use gateway::report::run::{self, ReportError};
+use gateway::report::{figure::Page, page, svg};
+use gateway::run::file::WholeFile;
+use protocol::usage::{Failure, print};
+
+use super::output::note;
+
+/// Report on a recorded run: one HTML page with figures, beside the paper's numbers
+///
+/// The page needs nothing else, no network and no script; it is readable on a phone, on a dark screen and on paper. A
+/// recording that was cut off is reported as far as it goes, and what is missing is said in it and on standard error.
+/// Exit code 0: the report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway report run.mcap -o run.html
+  gateway report run.mcap --svg figures --force")]
+pub(crate) struct Report {
+    /// The recording of a run: what `gateway run SKIN --record FILE` wrote
+    file: PathBuf,
+    /// The page; else the recording's name with .html
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Also each figure as an SVG file, in this folder, which is made if it is not there
+    #[arg(long, value_name = "DIR")]
+    svg: Option<PathBuf>,
+    /// Overwrite files that exist
+    #[arg(long)]
+    force: bool,
+}
+
+impl Report {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let output = self.output.clone().unwrap_or_else(|| self.file.with_extension("html"));
+        self.is_free(&output, "-o")?;
+        let command: Vec<_> = std::env::args().collect();
+        let report = run::report(&self.file, &command.join(" ")).map_err(|error| match error {
+            ReportError::Log { .. } | ReportError::Foreign { .. } => Failure::usage(error),
+            error => Failure::run(error),
+        })?;
+        let mut files = vec![(output.clone(), page::html(&report.page))];
+        if let Some(folder) = &self.svg {
+            for (name, drawing) in drawings(&report.page) {
+                let path = folder.join(name);
+                self.is_free(&path, "--svg")?;
+                files.push((path, drawing));
+            }
+        }
+        let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
+        if let Err(failure) = write(&files) {
+            if let Some(folder) = self.svg.filter(|_| made) {
+                // Only if nothing is in it.
+                let _ = fs::remove_dir(folder);
+            }
+            return Err(failure);
+        }
+        if let Some(missing) = &report.missing {
+            note(format_args!("gateway: {}: {missing}", self.file.display()));
+        }
+        let figures: usize = report.page.sections.iter().map(|section| section.figures.len()).sum();
+        let beside =
+            self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
+        print(&format!("{}: {figures} figures{beside}\n", output.display()))
+    }
+
+    /// What is there is not overwritten unless that is asked for.
+    fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
+        let name = path.display();
+        if let (Ok(recording), Ok(there)) = (fs::canonicalize(&self.file), fs::canonicalize(path))
+            && recording == there
+        {
+            return Err(Failure::usage(format!(
+                "{option} {name} is the recording itself: name another file"
+            )));
+        }
+        if !self.force && fs::symlink_metadata(path).is_ok_and(|about| about.is_file()) {
+            return Err(Failure::usage(format!(
+                "{option} {name}: it exists: name another file, or overwrite it with --force"
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Each figure's file name and drawing.
+fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
+    let figures = page.sections.iter().flat_map(|section| &section.figures);
+    figures.map(|figure| (format!("{}.svg", figure.name), svg::draw(figure)))
+}
+
+/// Makes a folder; whether it was not there.
+fn make(folder: &Path) -> Result<bool, Failure> {
+    let new = !folder.is_dir();
+    let made = fs::create_dir_all(folder).map(|()| new);
+    made.map_err(|error| Failure::run(format!("--svg {}: {error}", folder.display())))
+}
+
+/// Writes all of them, or none: each gets its name when all are whole.
+fn write(files: &[(PathBuf, String)]) -> Result<(), Failure> {
+    let failed = |path: &Path, error: io::Error| Failure::run(format!("{}: {error}", path.display()));
+    let mut whole = Vec::with_capacity(files.len());
+    for (path, text) in files {
+        let written = WholeFile::create(path).and_then(|(whole, mut file)| {
+            file.write_all(text.as_bytes())?;
+            Ok(whole)
+        });
+        whole.push((path, written.map_err(|error| failed(path, error))?));
+    }
+    whole.into_iter().try_for_each(|(path, whole)| whole.finish().map_err(|error| failed(path, error)))
+}

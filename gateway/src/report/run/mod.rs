@@ -1,0 +1,239 @@
+//! A report on a run, from its recording: read once from beginning to end, in bounded memory.
+//!
+//! ```text
+//!   /ROBOT/…, /gateway/timing ─> motion ─┐
+//!   /can/BUS ─> lane (a Table each) ─────┼─> page
+//!   metadata, /can/notes ────────────────┘
+//! ```
+//!
+//! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
+//! [`Table`](crate::table::Table) that the gateway had, and so come to the same accounts.
+
+mod lane;
+mod messages;
+mod motion;
+mod page;
+
+use std::path::Path;
+
+use protocol::skin::Skin;
+use thiserror::Error;
+
+use super::figure::Page;
+use crate::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other};
+use crate::record::layout::Layout;
+use lane::Lane;
+use motion::Motion;
+
+/// Columns of a line; a page is not wider.
+const COLUMNS: usize = 1_000;
+/// A column's width at first, in s.
+const GRAIN_S: f64 = 0.002;
+/// The skin in a recording.
+const SKIN: &str = "skin.toml";
+
+/// Why there is no report.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Capture(#[from] CaptureError),
+    /// Frames alone.
+    #[error(
+        "{name} is a candump log: a report needs a recording, which `gateway run SKIN --record run.mcap` makes"
+    )]
+    Log {
+        /// Its name.
+        name: String,
+    },
+    /// Of another program, or of nothing.
+    #[error("{name} holds no run: {what}; `gateway run SKIN --record run.mcap` makes what a report needs")]
+    Foreign {
+        /// Its name.
+        name: String,
+        /// What is missing.
+        what: String,
+    },
+}
+
+/// A report, and what of the recording is missing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// What it says.
+    pub page: Page,
+    /// A sentence, when the recording is cut off or damaged.
+    pub missing: Option<String>,
+}
+
+/// Reads a recording and says what it holds. `command` is how the report was asked for.
+///
+/// # Errors
+/// When it is no recording of a run, or has nothing in it.
+pub fn report(path: &Path, command: &str) -> Result<Report, ReportError> {
+    let (run, broken) = read(path)?;
+    let missing = broken.map(|why| run.missing(&why));
+    let page = page::page(&run, command, missing.as_deref());
+    Ok(Report { page, missing })
+}
+
+/// Reads it all; also why it has no proper end, if it has none.
+fn read(path: &Path) -> Result<(Run, Option<String>), ReportError> {
+    let name = path.display().to_string();
+    let mut items = Items::open(path)?;
+    if items.format() == Format::Candump {
+        let empty = path.metadata().is_ok_and(|about| about.is_file() && about.len() == 0);
+        return Err(if empty {
+            ReportError::Foreign { name, what: "it is empty".to_owned() }
+        } else {
+            ReportError::Log { name }
+        });
+    }
+    // What stands before the first message is known when it is open.
+    let mut run = Run::begin(&name, items.extras())?;
+    let damaged = loop {
+        match items.next() {
+            Ok(Some(item)) => run.take(&item),
+            Ok(None) => break None,
+            Err(error) => break Some(error),
+        }
+    };
+    run.finish();
+    let unfinished = items.extras().unfinished.clone();
+    if run.is_empty() {
+        let nothing = || "it has no tick and no frame of its skin's buses".to_owned();
+        return Err(match damaged {
+            Some(error) => error.into(),
+            None => ReportError::Foreign { name, what: unfinished.unwrap_or_else(nothing) },
+        });
+    }
+    Ok((run, damaged.map(|error| error.to_string()).or(unfinished)))
+}
+
+/// What a recording says, as far as it has been read.
+#[derive(Debug)]
+struct Run {
+    skin: Skin,
+    /// Its path, and of how many bytes.
+    name: String,
+    bytes: u64,
+    /// By name, as the recording has them.
+    metadata: Vec<(String, Vec<(String, String)>)>,
+    /// The topics of joints and of torques.
+    topics: [String; 2],
+    /// When the first message was, in ns since 1970.
+    began: Option<u64>,
+    motion: Motion,
+    lanes: Vec<Lane>,
+    /// Packets of any network that the kernel dropped on their way to sockets.
+    backlog: u64,
+    /// Frames of buses that the skin does not have.
+    others: u64,
+    /// Messages that are not what their topics say.
+    unreadable: u64,
+}
+
+impl Run {
+    fn begin(name: &str, extras: &Extras) -> Result<Self, ReportError> {
+        let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
+        let text = extras.attachments.iter().find(|(name, _)| name == SKIN);
+        let Some((_, text)) = text else {
+            let why = extras.unfinished.as_ref().map_or_else(String::new, |why| format!(" ({why})"));
+            return Err(foreign(format!("{SKIN} is not attached to it{why}")));
+        };
+        let text = String::from_utf8_lossy(text);
+        let skin = Skin::parse(SKIN, &text).map_err(|error| foreign(format!("the attached {error}")))?;
+        let layout = Layout::new(&skin);
+        let mut lanes: Vec<_> = (0..skin.buses.len()).map(|bus| Lane::new(&skin, bus)).collect();
+        for before in &extras.in_force {
+            if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
+                lane.in_force(before.nanos, &before.frame);
+            }
+        }
+        Ok(Self {
+            topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
+            motion: Motion::new(layout.joints.len()),
+            name: name.to_owned(),
+            bytes: std::fs::metadata(name).map_or(0, |about| about.len()),
+            metadata: extras.metadata.clone(),
+            skin,
+            began: None,
+            lanes,
+            backlog: 0,
+            others: 0,
+            unreadable: 0,
+        })
+    }
+
+    fn take(&mut self, item: &Item<'_>) {
+        match item {
+            Item::Entry(Entry::Frame(record)) => {
+                let at = self.seconds(record.time.nanos);
+                match self.skin.bus_named(record.interface).and_then(|bus| self.lanes.get_mut(bus)) {
+                    Some(lane) => lane.frame(at, record),
+                    None => self.others += 1,
+                }
+            }
+            Item::Entry(Entry::Note(note)) => self.note(note),
+            Item::Other(other) => self.message(other),
+        }
+    }
+
+    fn note(&mut self, note: &Note<'_>) {
+        match note.kind {
+            NoteKind::Dropped(frames) => {
+                match self.skin.bus_named(note.interface).and_then(|bus| self.lanes.get_mut(bus)) {
+                    Some(lane) => lane.dropped += frames,
+                    None => self.backlog += frames,
+                }
+            }
+            NoteKind::Unreadable(_) => self.unreadable += 1,
+            NoteKind::Text | NoteKind::CanXl => {}
+        }
+    }
+
+    fn message(&mut self, other: &Other<'_>) {
+        let at = self.seconds(other.nanos);
+        let [states, torques] = &self.topics;
+        let taken = if other.topic == states {
+            messages::joints(other.message).map(|joints| self.motion.joints(at, &joints))
+        } else if other.topic == torques {
+            messages::torques(other.message).map(|torques| self.motion.torques(at, &torques))
+        } else if other.topic == "/gateway/timing" {
+            messages::timing(other.message, other.nanos).map(|timing| self.motion.timing(at, &timing))
+        } else {
+            Ok(())
+        };
+        self.unreadable += u64::from(taken.is_err());
+    }
+
+    /// Seconds since the first message.
+    fn seconds(&mut self, nanos: u64) -> f64 {
+        let began = *self.began.get_or_insert(nanos);
+        if nanos >= began { (nanos - began) as f64 * 1e-9 } else { (began - nanos) as f64 * -1e-9 }
+    }
+
+    fn finish(&mut self) {
+        self.lanes.iter_mut().for_each(Lane::finish);
+    }
+
+    fn is_empty(&self) -> bool {
+        self.motion.ticks == 0 && self.lanes.iter().all(|lane| lane.frames == 0)
+    }
+
+    /// A value of the recording's metadata.
+    fn fact(&self, record: &str, key: &str) -> Option<&str> {
+        let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
+        facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
+    }
+
+    /// What of a recording without its end is missing, in a sentence.
+    fn missing(&self, why: &str) -> String {
+        let here = self.motion.seconds();
+        let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
+        let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
+            format!(" of the {planned} s that the run was to last: {:.2} s are missing", planned - here)
+        });
+        format!("{why}. What is here holds {here:.2} s{lacks}")
+    }
+}
