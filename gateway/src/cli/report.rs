@@ -9,6 +9,7 @@ use gateway::report::run::{self, ReportError};
 use gateway::report::{figure::Page, page, svg};
 use gateway::run::file::WholeFile;
 use protocol::usage::{Failure, print};
+use protocol::wire_time::bit_rate;
 
 use super::output::note;
 
@@ -30,6 +31,12 @@ pub(crate) struct Report {
     /// Also each figure as an SVG file, in this folder, which is made if it is not there
     #[arg(long, value_name = "DIR")]
     svg: Option<PathBuf>,
+    /// Bits in a second of every bus, for its load: 500k, 1M; else the skin's, else 1M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    nominal: Option<u32>,
+    /// Bits in a second of FD frames' data: 2M, 5M; else the skin's, else 5M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    data: Option<u32>,
     /// Overwrite files that exist
     #[arg(long)]
     force: bool,
@@ -40,8 +47,11 @@ impl Report {
         let output = self.output.clone().unwrap_or_else(|| self.file.with_extension("html"));
         self.is_free(&output, "-o")?;
         let command: Vec<_> = std::env::args().collect();
-        let report = run::report(&self.file, &command.join(" ")).map_err(|error| match error {
-            ReportError::Log { .. } | ReportError::Foreign { .. } => Failure::usage(error),
+        let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
+        let report = run::report(&self.file, &options).map_err(|error| match error {
+            ReportError::Log { .. } | ReportError::Foreign { .. } | ReportError::Rates { .. } => {
+                Failure::usage(error)
+            }
             error => Failure::run(error),
         })?;
         let mut files = vec![(output.clone(), page::html(&report.page))];

@@ -319,7 +319,7 @@ pub struct Table {
 }
 
 /// A number for people: whole ones below a million as they are, else at most three significant digits; very
-/// small and very large ones by a power of ten.
+/// small and very large ones by a power of ten; what is not finite is a dash.
 ///
 /// ```
 /// # use gateway::report::figure::number;
@@ -332,7 +332,7 @@ pub struct Table {
 pub fn number(value: f64) -> String {
     let size = value.abs();
     if !value.is_finite() {
-        return "none".to_owned();
+        return "–".to_owned();
     }
     if size < 1e6 && (value - value.round()).abs() < 1e-12 * size.max(1e-300) || size == 0.0 {
         return format!("{:.0}", value + 0.0);

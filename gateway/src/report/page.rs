@@ -116,13 +116,15 @@ fn findings(out: &mut String, findings: &[Finding]) {
             let _ = write!(out, "<td>{}</td>", svg::escaped(finding.bar.as_deref().unwrap_or_default()));
         }
         if paper || bar {
-            let (class, sign) = match finding.verdict {
-                Verdict::Better => ("better", "✓ "),
-                Verdict::Same => ("same", "= "),
-                Verdict::Worse => ("worse", "✗ "),
-                Verdict::Told => ("told", ""),
+            let (class, text) = match (finding.verdict, &finding.bar) {
+                (Verdict::Better, None) => ("better", "✓ better"),
+                (Verdict::Better, Some(_)) => ("better", "✓ holds"),
+                (Verdict::Same, _) => ("same", "= the same"),
+                (Verdict::Worse, None) => ("worse", "✗ worse"),
+                (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
+                (Verdict::Told, _) => ("told", ""),
             };
-            let _ = write!(out, "<td class=\"verdict {class}\">{sign}{}</td>", finding.verdict);
+            let _ = write!(out, "<td class=\"verdict {class}\">{text}</td>");
         }
         out.push_str("</tr>\n");
     }
@@ -156,5 +158,5 @@ fn numbers(table: &Table, column: usize) -> bool {
     let mut cells =
         table.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.is_empty()).peekable();
     cells.peek().is_some()
-        && cells.all(|cell| cell.starts_with(|first: char| first.is_ascii_digit() || "-+−".contains(first)))
+        && cells.all(|cell| cell.starts_with(|first: char| first.is_ascii_digit() || "-+−–".contains(first)))
 }

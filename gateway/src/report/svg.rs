@@ -10,7 +10,6 @@ use plotters::coord::Shift;
 use plotters::coord::cartesian::Cartesian2d;
 use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
 use plotters::element::{Circle, PathElement, Polygon, Rectangle, Text};
-use plotters::series::DashedLineSeries;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
@@ -23,6 +22,12 @@ use super::thin::thinned;
 const UNIT: i32 = 8;
 /// Of letters, in pixels.
 const LETTERS: f64 = 13.0;
+/// The widths of lines in units. Plotters would draw each dash as a line of its own, which of a noisy curve are
+/// thousands; so dashed lines have widths that no other line has, and are dashed by an attribute.
+const LINE: u32 = 13;
+const DASHED: u32 = 14;
+const DOTTED: u32 = 9;
+const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
 
 const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
@@ -113,6 +118,10 @@ fn classed(body: &str) -> String {
             let colour = format!("{attribute}=\"#{r:02X}{g:02X}{b:02X}\"");
             body = body.replace(&colour, &format!("class=\"{class}-{kind}\" {colour}"));
         }
+    }
+    for (width, dashes) in DASHES {
+        let width = format!("stroke-width=\"{width}\"");
+        body = body.replace(&width, &format!("{width} stroke-dasharray=\"{dashes}\""));
     }
     body
 }
@@ -205,7 +214,7 @@ fn series_of(
     (columns, lines): (u32, u32),
 ) -> Drawn {
     let placed = series.points.iter().map(|point| (x.place(point.0), y.place(point.1)));
-    let style = colour.stroke_width(in_pixels(1.6).unsigned_abs());
+    let style = colour.stroke_width(if series.shape == Shape::Dashed { DASHED } else { LINE });
     let back = |points: Vec<(f64, f64)>| -> Vec<(f64, f64)> {
         points.into_iter().map(|(across, up)| (x.value(across), y.value(up))).collect()
     };
@@ -216,12 +225,7 @@ fn series_of(
                 let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
                 for piece in clipped(&run) {
                     let points = back(piece);
-                    if series.shape == Shape::Dashed {
-                        let dashes = DashedLineSeries::new(points, pixels(7), pixels(5), style);
-                        chart.draw_series(dashes)?;
-                    } else {
-                        chart.draw_series([PathElement::new(points, style)])?;
-                    }
+                    chart.draw_series([PathElement::new(points, style)])?;
                 }
             }
         }
@@ -320,8 +324,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     }
     let ends = if mark.on == On::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
     let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
-    let style = FAINT.stroke_width(pixels(1));
-    chart.draw_series(DashedLineSeries::new(line, pixels(2), pixels(3), style))?;
+    chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED))])?;
     // The words stand on the side where there is room.
     let (across, up, side, end) = match mark.on {
         On::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
@@ -361,7 +364,7 @@ fn entry_of(area: &Area<'_>, series: &[Series], which: usize, (at, row): (i32, i
     };
     let middle = in_pixels(15.0) + row * in_pixels(20.0);
     let end = at + in_pixels(22.0);
-    let style: ShapeStyle = colour.stroke_width(in_pixels(2.4).unsigned_abs());
+    let style: ShapeStyle = colour.stroke_width(pixels(2));
     match series.shape {
         Shape::Line | Shape::Steps => area.draw(&PathElement::new([(at, middle), (end, middle)], style))?,
         Shape::Dashed => {

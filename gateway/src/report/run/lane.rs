@@ -1,9 +1,12 @@
 //! What the frames of one bus say: the same accounts that the gateway kept, epoch by epoch.
 
 use protocol::candump::{Direction, Record};
+use protocol::id::Kind;
 use protocol::message::Message;
+use protocol::packet;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
+use protocol::wire_time::{BitRates, Bits};
 
 use super::{COLUMNS, GRAIN_S};
 use crate::decode::{Decoded, Decoder};
@@ -69,13 +72,17 @@ pub(super) struct Lane {
     /// By place among the bus' cells.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
-    pub(super) traffic: Binned,
+    pub(super) rates: BitRates,
+    /// Seconds that a real bus would carry what it has to.
+    pub(super) load: Binned,
+    /// The same with stimuli and simulated wires, which no real bus carries.
+    pub(super) load_of_all: Binned,
     /// Frames that were lost on the way to the recording, as it says.
     pub(super) dropped: u64,
 }
 
 impl Lane {
-    pub(super) fn new(skin: &Skin, bus: usize) -> Self {
+    pub(super) fn new(skin: &Skin, bus: usize, rates: BitRates) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
         let roots: Vec<_> = table.cells().iter().filter(|cell| cell.root).map(|cell| cell.node).collect();
@@ -99,7 +106,9 @@ impl Lane {
             slowest: thinned(),
             error: thinned(),
             frames: 0,
-            traffic: Binned::new(BINS, BIN_S),
+            rates,
+            load: Binned::new(BINS, BIN_S),
+            load_of_all: Binned::new(BINS, BIN_S),
             dropped: 0,
         }
     }
@@ -119,16 +128,21 @@ impl Lane {
     pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
-        self.traffic.add(at, 1.0);
         if now.0 >= self.looked.0 + LOOK_US {
             self.looked = now;
             self.table.handle_time(now);
             self.table.notices().for_each(drop);
         }
         let own = record.direction == Some(Direction::Sent);
-        if let Decoded::Message(message) = self.decoder.decode(now, &self.name, &record.frame) {
-            self.answer(now, &message);
+        let decoded = self.decoder.decode(now, &self.name, &record.frame);
+        if let Decoded::Message(message) = &decoded {
+            self.answer(now, message);
         }
+        let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates));
+        let stimulus = packet::data_id(&record.frame).is_ok_and(|id| id.kind == Kind::Stimulus);
+        let real = !stimulus && !matches!(decoded, Decoded::Wire(..));
+        self.load_of_all.add(at, seconds);
+        self.load.add(at, if real { seconds } else { 0.0 });
         self.table.handle_frame(now, own, &record.frame, &mut |_| None);
         let newest = self.table.newest().map(|(number, _, _)| number);
         if newest.is_some() && newest != self.open.map(|open| open.number) {

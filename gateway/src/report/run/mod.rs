@@ -16,7 +16,9 @@ mod page;
 
 use std::path::Path;
 
-use protocol::skin::Skin;
+use protocol::can;
+use protocol::skin::{Bus, Skin};
+use protocol::wire_time::{BitRates, BitRatesError};
 use thiserror::Error;
 
 use super::figure::Page;
@@ -55,6 +57,14 @@ pub enum ReportError {
         /// What is missing.
         what: String,
     },
+    /// Bit rates that CAN does not have.
+    #[error("{bus}: {source}; say others with --nominal and --data")]
+    Rates {
+        /// The bus.
+        bus: String,
+        /// Why.
+        source: BitRatesError,
+    },
 }
 
 /// A report, and what of the recording is missing.
@@ -66,19 +76,47 @@ pub struct Report {
     pub missing: Option<String>,
 }
 
-/// Reads a recording and says what it holds. `command` is how the report was asked for.
+/// How a report is asked for.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// The command, as the page has it.
+    pub command: String,
+    /// Bits in a second of all buses, in place of the skin's.
+    pub nominal: Option<u32>,
+    /// Bits in a second of FD frames' data, in place of the skin's.
+    pub data: Option<u32>,
+}
+
+/// Bits in a second where neither the skin nor who asks says anything.
+const NOMINAL: u32 = 1_000_000;
+/// The same of FD frames' data.
+const DATA: u32 = 5_000_000;
+
+impl Options {
+    /// The bit rates that a bus' load is reckoned with.
+    fn rates(&self, bus: &Bus) -> Result<BitRates, ReportError> {
+        let nominal = self.nominal.or(bus.bitrate).unwrap_or(NOMINAL);
+        let data = match bus.format {
+            can::Format::Fd => self.data.or(bus.data_bitrate).unwrap_or_else(|| nominal.max(DATA)),
+            can::Format::Classic => nominal,
+        };
+        BitRates::new(nominal, data).map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
+    }
+}
+
+/// Reads a recording and says what it holds.
 ///
 /// # Errors
-/// When it is no recording of a run, or has nothing in it.
-pub fn report(path: &Path, command: &str) -> Result<Report, ReportError> {
-    let (run, broken) = read(path)?;
+/// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
+pub fn report(path: &Path, options: &Options) -> Result<Report, ReportError> {
+    let (run, broken) = read(path, options)?;
     let missing = broken.map(|why| run.missing(&why));
-    let page = page::page(&run, command, missing.as_deref());
+    let page = page::page(&run, &options.command, missing.as_deref());
     Ok(Report { page, missing })
 }
 
 /// Reads it all; also why it has no proper end, if it has none.
-fn read(path: &Path) -> Result<(Run, Option<String>), ReportError> {
+fn read(path: &Path, options: &Options) -> Result<(Run, Option<String>), ReportError> {
     let name = path.display().to_string();
     let mut items = Items::open(path)?;
     if items.format() == Format::Candump {
@@ -90,7 +128,7 @@ fn read(path: &Path) -> Result<(Run, Option<String>), ReportError> {
         });
     }
     // What stands before the first message is known when it is open.
-    let mut run = Run::begin(&name, items.extras())?;
+    let mut run = Run::begin(&name, items.extras(), options)?;
     let damaged = loop {
         match items.next() {
             Ok(Some(item)) => run.take(&item),
@@ -134,7 +172,7 @@ struct Run {
 }
 
 impl Run {
-    fn begin(name: &str, extras: &Extras) -> Result<Self, ReportError> {
+    fn begin(name: &str, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
         let text = extras.attachments.iter().find(|(name, _)| name == SKIN);
         let Some((_, text)) = text else {
@@ -144,7 +182,9 @@ impl Run {
         let text = String::from_utf8_lossy(text);
         let skin = Skin::parse(SKIN, &text).map_err(|error| foreign(format!("the attached {error}")))?;
         let layout = Layout::new(&skin);
-        let mut lanes: Vec<_> = (0..skin.buses.len()).map(|bus| Lane::new(&skin, bus)).collect();
+        let buses = skin.buses.iter().enumerate();
+        let lanes = buses.map(|(at, bus)| Ok(Lane::new(&skin, at, options.rates(bus)?)));
+        let mut lanes = lanes.collect::<Result<Vec<_>, ReportError>>()?;
         for before in &extras.in_force {
             if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
                 lane.in_force(before.nanos, &before.frame);

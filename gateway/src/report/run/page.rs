@@ -7,7 +7,7 @@ use super::lane::Lane;
 use crate::report::figure::{
     Axis, Figure, Finding, Mark, On, Page, Quantity, Section, Series, Shape, Size, Table, number,
 };
-use crate::report::thin::Thinned;
+use crate::report::thin::{Binned, Thinned};
 use crate::summary::Quantiles;
 use crate::table::{Errors, Event, Uplink};
 
@@ -51,7 +51,7 @@ pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
     if motion.ticks > 0 {
         sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
     }
-    sections.extend([draft.replies(), draft.traffic(), draft.losses()]);
+    sections.extend([draft.replies(), draft.load(), draft.losses()]);
     Page { title: format!("{}: report on a run", skin.name), intro, facts: facts(run, command), sections }
 }
 
@@ -129,9 +129,15 @@ impl Draft<'_> {
         let accounts = self.run.lanes.iter().map(Lane::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
-            let part = Quantity::new(in_time as f64 / due as f64 * 100.0, "%");
-            let what = format!("replies before the next joints, of {due} that were due");
-            findings.push(Finding::told(what, part).must("all", in_time == due));
+            let what = format!("replies not there before the next joints, of {due} that were due");
+            findings.push(Finding::told(what, count(due - in_time)).must("none", in_time == due));
+        }
+        for lane in &self.run.lanes {
+            let greatest = lane.load.rates().into_iter().map(|(_, part)| part * 100.0).fold(0.0, f64::max);
+            let what = format!("{}: greatest load of a real bus at {}", lane.name, lane.rates);
+            findings.push(
+                Finding::told(what, Quantity::new(greatest, "%")).must("below 100 %", greatest < 100.0),
+            );
         }
         let uplink =
             Uplink::total(self.run.lanes.iter().flat_map(|lane| lane.table.cells()).map(|cell| cell.uplink));
@@ -163,7 +169,10 @@ impl Draft<'_> {
             size: Size::Half,
             x: self.time(),
             y: Axis::new("torque", "Nm"),
-            series: vec![self.line("distributed", distributed), self.line("central", central)],
+            series: vec![
+                self.line("distributed", distributed),
+                Series::new("central", Shape::Dashed, self.points(central)),
+            ],
             marks: Vec::new(),
         });
         let mut figures: Vec<_> = figures.collect();
@@ -204,7 +213,7 @@ impl Draft<'_> {
         let joints = self.run.skin.robot.joints.len().min(WORDS);
         let single = accuracy.single_by_joint.iter().zip(&accuracy.whole_by_joint).take(joints);
         let text = |errors: &Errors| {
-            let mean = errors.mean().map_or_else(|| "none".to_owned(), number);
+            let mean = number(errors.mean().unwrap_or(f64::NAN));
             [mean, number(errors.max()), errors.count().to_string()]
         };
         let row = |name: String, single: &Errors, whole: &Errors| {
@@ -303,7 +312,7 @@ impl Draft<'_> {
                     self.line("central computation in it", &motion.central_took),
                 ],
             ),
-            figure("lateness", "How late each tick began", vec![self.line("late", &motion.late)]),
+            figure("lateness", "How late each tick began", vec![self.line("", &motion.late)]),
         ];
         let rows = [
             ("tick began late", &motion.late_ns),
@@ -486,25 +495,42 @@ impl Draft<'_> {
         }
     }
 
-    fn traffic(&self) -> Section {
-        let series = self.run.lanes.iter().map(|lane| {
-            let points = lane.traffic.rates().into_iter().map(|(x, y)| (x - self.zero, y)).collect();
-            Series::new(self.named(lane), Shape::Steps, points)
-        });
-        let width = self.run.lanes.iter().map(|lane| lane.traffic.width()).fold(0.0, f64::max);
-        let figure = Figure {
-            name: "traffic".to_owned(),
-            title: format!("Frames on the bus, over {} s each", number(width)),
+    /// What a real bus would carry.
+    fn load(&self) -> Section {
+        let percent = |binned: &Binned| {
+            let rates = binned.rates().into_iter();
+            rates.map(|(x, part)| (x - self.zero, part * 100.0)).collect::<Vec<_>>()
+        };
+        let figure = |lane: &Lane| Figure {
+            name: format!("load-{}", lane.name),
+            title: format!(
+                "{}: load of a real bus at {}, over {} s each",
+                lane.name,
+                lane.rates,
+                number(lane.load.width())
+            ),
             size: Size::Wide,
             x: self.time(),
-            y: Axis::new("frames", "1/s"),
-            series: series.collect(),
-            marks: Vec::new(),
+            y: Axis::new("load", "%"),
+            series: vec![
+                Series::new("what a real bus would carry", Shape::Steps, percent(&lane.load)),
+                Series::new(
+                    "with stimuli and simulated wires",
+                    Shape::Dashed,
+                    stairs(&percent(&lane.load_of_all)),
+                ),
+            ],
+            marks: vec![Mark { on: On::Y, at: 100.0, label: "all that it can".to_owned() }],
         };
         Section {
-            name: "traffic".to_owned(),
-            title: "Traffic".to_owned(),
-            figures: vec![figure],
+            name: "load".to_owned(),
+            title: "Load of the buses".to_owned(),
+            text: vec![
+                "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
+                 own bits make. Stimuli and simulated wires exist on a bench only."
+                    .to_owned(),
+            ],
+            figures: self.run.lanes.iter().map(figure).collect(),
             ..Section::default()
         }
     }
@@ -551,6 +577,14 @@ impl Draft<'_> {
             ..Section::default()
         }
     }
+}
+
+/// A line that holds each value until the next one.
+fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let held = points.windows(2).filter_map(|pair| Some((pair.get(1)?.0, pair.first()?.1)));
+    let mut stairs: Vec<_> = points.iter().copied().zip(held).flat_map(|(from, to)| [from, to]).collect();
+    stairs.extend(points.last());
+    stairs
 }
 
 fn count(count: u64) -> Quantity {
