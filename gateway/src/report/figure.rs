@@ -347,3 +347,44 @@ pub fn number(value: f64) -> String {
     let text = format!("{value:.digits$}");
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn verdicts_know_which_way_is_better_and_what_is_the_same() {
+        let quantity = |value| Quantity::new(value, "Nm");
+        let less = |ours| Finding::less_is_better("", quantity(2.0), quantity(ours)).verdict;
+        let more = |ours| Finding::more_is_better("", quantity(2.0), quantity(ours)).verdict;
+        assert_eq!(
+            [1.0, 1.91, 2.09, 2.2].map(less),
+            [Verdict::Better, Verdict::Same, Verdict::Same, Verdict::Worse]
+        );
+        assert_eq!(
+            [1.0, 1.95, 2.05, 3.0].map(more),
+            [Verdict::Worse, Verdict::Same, Verdict::Same, Verdict::Better]
+        );
+        assert_eq!(less(f64::NAN), Verdict::Told);
+        assert_eq!(Finding::told("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
+    }
+
+    #[test]
+    fn numbers_have_three_digits_and_no_more_zeros_than_they_need() {
+        for (value, text) in [
+            (0.0, "0"),
+            (-0.0, "0"),
+            (1.0, "1"),
+            (999_999.0, "999999"),
+            (2.5e7, "2.5e7"),
+            (0.012_345, "0.0123"),
+            (0.1, "0.1"),
+            (-12.349, "-12.3"),
+            (1.5e-7, "1.5e-7"),
+            (5e-5, "5e-5"),
+            (f64::NAN, "–"),
+        ] {
+            assert_eq!(number(value), text);
+        }
+    }
+}

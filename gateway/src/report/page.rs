@@ -15,9 +15,9 @@ pub fn html(page: &Page) -> String {
     let title = svg::escaped(&page.title);
     let _ = write!(
         out,
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <meta name=\"color-scheme\" content=\"light dark\">\n<title>{title}</title>\n\
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
+         <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}</title>\n\
          <style>\n{STYLE}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
         svg::dark()
     );
@@ -109,11 +109,13 @@ fn findings(out: &mut String, findings: &[Finding]) {
         let _ = write!(out, "<tr><td>{}</td>", svg::escaped(&finding.what));
         if paper {
             let paper = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
-            let _ = write!(out, "<td class=\"n\">{}</td>", svg::escaped(&paper));
+            let _ = write!(out, "<td class=\"n\" data-head=\"paper\">{}</td>", svg::escaped(&paper));
         }
-        let _ = write!(out, "<td class=\"n\">{}</td>", svg::escaped(&finding.ours.to_string()));
+        let ours = svg::escaped(&finding.ours.to_string());
+        let _ = write!(out, "<td class=\"n\" data-head=\"here\">{ours}</td>");
         if bar {
-            let _ = write!(out, "<td>{}</td>", svg::escaped(finding.bar.as_deref().unwrap_or_default()));
+            let bar = svg::escaped(finding.bar.as_deref().unwrap_or_default());
+            let _ = write!(out, "<td class=\"bar\" data-head=\"must be\">{bar}</td>");
         }
         if paper || bar {
             let (class, text) = match (finding.verdict, &finding.bar) {
@@ -159,4 +161,88 @@ fn numbers(table: &Table, column: usize) -> bool {
         table.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.is_empty()).peekable();
     cells.peek().is_some()
         && cells.all(|cell| cell.starts_with(|first: char| first.is_ascii_digit() || "-+−–".contains(first)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::figure::{Axis, Quantity, Series, Shape};
+    use roxmltree::{Document, ParsingOptions};
+
+    fn whole() -> Page {
+        let series = vec![Series::new("line", Shape::Line, vec![(0.0, 1.0), (1.0, 2.0)])];
+        let figure = |name: &str, size| Figure {
+            name: name.to_owned(),
+            title: format!("{name} <&>"),
+            size,
+            x: Axis::new("time", "s"),
+            y: Axis::new("torque", "Nm"),
+            series: series.clone(),
+            marks: Vec::new(),
+        };
+        let nm = |value| Quantity::new(value, "Nm");
+        let section = |name: &str| Section {
+            name: name.to_owned(),
+            title: "One & two".to_owned(),
+            text: vec!["a < b".to_owned()],
+            figures: vec![
+                figure(&format!("{name}-wide"), Size::Wide),
+                figure(&format!("{name}-half"), Size::Half),
+            ],
+            findings: vec![
+                Finding::less_is_better("error", nm(0.0054), nm(6.3e-5)),
+                Finding::told("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false),
+            ],
+            tables: vec![Table {
+                title: "cells".to_owned(),
+                head: vec!["cell".to_owned(), "late".to_owned()],
+                rows: vec![
+                    vec!["vcan0 1".to_owned(), "12".to_owned()],
+                    vec!["vcan0 2".to_owned(), "–".to_owned()],
+                ],
+            }],
+        };
+        Page {
+            title: "A page & more".to_owned(),
+            intro: "<script>".to_owned(),
+            facts: vec![("command".to_owned(), "gateway run 'a' > b".to_owned())],
+            sections: vec![section("one"), section("two"), section("three")],
+        }
+    }
+
+    /// All text of an element.
+    fn text(node: roxmltree::Node<'_, '_>) -> String {
+        node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
+    }
+
+    #[test]
+    fn a_page_is_well_formed_whole_and_needs_nothing_else() {
+        let html = html(&whole());
+        let document = Document::parse_with_options(
+            &html,
+            ParsingOptions { allow_dtd: true, ..ParsingOptions::default() },
+        );
+        let document = document.unwrap_or_else(|error| panic!("{error}\n{html}"));
+        let all = |name: &str| {
+            document.descendants().filter(|node| node.tag_name().name() == name).collect::<Vec<_>>()
+        };
+        assert_eq!(text(all("h1")[0]), "A page & more");
+        assert_eq!(all("figure").len(), 6);
+        assert_eq!(all("svg").len(), 9, "a wide figure has a drawing for the hand");
+        assert!(all("script").is_empty() && all("img").is_empty() && all("link").is_empty());
+        assert!(!html.replace("http://www.w3.org/2000/svg", "").contains("http"), "nothing is fetched");
+        let names: Vec<_> = document.descendants().filter_map(|node| node.attribute("id")).collect();
+        for link in all("a") {
+            let to = link.attribute("href").unwrap().strip_prefix('#').unwrap();
+            assert_eq!(names.iter().filter(|name| **name == to).count(), 1, "{to}");
+        }
+        let rows: Vec<_> = all("tr").into_iter().map(text).collect();
+        assert!(rows.contains(&"error0.0054\u{a0}Nm6.3e-5\u{a0}Nm✓ better".to_owned()), "{rows:?}");
+        assert!(rows.contains(&"slope0.25 ± 0.5\u{a0}Nmbelow 1 Nm✗ does not hold".to_owned()), "{rows:?}");
+        let right: Vec<_> =
+            all("td").into_iter().filter(|cell| cell.attribute("class") == Some("n")).map(text).collect();
+        assert!(right.contains(&"12".to_owned()) && right.contains(&"–".to_owned()));
+        assert!(!right.contains(&"vcan0 1".to_owned()));
+        assert!(text(all("footer")[0]).contains("gateway run 'a' > b"));
+    }
 }

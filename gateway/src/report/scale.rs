@@ -195,3 +195,60 @@ const fn raised(digit: char) -> char {
         other => other,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn span(from: f64, to: f64, scale: Scale) -> Span {
+        Span::new(&Axis { scale, ..Axis::default() }.between(from, to), [].into_iter(), 0.0)
+    }
+
+    #[test]
+    fn ticks_stand_at_round_numbers_and_are_written_with_the_digits_that_tell_them_apart() {
+        let labels = |from, to, scale, most| {
+            let span = span(from, to, scale);
+            span.ticks(most).into_iter().map(|tick| span.label(tick, most)).collect::<Vec<_>>().join(" ")
+        };
+        assert_eq!(labels(0.0, 12.0, Scale::Linear, 8), "0 2 4 6 8 10 12");
+        assert_eq!(labels(-1.3, 0.4, Scale::Linear, 9), "-1.2 -1.0 -0.8 -0.6 -0.4 -0.2 0.0 0.2 0.4");
+        assert_eq!(labels(0.0, 2e-5, Scale::Linear, 4), "0 5·10⁻⁶ 10⁻⁵ 1.5·10⁻⁵ 2·10⁻⁵");
+        assert_eq!(labels(1e-7, 0.04, Scale::Log, 6), "10⁻⁷ 10⁻⁶ 10⁻⁵ 10⁻⁴ 10⁻³ 0.01");
+        assert_eq!(labels(15.0, 2_000.0, Scale::Log, 8), "20 50 100 200 500 1000 2000");
+    }
+
+    #[test]
+    fn an_axis_fits_what_is_drawn_and_begins_at_0_where_all_is_above() {
+        let ends = |scale, values: &[f64]| {
+            let span = Span::new(&Axis { scale, ..Axis::default() }, values.iter().copied(), 0.05);
+            (span.from, span.to)
+        };
+        assert_eq!(ends(Scale::Linear, &[0.2, 10.0, f64::NAN]), (0.0, 10.0 + 0.05 * 9.8));
+        assert_eq!(ends(Scale::Linear, &[-1.0, 1.0]), (-1.1, 1.1));
+        assert_eq!(ends(Scale::Linear, &[3.0]), (3.0 - 0.3, 3.3));
+        assert_eq!(ends(Scale::Linear, &[]), (0.0, 1.0));
+        assert_eq!(ends(Scale::Log, &[0.0, -4.0]), (1.0, 10.0), "nothing that could stand there");
+        let (from, to) = ends(Scale::Log, &[0.0, 1.0, 100.0]);
+        assert!(from > 0.7 && from < 1.0 && to > 100.0 && to < 140.0, "{from} {to}");
+    }
+
+    proptest! {
+        #[test]
+        fn ticks_are_few_in_order_and_inside(from in -1e6..1e6_f64, width in 1e-6..1e6_f64, most in 2_usize..12, log: bool) {
+            let (scale, from) = if log { (Scale::Log, from.abs() + 1e-6) } else { (Scale::Linear, from) };
+            let span = span(from, from + width, scale);
+            let ticks = span.ticks(most);
+            prop_assert!(ticks.len() <= most + 1, "{ticks:?}");
+            prop_assert!(ticks.is_sorted());
+            let little = 1e-5 * (from.abs() + width);
+            prop_assert!(ticks.iter().all(|tick| *tick >= from - little && *tick <= from + width + little), "{ticks:?}");
+        }
+
+        #[test]
+        fn a_place_comes_back_as_its_value(from in 1e-3..1e3_f64, width in 1e-2..1e3_f64, place in 0.0..1.0_f64, log: bool) {
+            let span = span(from, from + width, if log { Scale::Log } else { Scale::Linear });
+            prop_assert!((span.place(span.value(place)) - place).abs() < 1e-9);
+        }
+    }
+}

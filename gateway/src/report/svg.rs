@@ -398,3 +398,6 @@ const fn pixels(count: u32) -> u32 {
 fn in_pixels(count: f64) -> i32 {
     (count * f64::from(UNIT)).round() as i32
 }
+
+#[cfg(test)]
+mod tests;

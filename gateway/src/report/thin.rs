@@ -221,3 +221,95 @@ impl Binned {
         bins.map(|(at, sum)| (from + at as f64 * self.width, sum / self.width)).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn ends(points: &[(f64, f64)]) -> (f64, f64) {
+        points.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, greatest), (_, y)| {
+            (least.min(*y), greatest.max(*y))
+        })
+    }
+
+    #[test]
+    fn a_peak_of_one_point_in_a_million_stays_where_it_was() {
+        let mut line = Thinned::new(500, 0.002);
+        for n in 0..1_000_000_u32 {
+            let y = if n == 654_321 { 99.0 } else { f64::from(n % 7) };
+            line.push(f64::from(n) * 0.002, y);
+        }
+        let points = line.points();
+        assert!((500..=2_000).contains(&points.len()), "{}", points.len());
+        assert_eq!(line.count(), 1_000_000);
+        assert!(points.contains(&(654_321.0 * 0.002, 99.0)));
+        assert_eq!(points.first(), Some(&(0.0, 0.0)));
+        assert_eq!(points.last(), Some(&(999_999.0 * 0.002, f64::from(999_999 % 7))));
+        assert!(points.is_sorted_by(|a, b| a.0 <= b.0));
+    }
+
+    #[test]
+    fn a_gap_stays_a_gap_when_columns_become_wider() {
+        let mut line = Thinned::new(16, 1.0);
+        for n in 0..1_000_u32 {
+            line.push(n.into(), if (300..700).contains(&n) { f64::NAN } else { 1.0 });
+        }
+        let points = line.points();
+        let gaps: Vec<_> = points.iter().filter(|(_, y)| y.is_nan()).map(|(x, _)| *x).collect();
+        assert_eq!(gaps.len(), 1, "{points:?}");
+        let before = points.iter().take_while(|(_, y)| !y.is_nan()).last().unwrap().0;
+        let after = points.iter().skip_while(|(_, y)| !y.is_nan()).nth(1).unwrap().0;
+        assert_eq!((before, after), (299.0, 700.0));
+    }
+
+    #[test]
+    fn what_is_added_to_bins_is_all_there_when_they_become_wider() {
+        let mut bins = Binned::new(10, 0.1);
+        for n in 0..1_000_u32 {
+            bins.add(5.0 + f64::from(n) * 0.01, 2.0);
+        }
+        assert!((bins.width() - 1.6).abs() < 1e-12, "10 s in at most 10 bins: {}", bins.width());
+        let rates = bins.rates();
+        assert_eq!(rates.len(), 6, "the last is not full");
+        for (at, (x, rate)) in (0_u32..).zip(&rates) {
+            assert!((x - 5.0 - f64::from(at) * 1.6).abs() < 1e-9, "{x}");
+            assert!((rate - 200.0).abs() < 2.5, "{rate}");
+        }
+    }
+
+    proptest! {
+        /// By brute force: each column's extremes, and no point that was not there.
+        #[test]
+        fn thinning_keeps_the_extremes_of_every_column(
+            ys in proptest::collection::vec(-100..100_i32, 1..4_000), columns in 2_u32..40,
+        ) {
+            let count = ys.len() as f64;
+            let points: Vec<_> = ys.iter().enumerate().map(|(n, y)| (n as f64 / count, f64::from(*y))).collect();
+            let thin = thinned(&points, columns);
+            prop_assert!(thin.len() <= points.len() && (points.len() <= 4 * columns as usize || thin.len() <= 4 * columns as usize));
+            prop_assert!(thin.iter().all(|point| points.contains(point)));
+            for column in 0..columns {
+                let inside = |(x, _): &&(f64, f64)| (x * f64::from(columns)).floor() == f64::from(column);
+                let of = |points: &[(f64, f64)]| ends(&points.iter().filter(inside).copied().collect::<Vec<_>>());
+                prop_assert_eq!(of(&points), of(&thin));
+            }
+        }
+
+        #[test]
+        fn a_stream_keeps_its_ends_and_stays_small(ys in proptest::collection::vec(-100..100_i32, 1..4_000), most in 2_usize..60) {
+            let mut line = Thinned::new(most, 0.5);
+            let mut all = Vec::new();
+            for (n, y) in ys.iter().enumerate() {
+                let point = (n as f64 * 0.3, f64::from(*y));
+                line.push(point.0, point.1);
+                all.push(point);
+            }
+            let points = line.points();
+            prop_assert!(points.len() <= 4 * most);
+            prop_assert_eq!(ends(&points), ends(&all));
+            prop_assert_eq!((points.first(), points.last()), (all.first(), all.last()));
+            prop_assert!(points.iter().all(|point| all.contains(point)));
+        }
+    }
+}

@@ -72,6 +72,8 @@ pub(super) struct Lane {
     /// By place among the bus' cells.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
+    /// When the first and the last joints stood on the bus, in s, and how many there were.
+    pub(super) joints: Option<(f64, f64, u64)>,
     pub(super) rates: BitRates,
     /// Seconds that a real bus would carry what it has to.
     pub(super) load: Binned,
@@ -106,6 +108,7 @@ impl Lane {
             slowest: thinned(),
             error: thinned(),
             frames: 0,
+            joints: None,
             rates,
             load: Binned::new(BINS, BIN_S),
             load_of_all: Binned::new(BINS, BIN_S),
@@ -193,6 +196,8 @@ impl Lane {
 
     /// New joints stand on the bus.
     fn next(&mut self, number: u64, at: f64) {
+        let (first, _, count) = self.joints.unwrap_or((at, at, 0));
+        self.joints = Some((first, at, count + 1));
         let (account, errors) = (self.account(), self.errors());
         let due = self.close(account, errors);
         self.open = Some(Open { number, at, due, before: account, errors, slowest: None });

@@ -1,0 +1,135 @@
+use super::*;
+use crate::report::figure::Axis;
+use roxmltree::{Document, Node};
+
+fn figure(series: Vec<Series>) -> Figure {
+    let (x, y) = (Axis::new("time", "s").between(0.0, 10.0), Axis::new("torque", "Nm").between(-1.0, 1.0));
+    Figure {
+        name: "figure".to_owned(),
+        title: "A <title> & more".to_owned(),
+        x,
+        y,
+        series,
+        ..Figure::default()
+    }
+}
+
+fn line(points: &[(f64, f64)]) -> Series {
+    Series::new("a \"line\" & more", Shape::Line, points.to_vec())
+}
+
+/// The lines of a class, as places in units.
+fn lines<'a>(document: &'a Document<'_>, class: &'a str) -> Vec<Vec<(f64, f64)>> {
+    let of_class =
+        |node: &Node<'_, '_>| node.has_tag_name((SVG, "polyline")) && node.attribute("class") == Some(class);
+    let places = |text: &str| {
+        let pairs = text.split_whitespace().map(|pair| pair.split_once(',').unwrap());
+        pairs.map(|(x, y)| (x.parse().unwrap(), y.parse().unwrap())).collect()
+    };
+    let lines = document.descendants().filter(of_class).map(|node| places(node.attribute("points").unwrap()));
+    // The legend's stroke is the last one.
+    lines.collect()
+}
+
+const SVG: &str = "http://www.w3.org/2000/svg";
+
+#[test]
+fn values_stand_where_the_axes_say() {
+    let text = draw(&figure(vec![line(&[(0.0, -1.0), (5.0, 0.0), (10.0, 1.0)])]));
+    let document = Document::parse(&text).unwrap();
+    let places = lines(&document, "c0-s");
+    let [(left, bottom), (middle, half), (right, top)] = places[0][..] else { panic!("{places:?}") };
+    assert!(left < right && top < bottom, "to the right and upwards: {places:?}");
+    assert!(((left + right) / 2.0 - middle).abs() <= 1.0 && ((top + bottom) / 2.0 - half).abs() <= 1.0);
+    let (width, height) = natural(Size::Wide);
+    assert!(left > 0.0 && right < f64::from(width) * f64::from(UNIT));
+    assert!(top > 0.0 && bottom < f64::from(height) * f64::from(UNIT));
+    // A tick's words stand at its value.
+    let words: Vec<_> = document.descendants().filter(|node| node.has_tag_name((SVG, "text"))).collect();
+    let at = |word: &str, axis: &str| {
+        let node = words.iter().find(|node| node.text().unwrap().trim() == word).unwrap();
+        node.attribute(axis).unwrap().parse::<f64>().unwrap()
+    };
+    assert!((at("5", "x") - middle).abs() <= f64::from(UNIT), "{} {middle}", at("5", "x"));
+    assert!((at("0.0", "y") - half).abs() <= f64::from(UNIT), "{} {half}", at("0.0", "y"));
+    for word in ["time (s)", "torque (Nm)", "a \"line\" & more"] {
+        assert!(words.iter().any(|node| node.text().unwrap().trim() == word), "{word} in {text}");
+    }
+    let title = document.descendants().find(|node| node.has_tag_name((SVG, "title"))).unwrap();
+    assert_eq!(title.text(), Some("A <title> & more"));
+}
+
+#[test]
+fn what_lies_outside_is_cut_off_at_the_edge_and_a_gap_is_a_gap() {
+    let inside = [(0.0, -1.0), (10.0, 1.0)];
+    let beyond = [(0.0, -3.0), (5.0, 3.0), (10.0, -3.0)];
+    let gap = [(0.0, 0.5), (2.0, 0.5), (3.0, f64::NAN), (4.0, 0.5), (6.0, 0.5)];
+    let text = draw(&figure(vec![line(&inside), line(&beyond), line(&gap)]));
+    let document = Document::parse(&text).unwrap();
+    let (frame, beyond, gap) = (lines(&document, "c0-s"), lines(&document, "c1-s"), lines(&document, "c2-s"));
+    let [(left, bottom), (right, top)] = frame[0][..] else { panic!("{frame:?}") };
+    assert_eq!(beyond.len(), 2 + 1, "two pieces, and the legend's");
+    for (x, y) in beyond[..2].concat() {
+        assert!((left..=right).contains(&x) && (top - 1.0..=bottom + 1.0).contains(&y), "{x} {y}");
+    }
+    // From -3 to 3 in 5 s, it comes in at -1 after 5/3 s.
+    let into = left + (right - left) / 6.0;
+    assert!((beyond[0][0].0 - into).abs() <= 2.0, "{beyond:?} {into}");
+    assert_eq!(gap.len(), 2 + 1, "{gap:?}");
+}
+
+#[test]
+fn steps_hold_their_value_dashes_are_an_attribute_and_a_band_is_an_area() {
+    let points = vec![(0.0, 0.0), (5.0, 0.5), (10.0, 0.5)];
+    let shape = |shape| draw(&figure(vec![Series::new("", shape, points.clone())]));
+    let steps = shape(Shape::Steps);
+    let steps = lines(&Document::parse(&steps).unwrap(), "c0-s");
+    assert_eq!(steps[0].len(), 5);
+    assert!(steps[0][0].1 > steps[0][2].1 && (steps[0][1].1 - steps[0][0].1).abs() < 0.5, "{steps:?}");
+    assert!(shape(Shape::Dashed).contains("stroke-dasharray"));
+    assert!(!shape(Shape::Line).contains("stroke-dasharray"));
+    assert!(shape(Shape::Band).contains("<polygon"));
+    assert_eq!(shape(Shape::Points).matches("<circle").count(), 3);
+}
+
+#[test]
+fn nothing_to_draw_is_drawn_as_axes() {
+    for points in [vec![], vec![(f64::NAN, 1.0)], vec![(1.0, f64::INFINITY)], vec![(2.0, 3.0)]] {
+        for shape in [Shape::Line, Shape::Dashed, Shape::Points, Shape::Steps, Shape::Band] {
+            for scale in [Axis::new("x", ""), Axis::new("x", "").log()] {
+                let series = vec![Series::new("something", shape, points.clone())];
+                let figure = Figure { series, x: scale.clone(), y: scale, ..figure(Vec::new()) };
+                let text = draw(&figure);
+                let document = Document::parse(&text).unwrap();
+                assert!(document.descendants().any(|node| node.has_tag_name((SVG, "line"))), "{text}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_hour_at_500_hz_is_a_small_drawing() {
+    let points: Vec<_> =
+        (0..1_800_000).map(|n| (f64::from(n) / 180_000.0, f64::from(n % 17) / 17.0)).collect();
+    let text = draw(&figure(vec![line(&points)]));
+    assert!(text.len() < 60_000, "{}", text.len());
+}
+
+#[test]
+fn every_colour_has_another_one_on_a_dark_screen() {
+    let rules = dark();
+    for (_, class, colour) in CLASSES {
+        assert!(rules.contains(&format!(".{class}-s{{stroke:{colour}}}")));
+    }
+    let series =
+        (0..9).map(|n| Series::new(format!("s{n}"), Shape::Line, vec![(0.0, 0.0), (10.0, 0.1)])).collect();
+    let text = draw(&figure(series));
+    let document = Document::parse(&text).unwrap();
+    for node in document.descendants() {
+        let coloured = ["fill", "stroke"]
+            .iter()
+            .filter_map(|name| node.attribute(*name))
+            .any(|value| value.starts_with('#'));
+        assert!(!coloured || node.attribute("class").is_some(), "{node:?}");
+    }
+}
