@@ -1,0 +1,209 @@
+//! Reports on recordings of real benches: what figures and tables show is what the recording holds, read by another
+//! program's reader, and what the gateway itself counted.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod process;
+#[path = "process/recorded.rs"]
+mod recorded;
+
+use std::fs;
+
+use gateway::report::figure::{Figure, Page, Table, number};
+use gateway::report::run::{Options, report};
+use process::{PRESSED, Place, names};
+use recorded::Recorded;
+use serde_json::Value;
+
+/// A bench of eight cells that push the arm, compared all the time.
+fn recorded_bench(place: &Place, seconds: f64) -> Recorded {
+    place.skin(8);
+    place.scenario(&PRESSED.replace("\"hold\"", "\"kinesthetic\""));
+    place.bench(seconds, "--record run.mcap").end().well();
+    Recorded::read(&place.path("run.mcap"))
+}
+
+fn page(place: &Place, name: &str) -> (Page, Option<String>) {
+    let report = report(&place.path(name), &Options::default()).unwrap();
+    (report.page, report.missing)
+}
+
+fn figure<'a>(page: &'a Page, name: &str) -> &'a Figure {
+    let mut figures = page.sections.iter().flat_map(|section| &section.figures);
+    figures.find(|figure| figure.name == name).unwrap_or_else(|| panic!("no figure {name}"))
+}
+
+fn table<'a>(page: &'a Page, title: &str) -> &'a Table {
+    let mut tables = page.sections.iter().flat_map(|section| &section.tables);
+    tables.find(|table| table.title == title).unwrap_or_else(|| panic!("no table {title}"))
+}
+
+/// A row by its first cell, without it.
+fn row<'a>(table: &'a Table, first: &str) -> &'a [String] {
+    let row = table.rows.iter().find(|row| row[0] == first);
+    &row.unwrap_or_else(|| panic!("no row {first} in {table:?}"))[1..]
+}
+
+/// What was found, by what it begins with.
+fn found(page: &Page, what: &str) -> f64 {
+    let mut findings = page.sections.iter().flat_map(|section| &section.findings);
+    findings.find(|finding| finding.what.starts_with(what)).unwrap_or_else(|| panic!("no {what}")).ours.value
+}
+
+/// The first, the least, the greatest and the last.
+fn span(values: impl Iterator<Item = f64>) -> [f64; 4] {
+    let values: Vec<_> = values.filter(|value| value.is_finite()).collect();
+    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [values[0], least, greatest, values[values.len() - 1]]
+}
+
+fn drawn(figure: &Figure, series: usize) -> [f64; 4] {
+    span(figure.series[series].points.iter().map(|(_, y)| *y))
+}
+
+#[test]
+fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
+    let place = Place::new();
+    let recorded = recorded_bench(&place, 3.0);
+    let (page, missing) = page(&place, "run.mcap");
+    assert_eq!(missing, None);
+    let summary = place.summary();
+
+    let on = |topic: &str, field: &str, index: Option<usize>| {
+        let value =
+            |value: &Value| index.map_or_else(|| value[field].as_f64(), |index| value[field][index].as_f64());
+        span(recorded.on(topic).map(|message| value(&message.value).unwrap()))
+    };
+    for joint in 0..6 {
+        assert_eq!(
+            drawn(figure(&page, "positions"), joint),
+            on("/UR5/joint_states", "position", Some(joint))
+        );
+        assert_eq!(
+            drawn(figure(&page, "velocities"), joint),
+            on("/UR5/joint_states", "velocity", Some(joint))
+        );
+        let torque = figure(&page, &format!("torque-joint{}", joint + 1));
+        assert_eq!(drawn(torque, 0), on("/UR5/torques", "distributed", Some(joint)));
+        assert_eq!(drawn(torque, 1), on("/UR5/torques", "central", Some(joint)));
+    }
+    let moved = drawn(figure(&page, "positions"), 1);
+    assert!((moved[0] - moved[3]).abs() > 0.01, "the arm gives way: {moved:?}");
+    assert_eq!(drawn(figure(&page, "cycle"), 0), on("/gateway/timing", "took_us", None));
+    assert_eq!(drawn(figure(&page, "cycle"), 1), on("/gateway/timing", "central_us", None));
+    assert_eq!(drawn(figure(&page, "lateness"), 0), on("/gateway/timing", "late_us", None));
+    assert_eq!(drawn(figure(&page, "active-cells"), 0), on("/gateway/timing", "contributing", None));
+    assert_eq!(drawn(figure(&page, "active-cells"), 1), on("/UR5/torques", "active", None));
+    let times: Vec<_> = recorded.on("/gateway/timing").map(|message| message.nanos).collect();
+    let seconds = (times[times.len() - 1] - times[0]) as f64 * 1e-9;
+    let last = figure(&page, "positions").series[0].points.last().unwrap().0;
+    assert!((last - seconds).abs() < 1e-6, "{last} {seconds}");
+
+    // The gateway's own accounts, which are not in the recording as numbers.
+    let counted = |pointer: &str| summary.number(pointer).to_string();
+    let replies = row(table(&page, "Replies by bus"), "vcan0");
+    let keys =
+        ["replies/due", "replies/in_time", "replies/late"].map(|key| counted(&format!("/buses/0/{key}")));
+    assert_eq!(replies[..3], keys);
+    let reasons = ["too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
+    let missing: u64 = reasons.iter().map(|key| summary.number(&format!("/buses/0/replies/{key}"))).sum();
+    assert_eq!(replies[3], missing.to_string());
+    assert_eq!(
+        replies[4..6],
+        ["epochs_due", "epochs_complete"].map(|key| counted(&format!("/buses/0/{key}")))
+    );
+    assert!(summary.number("/buses/0/replies/in_time") > 0);
+    let slowest = summary.figure("/buses/0/last_reply_us/max");
+    assert_eq!(replies[8], number(slowest * 1e-3));
+    let due: f64 =
+        figure(&page, "replies-vcan0").series[0].points.iter().map(|(_, y)| *y).fold(0.0, f64::max);
+    assert!((due - 8.0).abs() < 0.5, "all eight are due: {due}");
+
+    let errors = table(
+        &page,
+        "Absolute errors in Nm, joint by joint: single cells where the joint carries them, and the whole skin's sum",
+    );
+    let all = row(errors, "all");
+    for (key, cells) in [("single", &all[..3]), ("whole", &all[3..])] {
+        let of = |name: &str| summary.figure(&format!("/accuracy/{key}/{name}"));
+        assert_eq!(
+            cells,
+            [number(of("mean_nm")), number(of("max_nm")), counted(&format!("/accuracy/{key}/count"))]
+        );
+    }
+    let single = found(&page, "torques of single cells");
+    assert!((single / summary.figure("/accuracy/single/mean_nm") - 1.0).abs() < 1e-9, "{single}");
+    let by_joint = errors.rows.iter().filter(|row| row[0].starts_with("joint "));
+    let torques: u64 = by_joint.map(|row| row[3].parse::<u64>().unwrap()).sum();
+    assert_eq!(torques, summary.number("/accuracy/single/count"));
+
+    let control = table(&page, "The control loop");
+    for (name, key) in [
+        ("tick began late", "late_us"),
+        ("tick took", "took_us"),
+        ("central computation in it", "central_us"),
+    ] {
+        let quantile = |name: &str| number(summary.figure(&format!("/loop/{key}/{name}")));
+        let expected = ["p50", "p90", "p99", "max"].map(quantile);
+        assert_eq!(row(control, name)[..4], expected, "{key}");
+        assert_eq!(row(control, name)[4], counted(&format!("/loop/{key}/count")));
+    }
+    let losses = page.sections.iter().find(|section| section.name == "losses").unwrap();
+    assert_eq!(row(&losses.tables[0], "ticks skipped by the loop"), [counted("/loop/ticks_skipped")]);
+    assert_eq!(row(&losses.tables[0], "vcan0: frames recorded"), [counted("/recording/frames")]);
+    assert_eq!(
+        row(&losses.tables[0], "vcan0: packets that cells sent, by their own count"),
+        [counted("/buses/0/uplink/sent")]
+    );
+    let fact = |name: &str| &page.facts.iter().find(|(fact, _)| fact == name).unwrap().1;
+    assert!(fact("run's command").contains("--record run.mcap"));
+    assert!(fact("idle machine").contains("µs late (median)"));
+}
+
+#[test]
+fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_says_what_is_missing() {
+    let place = Place::new();
+    recorded_bench(&place, 2.0);
+    let before = place.files();
+    let ended = place.start("gateway", "report run.mcap --svg figures").end().well();
+    let (whole, _) = page(&place, "run.mcap");
+    let figures: Vec<_> = whole.sections.iter().flat_map(|section| &section.figures).collect();
+    assert_eq!(ended.stdout, format!("run.html: {} figures, also as files in figures\n", figures.len()));
+    let html = place.read("run.html");
+    let mut drawings = Vec::new();
+    for figure in &figures {
+        assert!(html.contains(&format!("id=\"{}\"", figure.name)), "{}", figure.name);
+        drawings.push(format!("{}.svg", figure.name));
+    }
+    drawings.sort();
+    assert_eq!(names(&place.path("figures")), drawings);
+    assert!(html.ends_with("</html>\n") && html.contains("gateway run skin.toml"));
+    let after: Vec<_> = place.files().into_iter().filter(|name| !before.contains(name)).collect();
+    assert_eq!(after, ["figures", "run.html"]);
+
+    // Where nothing can be written nothing is left.
+    let refused = place.start("gateway", "report run.mcap -o run.mcap/run.html").end();
+    assert!(refused.refusal(1).starts_with("gateway: run.mcap/run.html: "), "{refused:?}");
+    let refused = place.start("gateway", "report run.mcap -o nowhere/run.html --svg more").end();
+    assert!(refused.refusal(1).starts_with("gateway: nowhere/run.html: "), "{refused:?}");
+    assert!(!place.path("more").exists());
+    let refused = place.start("gateway", "report run.mcap -o new.html --nominal 2M").end();
+    assert!(refused.refusal(2).contains("nominal bit rate 2000000 bit/s"), "{refused:?}");
+
+    let bytes = fs::read(place.path("run.mcap")).unwrap();
+    fs::write(place.path("cut.mcap"), &bytes[..bytes.len() / 2]).unwrap();
+    let ended = place.start("gateway", "report cut.mcap").end().well();
+    assert_eq!(ended.stderr.matches('\n').count(), 1, "{ended:?}");
+    for words in ["gateway: cut.mcap: it has no end", "of the 2 s that the run was to last", "s are missing"]
+    {
+        assert!(ended.stderr.contains(words), "{words}: {ended:?}");
+    }
+    assert!(place.read("cut.html").contains("Not all of the run is here: it has no end"));
+    // As much as a recovery finds.
+    place.start("gateway", "recover cut.mcap -o recovered.mcap").end().well();
+    let recovered = Recorded::read(&place.path("recovered.mcap"));
+    let ticks = recovered.on("/gateway/timing").count();
+    let (cut, missing) = page(&place, "cut.mcap");
+    assert!(missing.is_some() && ticks > 0 && ticks < 1_000, "{ticks}");
+    assert_eq!(row(table(&cut, "The control loop"), "tick took")[4], ticks.to_string());
+}
