@@ -48,12 +48,7 @@ impl Report {
         self.is_free(&output, "-o")?;
         let command: Vec<_> = std::env::args().collect();
         let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
-        let report = run::report(&self.file, &options).map_err(|error| match error {
-            ReportError::Log { .. } | ReportError::Foreign { .. } | ReportError::Rates { .. } => {
-                Failure::usage(error)
-            }
-            error => Failure::run(error),
-        })?;
+        let report = run::report(&self.file, &options).map_err(refused)?;
         let mut files = vec![(output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {
             for (name, drawing) in drawings(&report.page) {
@@ -96,6 +91,11 @@ impl Report {
         }
         Ok(())
     }
+}
+
+/// What is no recording of a run is wrong use; what cannot be read is not.
+fn refused(error: ReportError) -> Failure {
+    if matches!(error, ReportError::Capture(_)) { Failure::run(error) } else { Failure::usage(error) }
 }
 
 /// Each figure's file name and drawing.
