@@ -9,6 +9,7 @@ pub mod cycle;
 pub mod dbc;
 pub mod decode;
 pub mod explain;
+pub mod experiment;
 pub mod external;
 pub mod fit;
 pub mod generate;

@@ -34,7 +34,7 @@
 
 mod projection;
 mod scalar;
-#[cfg(any(feature = "host", test))]
+#[cfg(any(feature = "witness", test))]
 pub mod witness;
 mod wrench;
 

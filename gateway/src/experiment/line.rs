@@ -1,0 +1,187 @@
+//! A straight line through points by least squares, with its quality and how sure its slope is.
+
+/// A point, and how much it counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weighted {
+    /// To the right.
+    pub x: f64,
+    /// Upwards.
+    pub y: f64,
+    /// How many measurements it stands for; above 0.
+    pub weight: f64,
+}
+
+/// `y = slope x + intercept`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Line {
+    /// In units of y for one of x.
+    pub slope: f64,
+    /// In units of y.
+    pub intercept: f64,
+    /// R²: the part of y's variance that the line explains, in [0, 1].
+    pub quality: f64,
+    /// Half the width of the slope's 95 % interval, in its unit.
+    pub slope_half: f64,
+}
+
+impl Line {
+    /// The line from which the weighted squares of the distances along y are least. `None` for fewer than
+    /// three points, or when all have the same x: then there is no line, or no telling how sure it is.
+    ///
+    /// With weights w, means over w, and n points:
+    ///
+    /// ```text
+    ///   slope = Sxy / Sxx        R² = 1 - Σ w r² / Syy        s² = Σ w r² / (n - 2)
+    ///   interval of the slope: slope ± t(0.975, n - 2) · sqrt(s² / Sxx)
+    /// ```
+    #[must_use]
+    pub fn through(points: &[Weighted]) -> Option<Self> {
+        if points.len() < 3 {
+            return None;
+        }
+        let total: f64 = points.iter().map(|point| point.weight).sum();
+        let mean = |of: fn(&Weighted) -> f64| {
+            points.iter().map(|point| point.weight * of(point)).sum::<f64>() / total
+        };
+        let (x_mean, y_mean) = (mean(|point| point.x), mean(|point| point.y));
+        let (mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0);
+        for Weighted { x, y, weight } in points {
+            let (dx, dy) = (x - x_mean, y - y_mean);
+            sxx += weight * dx * dx;
+            sxy += weight * dx * dy;
+            syy += weight * dy * dy;
+        }
+        if sxx <= 0.0 {
+            return None;
+        }
+        let slope = sxy / sxx;
+        let intercept = y_mean - slope * x_mean;
+        let left = |point: &Weighted| point.weight * (point.y - slope * point.x - intercept).powi(2);
+        let residual: f64 = points.iter().map(left).sum();
+        // A level line explains nothing, and has nothing to explain.
+        let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
+        let freedom = count(points.len() - 2);
+        let slope_half = student(freedom) * (residual / freedom / sxx).sqrt();
+        Some(Self { slope, intercept, quality, slope_half })
+    }
+
+    /// The line through points that all count the same.
+    #[must_use]
+    pub fn through_equals(points: &[(f64, f64)]) -> Option<Self> {
+        let points: Vec<_> = points.iter().map(|&(x, y)| Weighted { x, y, weight: 1.0 }).collect();
+        Self::through(&points)
+    }
+
+    /// What the line says at `x`.
+    #[must_use]
+    pub fn at(&self, x: f64) -> f64 {
+        self.slope * x + self.intercept
+    }
+
+    /// The upper end of the slope's 95 % interval.
+    #[must_use]
+    pub fn slope_at_most(&self) -> f64 {
+        self.slope + self.slope_half
+    }
+
+    /// The greatest x at which the line is not above `y`; not a number for a line that does not rise.
+    #[must_use]
+    pub fn reaches(&self, y: f64) -> f64 {
+        if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }
+    }
+}
+
+/// A count as a real number.
+#[must_use]
+#[expect(clippy::cast_precision_loss, reason = "counts of what is in memory, below 2^53")]
+pub fn count(count: usize) -> f64 {
+    count as f64
+}
+
+/// Student's t, at 97.5 %, by its expansion about the normal distribution (Abramowitz and Stegun 26.7.5):
+/// below 10 degrees of freedom it is up to 5 % too small.
+fn student(freedom: f64) -> f64 {
+    const Z: f64 = 1.959_963_984_540_054;
+    let z = |power: i32| Z.powi(power);
+    let terms = [
+        (z(3) + Z) / 4.0,
+        (5.0 * z(5) + 16.0 * z(3) + 3.0 * Z) / 96.0,
+        (3.0 * z(7) + 19.0 * z(5) + 17.0 * z(3) - 15.0 * Z) / 384.0,
+        (79.0 * z(9) + 776.0 * z(7) + 1482.0 * z(5) - 1920.0 * z(3) - 945.0 * Z) / 92_160.0,
+    ];
+    terms.into_iter().zip(1..).fold(Z, |sum, (term, power)| sum + term / freedom.powi(power))
+}
+
+/// The value below which a part of some values lies; not a number of none. `part` in [0, 1].
+#[must_use]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place within the values")]
+pub fn quantile(values: &mut [f64], part: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let last = values.len().saturating_sub(1);
+    let place = (part * count(last)).round() as usize;
+    values.get(place).copied().unwrap_or(f64::NAN)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_is_found_and_explains_everything() {
+        let points: Vec<_> = (0..10).map(|x| (f64::from(x), 3.0 * f64::from(x) - 2.0)).collect();
+        let line = Line::through_equals(&points).unwrap();
+        assert!((line.slope - 3.0).abs() < 1e-12 && (line.intercept + 2.0).abs() < 1e-12);
+        assert!((line.quality - 1.0).abs() < 1e-12 && line.slope_half < 1e-6);
+        assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.at(9.0) - 25.0).abs() < 1e-12);
+    }
+
+    /// x 1 to 5, y 2, 4, 5, 4, 5: slope 0.6, intercept 2.2, R² 0.6, standard error of the slope 0.2828 (any
+    /// textbook's example), t(0.975, 3) = 3.182.
+    #[test]
+    fn quality_and_interval_are_those_of_a_textbook() {
+        let points = [(1.0, 2.0), (2.0, 4.0), (3.0, 5.0), (4.0, 4.0), (5.0, 5.0)];
+        let line = Line::through_equals(&points).unwrap();
+        assert!((line.slope - 0.6).abs() < 1e-12 && (line.intercept - 2.2).abs() < 1e-12);
+        assert!((line.quality - 0.6).abs() < 1e-12);
+        assert!((line.slope_half / 0.282_843 - 3.182).abs() < 0.02 * 3.182, "{}", line.slope_half);
+        assert!((line.slope_at_most() - line.slope - line.slope_half).abs() < 1e-12);
+    }
+
+    #[test]
+    fn students_t_is_that_of_the_tables() {
+        for (freedom, wanted, within) in
+            [(3.0, 3.182, 0.02), (10.0, 2.228, 1e-3), (29.0, 2.045, 1e-3), (100.0, 1.984, 1e-3)]
+        {
+            let t = student(freedom);
+            assert!((t / wanted - 1.0).abs() < within, "{freedom}: {t}");
+        }
+    }
+
+    #[test]
+    fn a_weight_of_three_is_three_points() {
+        let once = [(0.0, 1.0), (1.0, 2.0), (1.0, 2.0), (1.0, 2.0), (2.0, 5.0)];
+        let thrice = [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0), (2.0, 5.0, 1.0)];
+        let thrice = thrice.map(|(x, y, weight)| Weighted { x, y, weight });
+        let (once, thrice) = (Line::through_equals(&once).unwrap(), Line::through(&thrice).unwrap());
+        assert!((once.slope - thrice.slope).abs() < 1e-12);
+        assert!((once.intercept - thrice.intercept).abs() < 1e-12);
+        assert!((once.quality - thrice.quality).abs() < 1e-12);
+    }
+
+    #[test]
+    fn where_there_is_no_line_there_is_none() {
+        assert_eq!(Line::through_equals(&[(0.0, 1.0), (1.0, 2.0)]), None);
+        assert_eq!(Line::through_equals(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
+        let level = Line::through_equals(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
+        assert!(level.reaches(5.0).is_nan(), "a line that does not rise has no limit");
+    }
+
+    #[test]
+    fn quantiles_are_values() {
+        let mut values = [3.0, 1.0, 2.0, 5.0, 4.0];
+        let at = |part, values: &mut [f64]| quantile(values, part);
+        assert!((at(0.5, &mut values) - 3.0).abs() < 1e-12);
+        assert!((at(0.0, &mut values) - 1.0).abs() < 1e-12 && (at(1.0, &mut values) - 5.0).abs() < 1e-12);
+        assert!(quantile(&mut [], 0.5).is_nan());
+    }
+}

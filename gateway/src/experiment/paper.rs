@@ -1,0 +1,56 @@
+//! What the paper says: *Efficient Distributed Torque Computation for Large Scale Robot Skin*.
+
+/// Mean error of a single cell's torques, Q3.12, in Nm (Fig. 6).
+pub const SINGLE_NM: f64 = 0.0054;
+/// Mean error of summed torques, Q7.8, in Nm (Fig. 6).
+pub const SUMMED_NM: f64 = 0.0356;
+/// When the central computation is switched off, in s (Fig. 8).
+pub const SWITCHED_S: f64 = 5.7;
+/// Time of the rest of a cycle without the central computation, in s (Fig. 8).
+pub const REST_S: f64 = 0.2e-3;
+/// Time of a cycle at 500 Hz, in s.
+pub const CYCLE_S: f64 = 2e-3;
+/// Central time for each cell, in s (Eq. 29).
+pub const CELL_S: f64 = 0.827e-6;
+/// Central time without any cell, in s (Eq. 29).
+pub const FIXED_S: f64 = 0.010_73e-3;
+/// Quality of Eq. 29.
+pub const CELLS_QUALITY: f64 = 0.9995;
+/// Central time for each active cell, in s (Eq. 30).
+pub const ACTIVE_S: f64 = 0.798e-6;
+/// Central time of 253 cells none of which is active, in s (Eq. 30).
+pub const NONE_ACTIVE_S: f64 = 0.2e-3;
+/// Quality of Eq. 30.
+pub const ACTIVE_QUALITY: f64 = 0.939;
+/// Most cells at 500 Hz, none active.
+pub const LIMIT: f64 = 2160.0;
+/// Most cells at 500 Hz, 100 of them active (Eq. 31).
+pub const LIMIT_ACTIVE: f64 = 2067.0;
+/// Active cells that the second limit is for.
+pub const LIMIT_AT: f64 = 100.0;
+/// Mean error of the fifth-order sine.
+pub const SINE: f64 = 6.7e-4;
+/// Multiplications, additions, sines and cosines of one cell's Jacobian on the last link of six (Eq. 27).
+pub const OPERATIONS: [u32; 4] = [103, 57, 6, 6];
+
+/// The most cells for which a cycle holds the rest and the central computation (the paper's reasoning for its
+/// limits): `(cycle - rest - fixed - active · per active) / per cell`, all in s. Not a number if cells cost nothing.
+#[must_use]
+pub fn most_cells(per_cell: f64, fixed: f64, per_active: f64, active: f64) -> f64 {
+    let room = CYCLE_S - REST_S - fixed - active * per_active;
+    if per_cell > 0.0 { (room / per_cell).floor() } else { f64::NAN }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The first limit is rounded in the paper: its own law says 2163.
+    #[test]
+    fn the_papers_laws_lead_to_its_limits() {
+        let none = most_cells(CELL_S, FIXED_S, ACTIVE_S, 0.0);
+        assert!((none - 2163.0).abs() < 0.5 && (none - LIMIT).abs() < 5.0);
+        assert!((most_cells(CELL_S, FIXED_S, ACTIVE_S, LIMIT_AT) - LIMIT_ACTIVE).abs() < 0.5);
+        assert!(most_cells(0.0, FIXED_S, ACTIVE_S, 0.0).is_nan());
+    }
+}
