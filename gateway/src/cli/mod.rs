@@ -7,6 +7,7 @@ mod commission;
 mod convert;
 mod dbc;
 mod dump;
+mod experiment;
 mod explain;
 mod fit;
 mod frame;
@@ -54,6 +55,7 @@ enum Command {
     Explain(explain::Explain),
     Shadow(shadow::ShadowCommand),
     Fit(fit::Fit),
+    Experiment(experiment::Experiment),
 }
 
 impl Command {
@@ -76,6 +78,7 @@ impl Command {
             Self::Explain(command) => command.run(),
             Self::Shadow(command) => command.run(),
             Self::Fit(command) => command.run(),
+            Self::Experiment(command) => command.run(),
         }
     }
 }

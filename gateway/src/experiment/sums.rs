@@ -81,19 +81,15 @@ impl Mean {
     }
 }
 
-/// Measures the errors for every number of active cells that the skin has; the same for the same skin and extent.
-#[must_use]
-pub fn measure(skin: &Skin, extent: Extent, mut done: impl FnMut()) -> Vec<Errors> {
-    let numbers = ACTIVE.into_iter().filter(|&active| active <= skin.cells.len());
-    numbers
-        .map(|active| {
-            done();
-            errors(skin, active, extent)
-        })
-        .collect()
+/// The numbers of active cells that a skin has cells for.
+pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
+    let cells = skin.cells.len();
+    ACTIVE.into_iter().filter(move |&active| active <= cells)
 }
 
-fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
+/// Measures the errors for a number of active cells; the same for the same skin and extent.
+#[must_use]
+pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
     let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
     let (mut rounding, mut carrying) = (Tree::new(skin, false), Tree::new(skin, true));
     let [mut truncated, mut rounded, mut carried] = [Mean::default(); 3];
@@ -217,7 +213,10 @@ mod tests {
     #[test]
     fn cut_off_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
         let skin = ticks::skin(64, 1).unwrap();
-        let errors = measure(&skin, Extent { touches: 6, epochs: 4 }, || {});
+        let measure = || -> Vec<_> {
+            numbers(&skin).map(|active| errors(&skin, active, Extent { touches: 6, epochs: 4 })).collect()
+        };
+        let errors = measure();
         assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
         let (one, forty) = (errors[0], errors[5]);
         // Half a step for each cell, of 1/256 Nm.
@@ -229,6 +228,6 @@ mod tests {
         let section = section(&skin, &errors);
         assert_eq!(section.findings.len(), 5);
         assert!(section.figures[0].series.iter().all(|series| series.points.len() == 6));
-        assert_eq!(measure(&skin, Extent { touches: 6, epochs: 4 }, || {}), errors, "the same again");
+        assert_eq!(measure(), errors, "the same again");
     }
 }

@@ -1,0 +1,97 @@
+//! The moving arm's benches: this program again, as anybody would run it.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use gateway::experiment::arm::{self, Reply};
+use gateway::experiment::moving::Run;
+use gateway::experiment::{Effort, recorded};
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+
+/// Where benches are run, and with what.
+#[derive(Debug)]
+pub(super) struct Benches {
+    /// For their skins, scenarios, recordings and summaries.
+    pub(super) folder: PathBuf,
+    pub(super) cell_node: Option<PathBuf>,
+    pub(super) vcan_setup: Option<PathBuf>,
+    pub(super) cells_per_process: u8,
+}
+
+impl Benches {
+    /// Runs `gateway run` on the arm and reads what it recorded.
+    pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
+        let name = reply.name();
+        let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
+        let failed = |path: &Path, error: &dyn std::fmt::Display| {
+            Failure::run(format!("the bench of the moving arm ({name}): {}: {error}", path.display()))
+        };
+        let text = arm::skin(reply, effort);
+        let [skin, scenario, recording, summary] =
+            [file(".toml"), self.folder.join("arm-touches.toml"), file(".mcap"), file(".json")];
+        for (path, text) in [(&skin, text.as_str()), (&scenario, arm::scenario(effort))] {
+            fs::write(path, text).map_err(|error| failed(path, &error))?;
+        }
+        let own = std::env::current_exe().map_err(|error| failed(Path::new("gateway"), &error))?;
+        let buses = Buses::create()?;
+        let mut command = Command::new(&own);
+        command.arg("run").arg(&skin).arg("--scenario").arg(&scenario).arg("--record").arg(&recording);
+        command.arg("--summary").arg(&summary).args(["--bus-kind", "embedded", "--quiet"]);
+        command.arg("--cells-per-process").arg(self.cells_per_process.to_string());
+        for (option, path) in [("--cell-node", &self.cell_node), ("--vcan-setup", &self.vcan_setup)] {
+            if let Some(path) = path {
+                command.arg(option).arg(path);
+            }
+        }
+        let ended = command
+            .env("SKINBUS_DIR", &buses.0)
+            .stdin(Stdio::null())
+            .output()
+            .map_err(|error| failed(&own, &error))?;
+        if !ended.status.success() {
+            let said = String::from_utf8_lossy(&ended.stderr);
+            let last = said.trim_end().lines().last().unwrap_or("it said nothing").to_owned();
+            let last = last.strip_prefix("gateway: ").unwrap_or(&last);
+            return Err(Failure::run(format!("the bench of the moving arm ({name}): {last}")));
+        }
+        let rows = recorded::read(&recording).map_err(|error| failed(&recording, &error))?;
+        let text = fs::read_to_string(&summary).map_err(|error| failed(&summary, &error))?;
+        let summary = serde_json::from_str(&text).map_err(|error| failed(&summary, &error))?;
+        let joints = Skin::parse("the arm's skin", &arm::skin(reply, effort)).map_err(Failure::run)?.robot.joints.len();
+        if rows.is_empty() {
+            return Err(failed(&recording, &"it has no ticks"));
+        }
+        Ok(Run { rows, summary, joints })
+    }
+}
+
+/// A place of its own for a bench's bus: nobody else's bench meets it.
+struct Buses(PathBuf);
+
+impl Buses {
+    fn create() -> Result<Self, Failure> {
+        // A socket's path has at most 107 bytes, so it cannot be in the folder of the results.
+        let path = std::env::temp_dir().join(format!("skinbus-experiment-{}", std::process::id()));
+        let make = || match fs::DirBuilder::new().mode(0o700).create(&path) {
+            // Of a program of this number that was killed.
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                fs::remove_dir_all(&path)?;
+                fs::DirBuilder::new().mode(0o700).create(&path)
+            }
+            made => made,
+        };
+        make().map_err(|error| Failure::run(format!("{}: {error}", path.display())))?;
+        Ok(Self(path))
+    }
+}
+
+impl Drop for Buses {
+    fn drop(&mut self) {
+        // Nothing more can be done.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
