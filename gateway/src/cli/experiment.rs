@@ -111,6 +111,7 @@ impl Experiment {
             cell_node: self.cell_node.clone(),
             vcan_setup: self.vcan_setup.clone(),
             cells_per_process: self.cells_per_process,
+            stop: Arc::clone(&stop),
         };
         let mut lab = Here { benches, stop, idle: None };
         let mut session = Session::new(effort);

@@ -7,12 +7,15 @@ use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::skin::Skin;
 
+use super::line::count;
 use super::paper;
 use super::ticks::POSE;
 use crate::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table};
 
 /// One in so many angles is drawn.
 const DRAWN: usize = 16;
+/// Angles of which the greatest error is drawn.
+const PART: usize = 256;
 
 /// The error of a sine over all angles there are.
 #[derive(Clone, Debug)]
@@ -23,13 +26,16 @@ pub struct SineError {
     pub greatest: f64,
     /// Angle in quarter turns, signed error.
     pub points: Vec<(f64, f64)>,
+    /// The middle of each part of the circle in quarter turns, the greatest absolute error there.
+    pub parts: Vec<(f64, f64)>,
 }
 
 impl SineError {
     /// Over all 65 536 words.
     #[must_use]
     pub fn of(function: impl Fn(Q1_14) -> Q1_14) -> Self {
-        let (mut sum, mut greatest, mut points) = (0.0, 0.0_f64, Vec::new());
+        let (mut sum, mut greatest) = (0.0, 0.0_f64);
+        let (mut points, mut parts) = (Vec::new(), vec![(0.0, 0.0_f64); 65_536 / PART]);
         for (place, bits) in (i16::MIN..=i16::MAX).enumerate() {
             let angle = Q1_14::from_bits(bits);
             let error = function(angle).to_f64() - angle.to_radians().sin();
@@ -38,8 +44,12 @@ impl SineError {
             if place % DRAWN == 0 {
                 points.push((angle.to_f64(), error));
             }
+            if let Some((middle, greatest)) = parts.get_mut(place / PART) {
+                *middle += angle.to_f64() / count(PART);
+                *greatest = greatest.max(error.abs());
+            }
         }
-        Self { mean: sum / 65_536.0, greatest, points }
+        Self { mean: sum / 65_536.0, greatest, points, parts }
     }
 }
 
@@ -51,15 +61,15 @@ pub fn sine_section() -> Section {
         SineError::of(sine),
         SineError::of(|angle| Q1_14::nearest(angle.to_radians().sin())),
     ];
-    let figure = |name: &str, title: &str, series| Figure {
+    let figure = |name: &str, title: &str, error: &str, series| Figure {
         name: name.to_owned(),
         title: title.to_owned(),
         x: Axis::new("angle", "quarter turns").between(-2.0, 2.0),
-        y: Axis::new("error", ""),
+        y: Axis::new(error, ""),
         series,
         ..Figure::default()
     };
-    let line = |label: &str, error: &SineError| Series::new(label, Shape::Line, error.points.clone());
+    let greatest_there = |label: &str, error: &SineError| Series::new(label, Shape::Steps, error.parts.clone());
     let mean = |what: &str, error: &SineError, bar: f64| {
         Finding::less_is_better(what, Quantity::new(paper::SINE, ""), Quantity::new(error.mean, ""))
             .must(format!("at most {bar}"), error.mean <= bar)
@@ -78,11 +88,21 @@ pub fn sine_section() -> Section {
                 .to_owned(),
         ],
         figures: vec![
-            figure("sine-fifth", "Fifth order, the paper's (Eq. 17)", vec![line("fifth order", &fifth)]),
             figure(
-                "sine-seventh",
-                "Seventh order, the cells'",
-                vec![line("seventh order", &seventh), line("rounding alone", &rounded)],
+                "sine-fifth",
+                "Fifth order, the paper's (Eq. 17)",
+                "error",
+                vec![Series::new("fifth order", Shape::Line, fifth.points.clone())],
+            ),
+            figure(
+                "sine-greatest",
+                "The greatest errors in 256 parts of the circle",
+                "greatest error",
+                vec![
+                    greatest_there("fifth order", &fifth),
+                    greatest_there("seventh order, the cells'", &seventh),
+                    greatest_there("rounding alone", &rounded),
+                ],
             ),
         ],
         findings: vec![
@@ -144,18 +164,18 @@ pub fn kernels_section(robot: &str, costs: &Costs) -> Section {
             (f64::from(link), f64::from(done.multiplications + done.additions))
         }).collect::<Vec<_>>()
     };
-    let count = |value: u32| Quantity::new(f64::from(value), "");
+    let number = |value: u32| Quantity::new(f64::from(value), "");
     let mut findings = Vec::new();
     let last = |costs: &[Operations]| costs.last().copied().unwrap_or_default();
     for (((name, ours), paper), bar) in named(&last(&costs.wrench)).into_iter().zip(paper::OPERATIONS).zip(WRENCH) {
         let what = format!("{name} of the wrench kernel, cell on the last link");
         findings.push(
-            Finding::less_is_better(what, count(paper), count(ours)).must(format!("at most {bar}"), ours <= bar),
+            Finding::less_is_better(what, number(paper), number(ours)).must(format!("at most {bar}"), ours <= bar),
         );
     }
     for ((name, ours), paper) in named(&last(&costs.projection)).into_iter().zip(paper::OPERATIONS) {
         let what = format!("{name} of the paper's projections, cell on the last link");
-        findings.push(Finding::less_is_better(what, count(paper), count(ours)));
+        findings.push(Finding::less_is_better(what, number(paper), number(ours)));
     }
     let rows = [("wrench", &costs.wrench), ("projections", &costs.projection)];
     Section {
@@ -168,7 +188,7 @@ pub fn kernels_section(robot: &str, costs: &Costs) -> Section {
         figures: vec![Figure {
             name: "kernels".to_owned(),
             title: "Multiplications and additions over the link that the cell is on".to_owned(),
-            x: Axis::new("link", ""),
+            x: Axis::new("link", "").between(0.0, 7.0),
             y: Axis::new("multiplications and additions", ""),
             series: vec![
                 Series::new("wrench", Shape::Line, products(&costs.wrench)),
@@ -203,8 +223,11 @@ mod tests {
     fn the_sines_errors_are_within_their_bars_and_over_the_whole_circle() {
         let section = sine_section();
         assert!(section.findings.iter().all(|finding| finding.verdict != Verdict::Worse), "{section:?}");
-        let series = section.figures.iter().flat_map(|figure| &figure.series);
-        assert!(series.clone().count() == 3 && series.clone().all(|series| series.points.len() == 65_536 / DRAWN));
+        let drawn = section.figures.iter().flat_map(|figure| &figure.series).map(|series| series.points.len());
+        assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN, 256, 256, 256]);
+        let error = SineError::of(sine);
+        let greatest = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
+        assert!((greatest - error.greatest).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
         assert!(section.findings[0].ours.value > 1e-4 && section.findings[2].ours.value > 1e-5);
         let wrong = SineError::of(|angle| sine(angle.wrapping_add(Q1_14::from_bits(100))));
         assert!(wrong.mean > 1e-3, "a phase of 100 words is seen");

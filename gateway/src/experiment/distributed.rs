@@ -24,7 +24,7 @@ use crate::table::Table;
 /// How much is measured.
 #[derive(Clone, Copy, Debug)]
 pub struct Extent {
-    /// Numbers of cells, and of active cells, beside 0.
+    /// Numbers of cells beside one on each bus, and of active cells beside 0.
     pub steps: usize,
     /// How often each is measured.
     pub rounds: usize,
@@ -68,9 +68,13 @@ pub struct Distributed {
 #[must_use]
 pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
     let most = skin.cells.len();
-    let numbers: Vec<usize> = (0..=extent.steps).map(|step| most * step / extent.steps.max(1)).collect();
-    let parts: Vec<Skin> = numbers.iter().map(|&cells| spread(skin, cells)).collect();
-    let over = |ticks: &dyn Fn(usize, Mode) -> Ticks, seed| {
+    let step = |step| most * step / extent.steps.max(1);
+    // A bus without cells has no robot to compute, so that there is one cell at least on each.
+    let least = skin.buses.len().min(most);
+    let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(least)).collect();
+    let active: Vec<usize> = (0..=extent.steps).map(step).collect();
+    let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
+    let over = |numbers: &[usize], ticks: &dyn Fn(usize, Mode) -> Ticks, seed| {
         let (distributed, central) = (Mode::Distributed, Mode::Compare);
         let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
         let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
@@ -89,8 +93,9 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
         };
         Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
     };
-    let cells = over(&|place, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode), 11)?;
-    let active = over(&|place, mode| Ticks::new(skin, numbers.get(place).copied().unwrap_or(0), mode), 12)?;
+    let of_part = |place: usize, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode);
+    let of_touch = |place: usize, mode| Ticks::new(skin, active.get(place).copied().unwrap_or(0), mode);
+    let (cells, active) = (over(&cells, &of_part, 11)?, over(&active, &of_touch, 12)?);
     Some(Distributed {
         cells,
         active,
@@ -247,9 +252,9 @@ mod tests {
             clock.get()
         };
         let measured = measure(&skin, Extent { steps: 4, rounds: 3 }, now).unwrap();
-        for over in [&measured.cells, &measured.active] {
+        for (over, wanted) in [(&measured.cells, [12, 12, 24, 36, 48]), (&measured.active, [0, 12, 24, 36, 48])] {
             let numbers: Vec<_> = over.points.iter().map(|point| point[0] as u32).collect();
-            assert_eq!(numbers, [0, 12, 24, 36, 48]);
+            assert_eq!(numbers, wanted);
             assert!(over.points.iter().all(|[_, tick, central]| (tick - 1.0).abs() + (central - 1.0).abs() < 1e-9));
         }
         assert!((measured.receiving - 0.25).abs() < 1e-9, "four cells between two looks");

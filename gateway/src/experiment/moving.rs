@@ -78,7 +78,8 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
     let error = |run: &Run, kind: &str, key: &str| run.figure(&["accuracy", kind, key]);
     let (mean_single, mean_summed) = (error(single, "single", "mean_nm"), error(summed, "sums", "mean_nm"));
     let nm = |value| Quantity::new(value, "Nm");
-    let summed_in = summed.figure(&["buses", "0", "sums", "contributions", "in_time"]);
+    let [summed_due, summed_in] =
+        ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
     let row = |name: &str, run: &Run, kind: &str| {
         let [mean, greatest, torques] = ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
         vec![name.to_owned(), mean, greatest, torques]
@@ -95,8 +96,10 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
             ),
             "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
              the cell loads, so they hold nothing of what was on its way; the curves are what the loop had at each tick. \
-             The run with sums is a second one, with the same touches."
+             The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
+             compared."
                 .to_owned(),
+            bare(single),
         ],
         figures: (0..single.joints).map(joint).collect(),
         findings: vec![
@@ -104,7 +107,10 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
                 .must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             Finding::less_is_better("mean error of the summed torque, Q7.8", nm(paper::SUMMED_NM), nm(mean_summed)),
             single.replies(),
-            Finding::told("contributions of cells that came in sums in time", Quantity::new(summed_in, "")),
+            Finding::told(
+                format!("cells' torques that were in sums in time, of {summed_due}"),
+                Quantity::new(summed_in, ""),
+            ),
         ],
         tables: vec![Table {
             title: "Errors against the central computation, Nm".to_owned(),
@@ -116,6 +122,17 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
                 row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
             ],
         }],
+    }
+}
+
+/// Which joints bear nothing.
+fn bare(run: &Run) -> String {
+    let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
+    let bare: Vec<_> = (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
+    if bare.is_empty() {
+        "Every joint bears something.".to_owned()
+    } else {
+        format!("Without any torque: joint {}, for no cell sits beyond.", bare.join(", "))
     }
 }
 
@@ -168,6 +185,9 @@ pub fn fig7(run: &Run) -> Section {
     }
 }
 
+/// Cycles of which the median is drawn.
+const TOGETHER: usize = 25;
+
 /// The median of some ticks' times in µs.
 fn median<'a>(rows: impl Iterator<Item = &'a Row>, time: impl Fn(&Row) -> f64) -> f64 {
     quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
@@ -194,6 +214,19 @@ pub fn fig8(run: &Run) -> Section {
     let beyond = run.rows.iter().filter(|row| row.took_us > top).count();
     let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
     let us = |value| Quantity::new(value, "µs");
+    let figure = |name: &str, title: &str, top, series| Figure {
+        name: name.to_owned(),
+        title: title.to_owned(),
+        x: time(),
+        y: Axis::new("time in a cycle", "µs").between(0.0, top),
+        series,
+        marks: run.switched(),
+        ..Figure::default()
+    };
+    let medians = |time: &dyn Fn(&Row) -> f64| {
+        let pieces = run.rows.chunks(TOGETHER).filter_map(|rows| Some((rows.first()?.time_s, rows)));
+        pieces.map(|(at, rows)| (at, median(rows.iter(), time))).collect::<Vec<_>>()
+    };
     let per_frame = {
         let frames = run.figure(&["buses", "0", "uplink", "delivered"]);
         run.figure(&["processor", "gateway"]) * run.figure(&["duration_s"]) * 1e6 / frames
@@ -233,18 +266,26 @@ pub fn fig8(run: &Run) -> Section {
                 run.rows.len()
             ),
         ],
-        figures: vec![Figure {
-            name: "fig8".to_owned(),
-            title: "Cycle times".to_owned(),
-            x: time(),
-            y: Axis::new("time in a cycle", "µs").between(0.0, top),
-            series: vec![
-                Series::new("T_total", Shape::Line, run.over_time(|row| row.took_us)),
-                Series::new("T_skin", Shape::Line, run.over_time(|row| row.central_us)),
-            ],
-            marks: run.switched(),
-            ..Figure::default()
-        }],
+        figures: vec![
+            figure(
+                "fig8",
+                "Cycle times",
+                top,
+                vec![
+                    Series::new("T_total", Shape::Line, run.over_time(|row| row.took_us)),
+                    Series::new("T_skin", Shape::Line, run.over_time(|row| row.central_us)),
+                ],
+            ),
+            figure(
+                "fig8-medians",
+                "The same, medians of 25 cycles",
+                top / 2.0,
+                vec![
+                    Series::new("T_total", Shape::Steps, medians(&|row| row.took_us)),
+                    Series::new("T_skin", Shape::Steps, medians(&|row| row.central_us)),
+                ],
+            ),
+        ],
         findings,
         tables: Vec::new(),
     }

@@ -4,13 +4,17 @@ use std::fs;
 use std::io;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use gateway::experiment::arm::{self, Reply};
 use gateway::experiment::moving::Run;
 use gateway::experiment::{Effort, recorded};
 use protocol::skin::Skin;
 use protocol::usage::Failure;
+use rustix::process::{Pid, Signal, kill_process};
 
 /// Where benches are run, and with what.
 #[derive(Debug)]
@@ -20,7 +24,12 @@ pub(super) struct Benches {
     pub(super) cell_node: Option<PathBuf>,
     pub(super) vcan_setup: Option<PathBuf>,
     pub(super) cells_per_process: u8,
+    /// Set when it shall end.
+    pub(super) stop: Arc<AtomicBool>,
 }
+
+/// How often it is looked whether a bench has ended.
+const LOOK: Duration = Duration::from_millis(50);
 
 impl Benches {
     /// Runs `gateway run` on the arm and reads what it recorded.
@@ -47,11 +56,8 @@ impl Benches {
                 command.arg(option).arg(path);
             }
         }
-        let ended = command
-            .env("SKINBUS_DIR", &buses.0)
-            .stdin(Stdio::null())
-            .output()
-            .map_err(|error| failed(&own, &error))?;
+        command.env("SKINBUS_DIR", &buses.0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let ended = self.wait(command).map_err(|error| failed(&own, &error))?;
         if !ended.status.success() {
             let said = String::from_utf8_lossy(&ended.stderr);
             let last = said.trim_end().lines().last().unwrap_or("it said nothing").to_owned();
@@ -66,6 +72,23 @@ impl Benches {
             return Err(failed(&recording, &"it has no ticks"));
         }
         Ok(Run { rows, summary, joints })
+    }
+}
+
+impl Benches {
+    /// Waits for the bench's end, which comes early when somebody says so.
+    fn wait(&self, mut command: Command) -> io::Result<Output> {
+        let mut child = command.spawn()?;
+        let mut told = false;
+        while child.try_wait()?.is_none() {
+            if !told && self.stop.load(Ordering::Relaxed) {
+                told = true;
+                // If it has just ended there is nobody to tell.
+                let _ = kill_process(Pid::from_child(&child), Signal::INT);
+            }
+            std::thread::sleep(LOOK);
+        }
+        child.wait_with_output()
     }
 }
 
