@@ -18,6 +18,7 @@ use gateway::record::facts;
 use gateway::report::figure::{Finding, Page, Section, Verdict};
 use gateway::report::{page, svg};
 use gateway::run::realtime;
+use gateway::summary::Quantiles;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::{Failure, print, quoted};
 
@@ -191,16 +192,12 @@ impl Lab for Here {
 
 /// The processor and the kernel, in a line.
 fn machine() -> String {
-    let about = facts_of_machine();
+    let about = facts::machine(&Quantiles::default());
     let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or("unknown processor", |(_, name)| name.trim());
     format!("{name}, {} in use, {} {} {}", fact("processors"), fact("sysname"), fact("release"), fact("machine"))
-}
-
-fn facts_of_machine() -> facts::Facts {
-    facts::machine()
 }
 
 fn list() -> Result<(), Failure> {

@@ -6,8 +6,9 @@ use std::path::Path;
 use protocol::packet::WORDS;
 
 use crate::capture::{CaptureError, Item, Items};
+use crate::report::run::messages;
 use crate::ros2::Message;
-use crate::ros2::cdr::{CdrError, Reader};
+use crate::ros2::cdr::CdrError;
 use crate::ros2::skin::{LoopTiming, Torques};
 use crate::ros2::standard::JointState;
 
@@ -61,38 +62,26 @@ fn take(
     message: &[u8],
 ) -> Result<(), CdrError> {
     let is_states = schema == JointState::TYPE && topic.ends_with("/joint_states");
-    if !is_states && schema != Torques::TYPE && schema != LoopTiming::TYPE {
-        return Ok(());
-    }
-    let mut from = Reader::new(message)?;
-    (from.u32()?, from.u32()?, from.str()?);
-    let row = rows.entry(nanos).or_default();
     if is_states {
-        for _ in 0..from.count()? {
-            from.str()?;
-        }
-        numbers(&mut from)?;
-        row.velocity = numbers(&mut from)?.0;
+        let joints = messages::joints(message)?;
+        rows.entry(nanos).or_default().velocity = by_joint(&joints.velocity);
     } else if schema == Torques::TYPE {
-        row.distributed = numbers(&mut from)?.0;
-        row.central = numbers(&mut from).map(|(central, count)| (count > 0).then_some(central))?;
-    } else {
-        (from.u64()?, from.u64()?, from.f64()?);
-        (row.took_us, row.central_us, row.contributing) = (from.f64()?, from.f64()?, from.u32()?);
+        let torques = messages::torques(message)?;
+        let row = rows.entry(nanos).or_default();
+        row.distributed = by_joint(&torques.distributed);
+        row.central = (!torques.central.is_empty()).then(|| by_joint(&torques.central));
+    } else if schema == LoopTiming::TYPE {
+        let timing = messages::timing(message, nanos)?;
+        let row = rows.entry(nanos).or_default();
+        (row.took_us, row.central_us, row.contributing) =
+            (timing.took_us, timing.central_us, timing.contributing);
     }
     Ok(())
 }
 
-/// A sequence of numbers, of which the joints' count, and how many there are.
-fn numbers(from: &mut Reader<'_>) -> Result<([f64; WORDS], usize), CdrError> {
-    let (mut numbers, count) = ([0.0; WORDS], from.count()?);
-    for place in 0..count {
-        let number = from.f64()?;
-        if let Some(place) = numbers.get_mut(place) {
-            *place = number;
-        }
-    }
-    Ok((numbers, count))
+/// A number for each joint; 0 for those that the robot has not.
+fn by_joint(numbers: &[f64]) -> [f64; WORDS] {
+    core::array::from_fn(|joint| numbers.get(joint).copied().unwrap_or_default())
 }
 
 #[cfg(test)]

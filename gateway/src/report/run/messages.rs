@@ -8,18 +8,18 @@ const MOST: usize = 64;
 
 /// The robot's joints at a tick.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Joints {
-    pub(super) position: Vec<f64>,
-    pub(super) velocity: Vec<f64>,
+pub(crate) struct Joints {
+    pub(crate) position: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
 }
 
 /// The cells' torque and the central one at a tick.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Torques {
-    pub(super) distributed: Vec<f64>,
+pub(crate) struct Torques {
+    pub(crate) distributed: Vec<f64>,
     /// Empty without a central computation.
-    pub(super) central: Vec<f64>,
-    pub(super) active: u32,
+    pub(crate) central: Vec<f64>,
+    pub(crate) active: u32,
 }
 
 fn header(from: &mut Reader<'_>) -> Result<(), CdrError> {
@@ -41,7 +41,7 @@ fn numbers(from: &mut Reader<'_>) -> Result<Vec<f64>, CdrError> {
 }
 
 /// `sensor_msgs/JointState`.
-pub(super) fn joints(message: &[u8]) -> Result<Joints, CdrError> {
+pub(crate) fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = Reader::new(message)?;
     header(&mut from)?;
     for _ in 0..count(&mut from)? {
@@ -51,7 +51,7 @@ pub(super) fn joints(message: &[u8]) -> Result<Joints, CdrError> {
 }
 
 /// `skinbus_msgs/Torques`.
-pub(super) fn torques(message: &[u8]) -> Result<Torques, CdrError> {
+pub(crate) fn torques(message: &[u8]) -> Result<Torques, CdrError> {
     let mut from = Reader::new(message)?;
     header(&mut from)?;
     let (distributed, central) = (numbers(&mut from)?, numbers(&mut from)?);
@@ -60,7 +60,7 @@ pub(super) fn torques(message: &[u8]) -> Result<Torques, CdrError> {
 }
 
 /// `skinbus_msgs/LoopTiming`; its time is the recording's.
-pub(super) fn timing(message: &[u8], nanos: u64) -> Result<LoopTiming, CdrError> {
+pub(crate) fn timing(message: &[u8], nanos: u64) -> Result<LoopTiming, CdrError> {
     let mut from = Reader::new(message)?;
     header(&mut from)?;
     Ok(LoopTiming {

@@ -10,7 +10,7 @@
 //! [`Table`](crate::table::Table) that the gateway had, and so come to the same accounts.
 
 mod lane;
-mod messages;
+pub(crate) mod messages;
 mod motion;
 mod page;
 
