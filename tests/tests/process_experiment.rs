@@ -25,7 +25,10 @@ fn the_moving_arm_is_run_recorded_drawn_and_judged() {
     let value = |finding: &Value| finding["ours"]["value"].as_f64().unwrap();
     let single = finding(0, "Q3.12");
     assert!(value(single) > 0.0 && value(single) <= 1.2e-4, "{single}");
-    assert_eq!((single["paper"]["value"].as_f64(), single["verdict"].as_str()), (Some(0.0054), Some("Better")));
+    assert_eq!(
+        (single["paper"]["value"].as_f64(), single["verdict"].as_str()),
+        (Some(0.0054), Some("Better"))
+    );
     // Sums of all cells, rounded: far above a step of Q3.12, far below what cutting off would give.
     let summed = value(finding(0, "Q7.8"));
     assert!((1e-4..0.0356).contains(&summed), "{summed}");
@@ -57,7 +60,11 @@ fn what_fails_or_is_ended_leaves_nothing() {
         ("experiment fig9 --quick", 2, "-o DIR is missing"),
         ("experiment fig11 -o results", 2, "there is no experiment of this name"),
         ("experiment fig9 --quick -o file", 1, "it is a file; name a folder that can be written"),
-        ("experiment fig7 --quick -o results --cell-node nowhere/cell-node", 1, "the bench of the moving arm (single)"),
+        (
+            "experiment fig7 --quick -o results --cell-node nowhere/cell-node",
+            1,
+            "the bench of the moving arm (single)",
+        ),
     ] {
         let ended = place.start("gateway", words).end();
         assert_eq!(ended.status.code(), Some(code), "{words}: {}", ended.stderr);

@@ -93,7 +93,9 @@ impl Experiment {
         let Some(output) = &self.output else {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
         };
-        let wanted = |named: &Named| self.names.iter().any(|word| matches!(word, Word::All) || *word == Word::One(*named));
+        let wanted = |named: &Named| {
+            self.names.iter().any(|word| matches!(word, Word::All) || *word == Word::One(*named))
+        };
         let named: Vec<Named> = Named::ALL.into_iter().filter(wanted).collect();
         let stop = stopped()?;
         // Before anything is measured: nobody wants to hear after minutes that there is nowhere to write.
@@ -132,7 +134,8 @@ impl Experiment {
         let words = words.iter().enumerate().map(|(place, word)| {
             // The folder that the program lies in is nobody's business.
             let name = Path::new(word).file_name().filter(|_| place == 0);
-            quoted(&name.map_or_else(|| word.clone(), |name| name.to_string_lossy().into_owned())).into_owned()
+            quoted(&name.map_or_else(|| word.clone(), |name| name.to_string_lossy().into_owned()))
+                .into_owned()
         });
         let command = words.collect::<Vec<_>>().join(" ");
         let about = facts::program(std::slice::from_ref(&command), 0);
@@ -142,7 +145,10 @@ impl Experiment {
         facts.push(("machine".to_owned(), machine()));
         facts.extend(idle.map(|idle| ("idle lateness".to_owned(), idle)));
         if self.quick {
-            facts.push(("effort".to_owned(), "quick: few cells, few measurements; no figures of these are results".to_owned()));
+            facts.push((
+                "effort".to_owned(),
+                "quick: few cells, few measurements; no figures of these are results".to_owned(),
+            ));
         }
         Page {
             title: "The paper's experiments".to_owned(),
@@ -197,7 +203,13 @@ fn machine() -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or("unknown processor", |(_, name)| name.trim());
-    format!("{name}, {} in use, {} {} {}", fact("processors"), fact("sysname"), fact("release"), fact("machine"))
+    format!(
+        "{name}, {} in use, {} {} {}",
+        fact("processors"),
+        fact("sysname"),
+        fact("release"),
+        fact("machine")
+    )
 }
 
 fn list() -> Result<(), Failure> {
@@ -235,7 +247,11 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     }
     let worse = page.sections.iter().flat_map(|section| &section.findings);
     let worse = worse.filter(|finding| finding.verdict == Verdict::Worse).count();
-    let worse = if worse == 0 { String::new() } else { format!("worse than the paper's or than their bar: {worse}\n") };
+    let worse = if worse == 0 {
+        String::new()
+    } else {
+        format!("worse than the paper's or than their bar: {worse}\n")
+    };
     print(&format!("{}\n{worse}{}\n", rows.table(), report.display()))
 }
 

@@ -116,8 +116,12 @@ pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option
 const QUALITY: f64 = 0.99;
 
 fn quality(line: &Line, paper: f64) -> Finding {
-    Finding::more_is_better("quality of the fit, R²", Quantity::new(paper, ""), Quantity::new(line.quality, ""))
-        .must(format!("at least {QUALITY}"), line.quality >= QUALITY)
+    Finding::more_is_better(
+        "quality of the fit, R²",
+        Quantity::new(paper, ""),
+        Quantity::new(line.quality, ""),
+    )
+    .must(format!("at least {QUALITY}"), line.quality >= QUALITY)
 }
 
 /// A slope or a start in ns beside the paper's in s, as it is and as a ratio.
@@ -138,7 +142,8 @@ fn slope(line: &Line) -> Quantity {
 pub fn fig9(over: &OverCells) -> Section {
     let OverCells { points, line } = over;
     let most = points.last().map_or(0.0, |point| point[0]);
-    let micros = |place: fn(&[f64; 4]) -> f64| points.iter().map(move |point| (point[0], place(point) * 1e-3));
+    let micros =
+        |place: fn(&[f64; 4]) -> f64| points.iter().map(move |point| (point[0], place(point) * 1e-3));
     let band = micros(|point| point[2]).chain(micros(|point| point[3]).collect::<Vec<_>>().into_iter().rev());
     let figure = |name: &str, title: &str, series| Figure {
         name: name.to_owned(),
@@ -157,9 +162,11 @@ pub fn fig9(over: &OverCells) -> Section {
             "The same beside the paper's law (Eq. 29)",
             vec![
                 Series::new("measured", Shape::Points, micros(|point| point[1]).collect()),
-                Series::new("the paper's law", Shape::Dashed, steps(most, |cells| {
-                    (paper::CELL_S * cells + paper::FIXED_S) * 1e6
-                })),
+                Series::new(
+                    "the paper's law",
+                    Shape::Dashed,
+                    steps(most, |cells| (paper::CELL_S * cells + paper::FIXED_S) * 1e6),
+                ),
             ],
         )
     };
@@ -242,13 +249,13 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
         paper::NONE_ACTIVE_S,
     ));
     findings.push(quality(line, paper::ACTIVE_QUALITY));
-    findings.push(Finding::told(
-        format!("T_skin of {of} cells, all active (Eq. 31)"),
-        Quantity::new((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
-    ).beside(Quantity::new(
-        (paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6,
-        "µs",
-    )));
+    findings.push(
+        Finding::told(
+            format!("T_skin of {of} cells, all active (Eq. 31)"),
+            Quantity::new((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
+        )
+        .beside(Quantity::new((paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6, "µs")),
+    );
     let limits = [(0.0, paper::LIMIT), (paper::LIMIT_AT, paper::LIMIT_ACTIVE)];
     findings.extend(limits.map(|(active, paper)| {
         Finding::more_is_better(
@@ -306,17 +313,81 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
         tables: vec![Table {
             title: "Laws".to_owned(),
             head: ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"].map(str::to_owned).to_vec(),
-            rows: [("cells (Eq. 29)", of_cells, paper::CELL_S), ("active cells (Eq. 30)", *line, paper::ACTIVE_S)]
-                .map(|(name, line, paper)| {
-                    vec![
-                        name.to_owned(),
-                        number(line.slope),
-                        number(line.intercept),
-                        format!("{:.4}", line.quality),
-                        number(paper * 1e9),
-                    ]
-                })
-                .to_vec(),
+            rows: [
+                ("cells (Eq. 29)", of_cells, paper::CELL_S),
+                ("active cells (Eq. 30)", *line, paper::ACTIVE_S),
+            ]
+            .map(|(name, line, paper)| {
+                vec![
+                    name.to_owned(),
+                    number(line.slope),
+                    number(line.intercept),
+                    format!("{:.4}", line.quality),
+                    number(paper * 1e9),
+                ]
+            })
+            .to_vec(),
         }],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::ticks;
+    use crate::report::figure::Verdict;
+
+    fn line(slope: f64, intercept: f64) -> Line {
+        Line { slope, intercept, quality: 0.999, slope_half: 0.1 }
+    }
+
+    /// What is found where the law is the paper's own, in ns.
+    #[test]
+    fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
+        let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
+        let points = [0.0, 1500.0, 3000.0].map(|cells| [cells, law.at(cells), law.at(cells), law.at(cells)]);
+        let cells = OverCells { points: points.to_vec(), line: law };
+        let over = line(paper::ACTIVE_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
+        let points = [0.0, 100.0, 253.0].map(|x| Weighted { x, y: over.at(x), weight: 3.0 });
+        let active = OverActive { cells: 253, points: points.to_vec(), line: over };
+        let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
+        let all = || nine.findings.iter().chain(&ten.findings);
+        for finding in all().filter(|finding| finding.what.ends_with("ours by the paper's")) {
+            assert!((finding.ours.value - 1.0).abs() < 1e-9, "{finding:?}");
+        }
+        let limits: Vec<_> = all().filter(|finding| finding.what.starts_with("most cells")).collect();
+        assert_eq!(
+            limits.iter().map(|limit| limit.ours.value.to_string()).collect::<Vec<_>>(),
+            ["2163", "2163", "2067"]
+        );
+        assert!(limits.iter().all(|limit| limit.verdict == Verdict::Same));
+        let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
+        assert_eq!(of("T_skin for each cell").verdict, Verdict::Same);
+        assert_eq!(of("quality").verdict, Verdict::Better, "above the bar");
+        let steep = OverCells { line: Line { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
+        let worse = fig9(&steep).findings.iter().filter(|finding| finding.verdict == Verdict::Worse).count();
+        assert_eq!(worse, 3, "slope, quality and limit");
+    }
+
+    /// On a clock that goes on by 16 ns at each look every computation takes 1 ns, however many cells it is of.
+    #[test]
+    fn every_number_of_cells_and_of_active_cells_is_measured() {
+        let skin = ticks::skin(40, 1).unwrap();
+        let clock = std::cell::Cell::new(0);
+        let now = || {
+            clock.set(clock.get() + 16);
+            clock.get()
+        };
+        let extent = Extent { step: 10, rounds: 3, touches: 200 };
+        let cells = over_cells(&skin, extent, now).unwrap();
+        assert_eq!(
+            cells.points.iter().map(|point| point[0].to_string()).collect::<Vec<_>>(),
+            ["0", "10", "20", "30", "40"]
+        );
+        assert!(cells.points.iter().all(|point| (point[1] - 1.0).abs() < 1e-9));
+        let active = over_active(&skin, extent, now).unwrap();
+        assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
+        assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
+        assert!(over_cells(&skin, Extent { step: 40, ..extent }, now).is_none(), "two numbers make no law");
     }
 }

@@ -15,8 +15,8 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use super::line::{Line, count};
-use super::ticks::{BUSES, Ticks, nanos, spread};
 use super::samples;
+use super::ticks::{BUSES, Ticks, nanos, spread};
 use crate::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, number};
 use crate::scenario::Mode;
 use crate::table::Table;
@@ -87,7 +87,8 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
         });
         let medians = samples::medians(&measured);
         let pairs = numbers.iter().zip(medians.as_chunks().0);
-        let points: Vec<_> = pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
+        let points: Vec<_> =
+            pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
         let line = |place: fn(&[f64; 3]) -> f64| {
             Line::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
         };
@@ -139,7 +140,8 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
             table.handle_frame(at, true, &frame, &mut |_| None);
         }
         let torque = [Q3_12::from_bits(if round % 2 == 0 { 409 } else { -77 }); WORDS];
-        let replies = skin.cells.iter().flat_map(|cell| frames(Message::Torque { from: cell.node, epoch, torque }));
+        let replies =
+            skin.cells.iter().flat_map(|cell| frames(Message::Torque { from: cell.node, epoch, torque }));
         let replies: Vec<Frame> = replies.collect();
         let began = now();
         for frame in &replies {
@@ -158,7 +160,8 @@ fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     let slope = |line: &Line| Quantity::new(line.slope, "ns").plus_minus(line.slope_half);
     [
         Finding::told(format!("central T_skin for each {what}"), slope(central)),
-        Finding::told(format!("distributed tick for each {what}"), slope(distributed)).beside(Quantity::new(0.0, "ns")),
+        Finding::told(format!("distributed tick for each {what}"), slope(distributed))
+            .beside(Quantity::new(0.0, "ns")),
         Finding::told(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
             Quantity::new(over.share() * 100.0, "%"),
@@ -252,10 +255,17 @@ mod tests {
             clock.get()
         };
         let measured = measure(&skin, Extent { steps: 4, rounds: 3 }, now).unwrap();
-        for (over, wanted) in [(&measured.cells, [12, 12, 24, 36, 48]), (&measured.active, [0, 12, 24, 36, 48])] {
-            let numbers: Vec<_> = over.points.iter().map(|point| point[0] as u32).collect();
+        for (over, wanted) in [
+            (&measured.cells, ["12", "12", "24", "36", "48"]),
+            (&measured.active, ["0", "12", "24", "36", "48"]),
+        ] {
+            let numbers: Vec<_> = over.points.iter().map(|point| point[0].to_string()).collect();
             assert_eq!(numbers, wanted);
-            assert!(over.points.iter().all(|[_, tick, central]| (tick - 1.0).abs() + (central - 1.0).abs() < 1e-9));
+            assert!(
+                over.points
+                    .iter()
+                    .all(|[_, tick, central]| (tick - 1.0).abs() + (central - 1.0).abs() < 1e-9)
+            );
         }
         assert!((measured.receiving - 0.25).abs() < 1e-9, "four cells between two looks");
         let section = section(&measured);

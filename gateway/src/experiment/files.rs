@@ -64,7 +64,11 @@ fn back(ordered: u64) -> f64 {
 }
 
 fn quoted(text: &str) -> String {
-    if text.contains(['"', ',', '\n']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+    if text.contains(['"', ',', '\n']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_owned()
+    }
 }
 
 /// All findings of a page, by experiment, with how it came about.
@@ -119,7 +123,10 @@ mod tests {
         };
         let value = results(&page);
         let finding = &value["experiments"][0]["findings"][0];
-        assert_eq!((finding["ours"]["value"].as_f64(), finding["paper"]["unit"].as_str()), (Some(1.0), Some("Nm")));
+        assert_eq!(
+            (finding["ours"]["value"].as_f64(), finding["paper"]["unit"].as_str()),
+            (Some(1.0), Some("Nm"))
+        );
         assert_eq!(finding["verdict"], "Better");
         assert_eq!(value["facts"]["machine"], "one");
     }

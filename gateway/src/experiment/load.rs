@@ -4,7 +4,9 @@ use protocol::can::Format;
 use protocol::wire_time::{BitRates, Coding, Shape as Frame};
 
 use super::line::count;
-use crate::report::figure::{Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table, number};
+use crate::report::figure::{
+    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table, number,
+};
 
 /// From joints to joints, in s.
 const PERIOD_S: f64 = 0.016;

@@ -97,7 +97,9 @@ impl Experiment {
     #[must_use]
     pub const fn about(self) -> &'static str {
         match self {
-            Self::Fig6 => "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8",
+            Self::Fig6 => {
+                "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8"
+            }
             Self::Fig7 => "joint velocities and active cells of the moving arm",
             Self::Fig8 => "cycle times of the moving arm, the central computation switched off at 5.7 s",
             Self::Fig9 => "central computation over 0 to 3000 cells, none active (Eq. 29)",
@@ -217,7 +219,7 @@ impl Session {
                 let (steps, rounds) = self.pick((4, 10), (30, 200));
                 let extent = distributed::Extent { steps, rounds };
                 let now = || lab.now();
-                let measured = distributed::measure(self.large(), extent, &now);
+                let measured = distributed::measure(self.large(), extent, now);
                 distributed::section(&measured.expect("more than two numbers of cells"))
             }
             Experiment::Sums => {

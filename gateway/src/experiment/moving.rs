@@ -5,7 +5,9 @@ use serde_json::Value;
 use super::line::{Line, Weighted, count, quantile};
 use super::paper;
 use super::recorded::Row;
-use crate::report::figure::{Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number};
+use crate::report::figure::{
+    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
+};
 
 /// A run: its ticks, and the figures of its end ([`crate::summary::Summary`] as JSON).
 #[derive(Clone, Debug)]
@@ -81,7 +83,8 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
     let [summed_due, summed_in] =
         ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
     let row = |name: &str, run: &Run, kind: &str| {
-        let [mean, greatest, torques] = ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
+        let [mean, greatest, torques] =
+            ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
         vec![name.to_owned(), mean, greatest, torques]
     };
     Section {
@@ -128,7 +131,8 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
 /// Which joints bear nothing.
 fn bare(run: &Run) -> String {
     let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
-    let bare: Vec<_> = (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
+    let bare: Vec<_> =
+        (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
     if bare.is_empty() {
         "Every joint bears something.".to_owned()
     } else {
@@ -152,7 +156,10 @@ pub fn fig7(run: &Run) -> Section {
     Section {
         name: "fig7".to_owned(),
         title: "Fig. 7: joint velocities and active cells".to_owned(),
-        text: vec!["The same run. The arm moves because the cells' torques say so: the loop uses theirs only.".to_owned()],
+        text: vec![
+            "The same run. The arm moves because the cells' torques say so: the loop uses theirs only."
+                .to_owned(),
+        ],
         figures: vec![
             Figure {
                 name: "fig7-velocities".to_owned(),
@@ -237,9 +244,7 @@ pub fn fig8(run: &Run) -> Section {
             us((paper::CELL_S * cells + paper::FIXED_S) * 1e6),
             us(none_active),
         ),
-        Finding::told("T_skin after the switch, greatest", us(off))
-            .beside(us(0.0))
-            .must("0", off <= 0.0),
+        Finding::told("T_skin after the switch, greatest", us(off)).beside(us(0.0)).must("0", off <= 0.0),
         Finding::told("T_total before the switch, median", us(total[0])),
         Finding::less_is_better("T_total after the switch, median", us(paper::REST_S * 1e6), us(total[1]))
             .must("less than before", total[1] < total[0]),
@@ -348,7 +353,7 @@ mod tests {
         assert!((of("T_total after the switch, median").ours.value - 1.0).abs() < 1e-9);
         assert!(section.findings.iter().all(|finding| finding.verdict != Verdict::Worse));
         assert!((of("all of the gateway's").ours.value - 10.0).abs() < 1e-9);
-        let mut never_off = run.clone();
+        let mut never_off = run;
         never_off.rows.iter_mut().for_each(|row| row.central_us = 3.0);
         assert!(fig8(&never_off).findings.iter().any(|finding| finding.verdict == Verdict::Worse));
     }

@@ -107,13 +107,8 @@ mod tests {
         };
         let commands = JointState { velocity: &[7.0, 7.0], ..states };
         let torques = Torques { nanos: 5, distributed: &[1.0, 2.0], central: &[1.5, 2.5], active: 3 };
-        let timing = LoopTiming {
-            nanos: 5,
-            took_us: 6.0,
-            central_us: 4.0,
-            contributing: 3,
-            ..LoopTiming::default()
-        };
+        let timing =
+            LoopTiming { nanos: 5, took_us: 6.0, central_us: 4.0, contributing: 3, ..LoopTiming::default() };
         say("/UR5/joint_commands", JointState::TYPE, 5, &|out| commands.write(out));
         say("/UR5/joint_states", JointState::TYPE, 5, &|out| states.write(out));
         say("/UR5/torques", Torques::TYPE, 5, &|out| torques.write(out));

@@ -70,7 +70,8 @@ struct Mean {
 impl Mean {
     /// Adds the errors of loaded joints.
     fn add(&mut self, loaded: usize, got: &[f64; WORDS], wanted: &[f64; WORDS]) {
-        for (got, wanted) in got.iter().zip(wanted).take(loaded).filter(|(_, wanted)| wanted.abs() < MOST_NM) {
+        for (got, wanted) in got.iter().zip(wanted).take(loaded).filter(|(_, wanted)| wanted.abs() < MOST_NM)
+        {
             self.sum += (got - wanted).abs();
             self.count += 1;
         }
@@ -163,7 +164,8 @@ pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
             Finding::less_is_better(what, Quantity::new(paper::SUMMED_NM, "Nm"), Quantity::new(ours, "Nm"))
         };
         findings.push(summed("each cut off, mean error", at.truncated));
-        findings.push(summed("rounded, mean error", at.rounded).must("at most 0.005 Nm", at.rounded <= 0.005));
+        findings
+            .push(summed("rounded, mean error", at.rounded).must("at most 0.005 Nm", at.rounded <= 0.005));
         findings.push(summed("carried, mean error of single epochs", at.carried));
         findings.push(summed("rounded, mean error of the average over 32 epochs", at.rounded_average));
         findings.push(summed("carried, mean error of the average over 32 epochs", at.carried_average));

@@ -24,13 +24,22 @@ impl Lab for Bare {
 }
 
 fn is_drawable(figure: &Figure) {
-    assert!(!figure.title.is_empty() && !figure.x.label.is_empty() && !figure.y.label.is_empty(), "{}", figure.name);
+    assert!(
+        !figure.title.is_empty() && !figure.x.label.is_empty() && !figure.y.label.is_empty(),
+        "{}",
+        figure.name
+    );
     assert!(!figure.series.is_empty() && figure.series.len() <= Figure::COLOURS, "{}", figure.name);
     for series in &figure.series {
         let finite = series.points.iter().all(|(x, y)| x.is_finite() && y.is_finite());
         assert!(series.points.len() >= 2 && finite, "{}: {series:?}", figure.name);
         let rises = series.points.windows(2).all(|pair| pair[0].0 <= pair[1].0);
-        assert!(rises || matches!(series.shape, Shape::Band | Shape::Points), "{}: {}", figure.name, series.label);
+        assert!(
+            rises || matches!(series.shape, Shape::Band | Shape::Points),
+            "{}: {}",
+            figure.name,
+            series.label
+        );
     }
 }
 
@@ -48,9 +57,16 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
         names.extend(section.figures.iter().map(|figure| figure.name.clone()));
         for finding in &section.findings {
             assert!(finding.ours.value.is_finite(), "{finding:?}");
-            assert_eq!(finding.verdict == Verdict::Told, finding.bar.is_none() && is_told(finding), "{finding:?}");
+            assert_eq!(
+                finding.verdict == Verdict::Told,
+                finding.bar.is_none() && is_told(finding),
+                "{finding:?}"
+            );
         }
-        let rows = section.tables.iter().flat_map(|table| table.rows.iter().map(|row| (row.len(), table.head.len())));
+        let rows = section
+            .tables
+            .iter()
+            .flat_map(|table| table.rows.iter().map(|row| (row.len(), table.head.len())));
         assert!(rows.clone().all(|(cells, head)| cells == head));
     }
     let all = names.len();

@@ -105,7 +105,9 @@ impl Tree {
         let mut came = Came::default();
         let mut own = vec![None; self.sums.len()];
         for (place, felt) in touch {
-            let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else { continue };
+            let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else {
+                continue;
+            };
             let force = self.central.force(*place, felt);
             add(&mut came.central, self.central.torque(*place, &frames, force));
             let force = Force::fuse(felt.contact, felt.proximity, &self.skin.parameters(cell).contact);

@@ -56,7 +56,11 @@ impl Benches {
                 command.arg(option).arg(path);
             }
         }
-        command.env("SKINBUS_DIR", &buses.0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+            .env("SKINBUS_DIR", &buses.0)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped());
         let ended = self.wait(command).map_err(|error| failed(&own, &error))?;
         if !ended.status.success() {
             let said = String::from_utf8_lossy(&ended.stderr);
@@ -67,7 +71,11 @@ impl Benches {
         let rows = recorded::read(&recording).map_err(|error| failed(&recording, &error))?;
         let text = fs::read_to_string(&summary).map_err(|error| failed(&summary, &error))?;
         let summary = serde_json::from_str(&text).map_err(|error| failed(&summary, &error))?;
-        let joints = Skin::parse("the arm's skin", &arm::skin(reply, effort)).map_err(Failure::run)?.robot.joints.len();
+        let joints = Skin::parse("the arm's skin", &arm::skin(reply, effort))
+            .map_err(Failure::run)?
+            .robot
+            .joints
+            .len();
         if rows.is_empty() {
             return Err(failed(&recording, &"it has no ticks"));
         }
