@@ -146,10 +146,10 @@ pub fn section() -> Section {
 mod tests {
     use super::*;
 
-    /// Worst cases that others computed, in µs.
+    /// Worst cases that others computed, in µs; of two classic frames, whose CRC cannot be what would stuff most, 2 less.
     #[test]
     fn a_packet_takes_what_it_takes() {
-        let wanted = [160.0, 102.4, 128.0, 70.4, 56.0, 268.0];
+        let wanted = [160.0, 102.4, 128.0, 70.4, 56.0, 266.0];
         for (rates, wanted) in Rates::all().iter().zip(wanted) {
             assert!((rates.packet_s() * 1e6 - wanted).abs() < 0.05, "{}: {}", rates.name, rates.packet_s());
         }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q3_12;
-use protocol::message::{Message, SkinSensors};
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::message::{Joints, Message, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
@@ -66,14 +66,16 @@ fn felt(cells: usize, active: usize) -> Vec<SkinSensors> {
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     let mut table = Table::new(skin, bus);
     let cells: Vec<&Cell> = skin.cells_of(bus).collect();
-    let (epoch, mut quiet) = (Epoch(0), |_| None);
+    let epoch = Epoch(0);
+    let mut hear = |own, message: Message| {
+        for frame in message.encode().frames(Format::Fd) {
+            table.handle_frame(Micros(100), own, &frame, &mut |_| None);
+        }
+    };
+    hear(true, Message::Joints { epoch, joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 } });
     for cell in cells.iter().take(active) {
         // Some torque: what it is costs the same.
-        let torque = [Q3_12::from_bits(409); WORDS];
-        let message = Message::Torque { from: cell.node, epoch, torque };
-        for frame in message.encode().frames(Format::Fd) {
-            table.handle_frame(Micros(100), false, &frame, &mut quiet);
-        }
+        hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
     }
     Snapshot { sums: table.snapshot().sums, felt: felt(cells.len(), active) }
 }
