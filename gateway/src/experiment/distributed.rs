@@ -148,7 +148,11 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
             table.handle_frame(at, false, black_box(frame), &mut |_| None);
         }
         took.push(nanos(now().saturating_sub(began)) / count(replies.len()));
-        debug_assert_eq!(table.snapshot().sums.contributing as usize, skin.cells.len(), "everybody is in the sum");
+        debug_assert_eq!(
+            table.snapshot().sums.contributing as usize,
+            skin.cells.len(),
+            "everybody is in the sum"
+        );
     }
     super::line::quantile(&mut took, 0.5)
 }
