@@ -136,7 +136,7 @@ fn bare(run: &Run) -> String {
     if bare.is_empty() {
         "Every joint bears something.".to_owned()
     } else {
-        format!("Without any torque: joint {}, for no cell sits beyond.", bare.join(", "))
+        format!("No torque in joints {}, beyond which no cell sits.", bare.join(", "))
     }
 }
 
