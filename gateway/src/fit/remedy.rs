@@ -102,7 +102,7 @@ fn events(case: &Case) -> Option<Remedy> {
         Sensing::Off | Sensing::Event => None,
         Sensing::Continuous { .. } => {
             let quiet = Case { sensing: Sensing::Event, ..case.clone() };
-            Some(remedy("sensing = \"event\", as long as nothing changes".to_owned(), &quiet))
+            Some(remedy("sensing = \"event\", quiet".to_owned(), &quiet))
         }
     }
 }
@@ -117,11 +117,8 @@ pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Remedy> {
     };
     let sums = |shared| case::sums(skin, bus, case.period_ns, slot_us, shared);
     let torques = Answers::Torques { cells: case.answers.cells() };
-    let others = [
-        (Some(torques), "torques"),
-        (sums(true), "sums, all cells on this bus"),
-        (sums(false), "sums, only roots on this bus"),
-    ];
+    let others =
+        [(Some(torques), "torques"), (sums(true), "sums of all cells"), (sums(false), "sums, only of roots")];
     let other = |(answers, change): (Option<Answers>, &str)| {
         let other = Case { answers: answers?, ..case.clone() };
         (other.answers != case.answers).then(|| remedy(change.to_owned(), &other))

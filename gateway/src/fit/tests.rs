@@ -4,10 +4,10 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::wire_time::BitRates;
 
-use super::case::Case;
+use super::case::{Answers, Case};
 use super::limits::{Limit, Most};
-use super::{BusFit, COMPUTATION_NS, bus, fullest, table};
-use crate::generate::{Wanted, generate};
+use super::{BusFit, COMPUTATION_NS, bus, fullest, json, table, whole};
+use crate::generate::{Reply, Wanted, generate};
 
 fn text(wanted: &Wanted) -> String {
     generate(wanted).unwrap()
@@ -124,12 +124,7 @@ fn every_remedy_does_in_a_description_what_it_says() {
     let changes: Vec<_> = before.remedies.iter().map(|it| it.change.as_str()).collect();
     assert_eq!(
         changes,
-        [
-            "2 buses of 100 cells",
-            "1M/8M",
-            "joint_broadcast_hz = 22.727273",
-            "sensing = \"event\", as long as nothing changes",
-        ]
+        ["2 buses of 100 cells", "1M/8M", "joint_broadcast_hz = 22.727273", "sensing = \"event\", quiet",]
     );
     for remedy in &before.remedies {
         let rates = remedy.change.parse::<BitRates>().unwrap_or_else(|_| "500k/5M".parse().unwrap());
@@ -149,4 +144,60 @@ fn every_remedy_does_in_a_description_what_it_says() {
         let after = fullest(buses).unwrap().judged;
         assert_eq!(after, remedy.after, "{}", remedy.change);
     }
+}
+
+#[test]
+fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
+    let skin = skin(&text(&Wanted { buses: 3, ..Wanted::default() }));
+    let fit = fit(&skin, "1M/5M");
+    let [shared, roots] = &fit.answers[..] else { panic!("{:?}", fit.answers) };
+    assert_eq!(shared.after.load, fit.judged.load);
+    assert!(shared.after.times.last_ns() > fit.judged.times.last_ns(), "parents wait for their children");
+    assert_eq!(roots.after.case.answers.cells(), 1);
+    let packets = roots.after.load.total() / (70.4 / 16_000.0);
+    assert!((packets - 2.064).abs() < 1e-9, "joints, one sum, and that cell's heartbeats: {packets}");
+    assert_eq!(roots.after.exceeded, []);
+}
+
+#[test]
+fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
+    let skin = skin(&text(&Wanted { cells: 60, reply: Reply::Sum, ..Wanted::default() }));
+    let fit = fit(&skin, "1M/5M");
+    let Answers::Sums { by_depth, slot_ns, shared } = &fit.judged.case.answers else { panic!("{fit:?}") };
+    let depths = skin.wires(0).depths();
+    let deepest = depths.iter().flatten().max().copied().unwrap();
+    assert_eq!((by_depth.iter().sum::<u32>(), by_depth.len()), (60, usize::from(deepest) + 1));
+    assert!(*shared && by_depth[0] == 1);
+    assert!(
+        matches!(skin.buses[0].reply, protocol::skin::Reply::Sum { slot_us, .. } if u64::from(slot_us) * 1_000 == *slot_ns)
+    );
+    // Of every wire on the way up one computation, and one frame of somebody else's.
+    let chain_ns = 70_400 * 62 + (u64::from(deepest) + 1) * (68_500 + 70_400);
+    assert_eq!(fit.judged.times.chain_ns, Some(chain_ns));
+    let changes: Vec<_> = fit.answers.iter().map(|it| it.change.as_str()).collect();
+    assert_eq!(changes, ["torques", "sums, only of roots"]);
+    // Half the cells, half of every depth.
+    let half = fit.judged.case.answers.with_cells(30);
+    assert_eq!(half.cells(), 30);
+}
+
+#[test]
+fn json_has_the_same_figures_and_null_where_there_is_no_bound() {
+    let skin = skin(&text(&Wanted::default()));
+    let fits = [fit(&skin, "1M/5M")];
+    let json = json(&skin, &fits, Some(&whole(&skin, &fits[0])), &[]);
+    let bus = &json["buses"][0];
+    assert_eq!((bus["bus"].as_str(), bus["name"].as_str()), (Some("vcan0"), Some("1M/5M")));
+    assert_eq!((bus["nominal"].as_u64(), bus["data"].as_u64()), (Some(1_000_000), Some(5_000_000)));
+    assert!((bus["load"]["total"].as_f64().unwrap() - 1.1889).abs() < 1e-4);
+    assert!(bus["last_answer_us"].is_null() && bus["heartbeat_us"].is_null());
+    assert_eq!(bus["exceeded"], serde_json::json!(["bandwidth", "deadline", "nodes"]));
+    assert_eq!(bus["most_cells"], serde_json::json!({ "bandwidth": 212, "deadline": 223, "nodes": 109 }));
+    assert_eq!(bus["buses_needed"]["buses"].as_u64(), Some(3));
+    assert_eq!(bus["buses_needed"]["binding"], serde_json::json!(["nodes"]));
+    let three = &json["whole"]["spread"][2];
+    assert_eq!((three["buses"].as_u64(), three["fullest"]["cells"].as_u64()), (Some(3), Some(85)));
+    let last_us = three["fullest"]["last_answer_us"].as_f64().unwrap();
+    assert!((last_us - (88.0 * 70.4 + 68.5)).abs() < 1e-9);
+    assert!(json["table"].is_null());
 }

@@ -31,11 +31,11 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
             name(judged.case.format, judged.case.rates),
             micros(judged.case.packet_ns()),
             percent(judged.load.total()),
-            judged.times.last_ns().map_or_else(|| "-".to_owned(), millis),
+            ms(judged),
             most.in_time().to_string(),
             needed_shortly(&row.need),
             roots.map_or_else(String::new, |it| percent(it.load.total())),
-            roots.and_then(|it| it.times.last_ns()).map_or_else(|| "-".to_owned(), millis),
+            roots.map_or_else(String::new, ms),
         ]);
     }
     for column in table.column_iter_mut().skip(1) {
@@ -49,11 +49,11 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     };
     format!(
         "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
-         load   joints, {} of all cells, heartbeats{}; more than 100 % does not fit\n\
-         last   from the joints' turn on the bus to the end of the last answer, at most; - has no bound\n\
-         cells  that one bus has time for; transceivers drive about {}\n\
-         buses  for {cells} cells, and what asks for so many: time, or nodes electrically\n\
-         roots  sums along the tree with only the roots on this bus (sums of all cells save no frame)\n",
+         load    joints, {} of all cells, heartbeats{}; 100 % is all there is\n\
+         last    from the joints' turn on the bus to the end of the last answer at most\n\
+         cells   that a bus has time for; transceivers drive about {}\n\
+         buses   for {cells} cells, and what asks for so many: time or nodes\n\
+         roots   sums with only the roots on this bus; sums of all cells save no frame\n",
         skin.name,
         millis(case.period_ns),
         micros(case.computation_ns),
@@ -75,12 +75,12 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     }
     // Of one bus its own section says the same.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
-        rows.section(format!("{} cells in all", whole.cells), "on the fullest bus", "");
+        rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
+        rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
         for (buses, judged) in &whole.spread {
             let on = format!("{} of {} cells", count(*buses), judged.case.answers.cells());
             rows.row(on, figures(judged), verdict(judged));
         }
-        rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
     }
     format!("{}\n", rows.table())
 }
@@ -100,8 +100,7 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     let parts =
         parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", percent(*share)));
     rows.row("load", format!("{} %", percent(load.total())), parts.collect::<Vec<_>>().join(", "));
-    let bounds =
-        [("chain", times.chain_ns), ("response-time analysis", times.response_ns.map(|it| it.worst_ns))];
+    let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let bounds = bounds.collect::<Vec<_>>().join(", ");
     rows.row("last answer after joints", last(judged), bounds);
@@ -111,7 +110,7 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     rows.row("a heartbeat takes", heartbeat, "600 ms of silence make a dead cell");
     let others =
         format!("bandwidth {}, deadline {}, nodes about {}", most.bandwidth, most.deadline, most.nodes);
-    rows.row("cells that one bus takes", most.in_time().min(most.nodes), others);
+    rows.row("cells that fit", most.in_time().min(most.nodes), others);
     rows.row("buses needed", needed(need), each_need(need));
     if !remedies.is_empty() {
         rows.section("  what to change", "", "");
@@ -124,7 +123,7 @@ fn section(rows: &mut Rows, bus: &BusFit) {
         rows.row(format!("  {}", remedy.change), figures(&remedy.after), verdict(&remedy.after));
     }
     if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
-        rows.row("  sums", "not possible", "no wires lead from a root to every cell");
+        rows.row("  sums", "not possible", "a cell has no way to a root");
     }
 }
 
@@ -166,10 +165,16 @@ fn verdict(judged: &Judged) -> String {
     let exceeded = &judged.exceeded;
     match (judged.is_in_time(), exceeded.contains(&Limit::Nodes)) {
         (true, false) => "fits".to_owned(),
-        (true, true) => format!("in time; too many nodes: {nodes}"),
+        (true, true) => format!("in time, but {nodes} nodes"),
         (false, _) if exceeded.contains(&Limit::Bandwidth) => "does not fit: bandwidth".to_owned(),
         (false, _) => "does not fit: deadline".to_owned(),
     }
+}
+
+/// The last answer in ms for a column of numbers.
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn ms(judged: &Judged) -> String {
+    judged.times.last_ns().map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
 }
 
 /// As [`needed`], in fewer words: bandwidth and deadline are both a matter of time.
@@ -210,7 +215,7 @@ fn millis(ns: u64) -> String {
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn micros(ns: u64) -> String {
-    trimmed(ns as f64 / 1e3, 1)
+    format!("{:.1}", ns as f64 / 1e3)
 }
 
 fn percent(share: f64) -> String {
