@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-use comfy_table::{ContentArrangement, Table, presets};
+use comfy_table::{ColumnConstraint, ContentArrangement, Table, presets};
 use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
 use protocol::usage::{Failure, print};
 
@@ -32,6 +32,14 @@ impl Rows {
         }
         table.set_header(head);
         Self(table)
+    }
+
+    /// The same where names are not broken, however narrow the terminal.
+    pub(super) fn names_in_one_line(mut self) -> Self {
+        if let Some(names) = self.0.column_mut(0) {
+            names.set_constraint(ColumnConstraint::ContentWidth);
+        }
+        self
     }
 
     pub(super) const fn table(&self) -> &Table {

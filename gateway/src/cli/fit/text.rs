@@ -69,7 +69,7 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     let case = &first.judged.case;
     let period = format!("joints every {} ms", millis(case.period_ns));
     let computation = format!("a cell computes {} µs", micros(case.computation_ns));
-    let mut rows = Rows::new([skin.name.clone(), period, computation]);
+    let mut rows = Rows::new([skin.name.clone(), period, computation]).names_in_one_line();
     for bus in buses {
         section(&mut rows, bus);
     }
@@ -92,24 +92,21 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     let rates = name(case.format, case.rates);
     rows.section(format!("{bus_name}, {rates}"), verdict(judged), format!("{cells} cells, {}", what(case)));
     let parts = [
-        ("joints", load.joints),
-        (what(case), load.answers),
-        ("sensors", load.sensors),
-        ("heartbeats", load.heartbeats),
+        (format!("joints and {}", what(case)), load.joints + load.answers),
+        ("sensors".to_owned(), load.sensors),
+        ("heartbeats".to_owned(), load.heartbeats),
     ];
     let parts =
         parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", percent(*share)));
     rows.row("load", format!("{} %", percent(load.total())), parts.collect::<Vec<_>>().join(", "));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
-    let bounds = bounds.collect::<Vec<_>>().join(", ");
-    rows.row("last answer after joints", last(judged), bounds);
-    rows.row("  it has to be there after", format!("{} ms", millis(case.deadline_ns())), "");
+    let due = format!("due after {} ms", millis(case.deadline_ns()));
+    rows.row("last answer", last(judged), [due].into_iter().chain(bounds).collect::<Vec<_>>().join(", "));
     let heartbeat =
         times.heartbeat_ns.map_or_else(|| "no bound".to_owned(), |ns| format!("{} ms", millis(ns)));
-    rows.row("a heartbeat takes", heartbeat, "600 ms of silence make a dead cell");
-    let others =
-        format!("bandwidth {}, deadline {}, nodes about {}", most.bandwidth, most.deadline, most.nodes);
+    rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
+    let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.row("cells that fit", most.in_time().min(most.nodes), others);
     rows.row("buses needed", needed(need), each_need(need));
     if !remedies.is_empty() {
