@@ -12,7 +12,7 @@ const README: &str = include_str!("../../README.md");
 fn gateway(arguments: &str) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    command.args(arguments.split(' ')).current_dir(root).env("NO_COLOR", "1").output().unwrap()
+    command.args(arguments.split_whitespace()).current_dir(root).env("NO_COLOR", "1").output().unwrap()
 }
 
 fn output(arguments: &str) -> String {
