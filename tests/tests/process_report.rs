@@ -1,6 +1,7 @@
 //! Reports on recordings of real benches: what figures and tables show is what the recording holds, read by another
 //! program's reader, and what the gateway itself counted.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+#![allow(clippy::float_cmp, reason = "a figure shows the very numbers of the recording")]
 
 mod process;
 #[path = "process/recorded.rs"]
