@@ -1,33 +1,25 @@
-//! How fast captures are read and converted, and what memory that takes; beside the crate socketcan in the same run.
+//! How fast captures are converted, and what memory that takes. How fast text is read is `cargo bench -p gateway --bench
+//! captures`.
 //!
 //! ```text
 //!   cargo build --release -p gateway && cargo run --release -p gateway --example capture_speed [LINES [FOLDER]]
 //! ```
 //!
-//! Half of the lines are classic frames of 8 bytes, half FD frames of 16. What is read stands in memory; files of LINES
-//! lines (10 million unless told) lie in FOLDER for the conversions, and are gone afterwards. Each figure is the
-//! median of several turns taken one after the other, so that a busy machine is as unfair to one as to the other.
+//! Half of the lines are classic frames of 8 bytes, half FD frames of 16. Files of LINES lines (10 million unless told) lie
+//! in FOLDER for the conversions, and are gone afterwards.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
-    clippy::indexing_slicing,
     clippy::cast_precision_loss,
     reason = "a measurement may stop"
 )]
 
 use std::fmt::Write as _;
 use std::fs::File;
-use std::hint::black_box;
 use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-use gateway::capture::{Entry, Reader};
-use protocol::candump::write_record;
-
-/// Lines that are read from memory.
-const IN_MEMORY: u64 = 500_000;
 
 /// A line as `candump -L` writes it.
 fn write_line(log: &mut String, line: u64) {
@@ -40,35 +32,6 @@ fn write_line(log: &mut String, line: u64) {
         let other = word ^ line;
         writeln!(log, "({sec}.{micro:06}) vcan0 {id:03X}##5{word:016X}{other:016X}").unwrap();
     }
-}
-
-fn with_socketcan(log: &'static [u8]) {
-    let mut reader = socketcan::dump::Reader::from_reader(log);
-    while let Some(record) = reader.next_record().unwrap() {
-        black_box(&record);
-    }
-}
-
-fn with_ours(log: &'static [u8]) {
-    let mut reader = Reader::from_read("memory", log).unwrap();
-    while let Some(entry) = reader.next().unwrap() {
-        black_box(&entry);
-    }
-}
-
-fn and_written(log: &'static [u8]) {
-    let mut reader = Reader::from_read("memory", log).unwrap();
-    let mut line = String::new();
-    while let Some(Entry::Frame(record)) = reader.next().unwrap() {
-        line.clear();
-        write_record(&mut line, &record).unwrap();
-        black_box(&line);
-    }
-}
-
-fn median(mut figures: Vec<f64>) -> f64 {
-    figures.sort_by(f64::total_cmp);
-    figures[figures.len() / 2]
 }
 
 /// Million lines a second, and the greatest memory of the process in MB.
@@ -97,30 +60,6 @@ fn main() {
     let mut arguments = std::env::args().skip(1);
     let lines: u64 = arguments.next().map_or(10_000_000, |lines| lines.parse().expect("LINES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
-
-    let mut log = String::new();
-    (0..IN_MEMORY).for_each(|line| write_line(&mut log, line));
-    let log: &'static [u8] = log.leak().as_bytes();
-    let works: [fn(&'static [u8]); 3] = [with_socketcan, with_ours, and_written];
-    let mut rates = works.map(|_| Vec::new());
-    let mut ratios = Vec::new();
-    for _ in 0..15 {
-        for (work, rates) in works.iter().zip(&mut rates) {
-            let begun = Instant::now();
-            work(log);
-            rates.push(IN_MEMORY as f64 / begun.elapsed().as_secs_f64() / 1e6);
-        }
-        ratios.push(rates[1].last().unwrap() / rates[0].last().unwrap());
-    }
-    let [theirs, ours, written] = rates.map(median);
-    println!(
-        "read, million lines/s          socketcan {theirs:.2}, this {ours:.2}, ratio {:.2}",
-        median(ratios)
-    );
-    println!("read and written, million/s    {written:.2}");
-    if lines == 0 {
-        return;
-    }
 
     let program = std::env::current_exe().unwrap();
     let gateway = program.parent().and_then(Path::parent).unwrap().join("gateway");

@@ -1,0 +1,92 @@
+//! Instructions of one Jacobian and of the sines: `cargo bench -p cell-node --bench instructions`
+//!
+//! Counted by valgrind, so that they are the same on a busy machine. `docs/benchmarks.md` says what has to be installed.
+
+#![expect(missing_docs, unused_qualifications, reason = "gungraun's macros write them")]
+
+use std::hint::black_box;
+
+use cell_node::kernel::Kernel;
+use cell_node::sine;
+use gungraun::{library_benchmark, library_benchmark_group};
+use protocol::fixed::Q1_14;
+use protocol::parameters::MAX_JOINTS;
+
+#[path = "../../protocol/benches/counted/mod.rs"]
+mod counted;
+mod setting;
+
+use setting::Setting;
+
+/// Made before the count begins, and never dropped.
+fn cell() -> &'static Setting {
+    Box::leak(Box::new(Setting::new()))
+}
+
+/// The words of all angles of the circle, combined.
+fn circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
+    let word = |angle| function(black_box(Q1_14::from_bits(angle))).to_bits();
+    // Turned, for a sine and its opposite would cancel out.
+    (i16::MIN..=i16::MAX).fold(0_i16, |sum, angle| sum.rotate_left(1) ^ word(angle))
+}
+
+#[library_benchmark]
+#[bench::k6(cell())]
+fn wrench(cell: &Setting) -> [Q1_14; MAX_JOINTS] {
+    cell.wrench.jacobian(black_box(&cell.words))
+}
+
+#[library_benchmark]
+#[bench::k6(cell())]
+fn projection(cell: &Setting) -> [Q1_14; MAX_JOINTS] {
+    cell.projection.jacobian(black_box(&cell.words))
+}
+
+#[library_benchmark]
+#[bench::k6(cell())]
+fn nalgebra_f64(cell: &Setting) -> [f64; MAX_JOINTS] {
+    cell.double.jacobian(black_box(&cell.radians))
+}
+
+#[library_benchmark]
+#[bench::k6(cell())]
+fn nalgebra_f32(cell: &Setting) -> [f32; MAX_JOINTS] {
+    cell.single.jacobian(black_box(&cell.radians_f32))
+}
+
+#[library_benchmark]
+fn seventh_order() -> i16 {
+    circle(sine::sine)
+}
+
+#[library_benchmark]
+fn fifth_order() -> i16 {
+    circle(sine::paper_sine)
+}
+
+library_benchmark_group!(
+    name = jacobian;
+    compare_by_id = true;
+    benchmarks = wrench, projection, nalgebra_f64, nalgebra_f32
+);
+library_benchmark_group!(name = sines; benchmarks = seventh_order, fifth_order);
+
+/// All that is counted, once and with a look at what comes of it.
+fn once() {
+    cell().check();
+    assert_ne!(circle(sine::sine), circle(sine::paper_sine));
+}
+
+mod all {
+    use super::{jacobian, sines};
+
+    gungraun::main!(library_benchmark_groups = jacobian, sines);
+
+    pub(super) fn run() {
+        main();
+    }
+}
+
+fn main() {
+    counted::main(once, all::run);
+}

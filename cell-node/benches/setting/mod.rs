@@ -1,0 +1,64 @@
+//! One cell on the last link of a UR5, for each way to compute its Jacobian.
+
+mod peer;
+#[path = "../../tests/witness/mod.rs"]
+mod witness;
+
+use cell_node::kernel::{Kernel, Projection, Wrench};
+use protocol::fixed::Q1_14;
+use protocol::parameters::MAX_JOINTS;
+
+use peer::Peer;
+use witness::Case;
+
+/// A cell that joint 6 moves, and joints.
+pub(crate) struct Setting {
+    pub(crate) wrench: Wrench,
+    pub(crate) projection: Projection,
+    pub(crate) double: Peer<f64>,
+    pub(crate) single: Peer<f32>,
+    /// Joint positions in quarter turns.
+    pub(crate) words: [Q1_14; MAX_JOINTS],
+    /// The same in rad.
+    pub(crate) radians: [f64; MAX_JOINTS],
+    /// The same in rad.
+    pub(crate) radians_f32: [f32; MAX_JOINTS],
+}
+
+impl Setting {
+    /// The first of the tests' cases on joint 6.
+    pub(crate) fn new() -> Self {
+        let case = Case::all().into_iter().find(|case| case.joint == 6).expect("there are some");
+        let parameters = case.parameters();
+        let words = case.words();
+        let radians = words.map(Q1_14::to_radians);
+        #[expect(clippy::cast_possible_truncation, reason = "the nearest number")]
+        let radians_f32 = radians.map(|angle| angle as f32);
+        Self {
+            wrench: Wrench::new(&parameters),
+            projection: Projection::new(&parameters),
+            double: Peer::new(&parameters),
+            single: Peer::new(&parameters),
+            words,
+            radians,
+            radians_f32,
+        }
+    }
+
+    /// Sees that all of them compute the same.
+    ///
+    /// # Panics
+    /// When one is more than 5e-4 m from the double precision, or f32 more than 1e-6 m.
+    pub(crate) fn check(&self) {
+        let wanted = self.double.jacobian(&self.radians);
+        let wrench = self.wrench.jacobian(&self.words).map(Q1_14::to_f64);
+        let projection = self.projection.jacobian(&self.words).map(Q1_14::to_f64);
+        let single = self.single.jacobian(&self.radians_f32).map(f64::from);
+        for (name, got, most) in
+            [("wrench", wrench, 5e-4), ("projection", projection, 5e-4), ("nalgebra, f32", single, 1e-6)]
+        {
+            let near = got.iter().zip(&wanted).all(|(got, wanted)| (got - wanted).abs() < most);
+            assert!(near && wanted.iter().any(|j| j.abs() > 0.05), "{name}: {got:?}, not {wanted:?}");
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! How fast candump text is read, beside the crate socketcan's reader: `cargo bench -p gateway --bench captures`
+//!
+//! Half of the lines are classic frames of 8 bytes, half FD frames of 16; the text stands in memory. Converting files, and
+//! the memory that takes, is measured by the example `capture_speed`.
+
+use std::fmt::Write;
+use std::hint::black_box;
+use std::time::Duration;
+
+use criterion::{Criterion, Throughput};
+use gateway::capture::{Entry, Reader};
+use protocol::candump::write_record;
+
+const LINES: u64 = 20_000;
+
+/// As `candump -L` writes it.
+fn log() -> &'static [u8] {
+    let mut log = String::new();
+    for line in 0..LINES {
+        let micros = 1_700_000_000_000_000 + line * 63;
+        let (sec, micro, id) = (micros / 1_000_000, micros % 1_000_000, 0x200 + line % 253);
+        let word = line.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        write!(log, "({sec}.{micro:06}) vcan0 {id:03X}").expect("a String takes everything");
+        if line.is_multiple_of(2) {
+            writeln!(log, "#{word:016X}").expect("a String takes everything");
+        } else {
+            writeln!(log, "##5{word:016X}{:016X}", word ^ line).expect("a String takes everything");
+        }
+    }
+    log.leak().as_bytes()
+}
+
+fn with_socketcan(log: &'static [u8]) -> u64 {
+    let mut reader = socketcan::dump::Reader::from_reader(log);
+    let mut frames = 0;
+    while let Some(record) = reader.next_record().expect("a sound log") {
+        black_box(&record);
+        frames += 1;
+    }
+    frames
+}
+
+fn with_ours(log: &'static [u8]) -> u64 {
+    let mut reader = Reader::from_read("memory", log).expect("a sound log");
+    let mut frames = 0;
+    while let Some(entry) = reader.next().expect("a sound log") {
+        frames += u64::from(matches!(black_box(&entry), Entry::Frame(_)));
+    }
+    frames
+}
+
+fn and_written(log: &'static [u8]) -> usize {
+    let mut reader = Reader::from_read("memory", log).expect("a sound log");
+    let (mut line, mut bytes) = (String::new(), 0);
+    while let Some(entry) = reader.next().expect("a sound log") {
+        if let Entry::Frame(record) = entry {
+            line.clear();
+            write_record(&mut line, &record).expect("a String takes everything");
+            bytes += black_box(&line).len();
+        }
+    }
+    bytes
+}
+
+fn main() {
+    let mut criterion = Criterion::default()
+        .sample_size(30)
+        .warm_up_time(Duration::from_millis(300))
+        .measurement_time(Duration::from_millis(1_500))
+        .configure_from_args();
+    let log = log();
+    assert_eq!([with_ours(log), with_socketcan(log)], [LINES; 2]);
+    assert_eq!(
+        and_written(log),
+        log.iter().filter(|&&byte| byte != b'\n').count(),
+        "what is written is what was read"
+    );
+    let mut group = criterion.benchmark_group("candump");
+    group.throughput(Throughput::Elements(LINES));
+    group.bench_function("this reader", |bencher| bencher.iter(|| with_ours(black_box(log))));
+    group.bench_function("socketcan", |bencher| bencher.iter(|| with_socketcan(black_box(log))));
+    group.bench_function("read and written", |bencher| bencher.iter(|| and_written(black_box(log))));
+    group.finish();
+    criterion.final_summary();
+}

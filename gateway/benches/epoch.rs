@@ -1,0 +1,183 @@
+//! How long it takes to receive an epoch's 253 replies, beside the plainest C loop with `recv`:
+//! `cargo bench -p gateway --bench epoch`
+//!
+//! All frames wait in the socket when the clock starts, as they do when a receiver has let them gather. *Frames* is what the
+//! receiver does to have them with their time stamps (`recvmmsg`), *table* is that and all that becomes of them: CRC, accounts,
+//! sums. The C program (`recv.c`) asks for each frame alone, without a time stamp, and looks at one byte of it.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, exit};
+use std::time::{Duration, Instant};
+
+use criterion::{Criterion, Throughput};
+use gateway::generate::{Wanted, generate};
+use gateway::table::Table;
+use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::can::{Format, Frame};
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::id::CellId;
+use protocol::message::{Joints, Message};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use vcan_setup::embedded::Served;
+
+const CELLS: usize = 253;
+/// Who hears it knows that the replies before it have been delivered.
+const AFTER: u32 = 0x7FF;
+
+/// An embedded bus with replies, who sends them, and who takes them.
+struct Wire {
+    _served: Served,
+    cells: Bus,
+    gateway: Bus,
+    bell: Bus,
+    inbox: Inbox,
+}
+
+impl Wire {
+    fn new(directory: PathBuf) -> Self {
+        let served = Served::start_in(&directory, "vcan0").expect("a new directory");
+        let open = |filters| {
+            let directory = Some(directory.clone());
+            let options = Options { filters, directory, receive_buffer: 1 << 20, ..Options::default() };
+            Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).expect("it is served")
+        };
+        let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }]);
+        let bell = open(vec![Filter { id: AFTER, mask: Filter::EXACT_MASK }]);
+        Self { cells: open(Vec::new()), gateway, bell, inbox: Inbox::new(), _served: served }
+    }
+
+    /// Lets these wait in the gateway's socket, all of them.
+    fn put(&mut self, replies: &[Frame]) {
+        self.cells.send(replies).expect("there is room");
+        self.cells.send(&[Frame::classic(AFTER, &[]).expect("an empty frame")]).expect("there is room");
+        // The server sends to its clients in the order in which frames for them came.
+        assert!(self.bell.wait(Some(Duration::from_secs(10))).expect("it is served"), "it is delivered");
+        self.bell.receive(&mut self.inbox).expect("it is served");
+    }
+
+    /// Takes what waits, and gives it to `hear`; how long that took.
+    fn take(&mut self, mut hear: impl FnMut(u64, &Frame)) -> Duration {
+        let (mut taken, began) = (0, Instant::now());
+        while taken < CELLS {
+            let more = self.gateway.receive(&mut self.inbox).expect("it is served");
+            self.inbox.frames().for_each(|received| hear(received.at_nanos, &received.frame));
+            assert!(more > 0, "{taken} frames, and no more");
+            taken += more;
+        }
+        began.elapsed()
+    }
+}
+
+/// An epoch's replies.
+fn replies(epoch: Epoch) -> Vec<Frame> {
+    let reply = |from: CellId| {
+        let torque = [0.1, -0.2, 0.3, 0.05, 0.01, 0.0].map(Q3_12::nearest);
+        Message::Torque { from, epoch, torque }.encode().frames(Format::Fd)
+    };
+    CellId::all().take(CELLS).flat_map(reply).collect()
+}
+
+/// A table that follows epochs, and hears them.
+struct Listener {
+    table: Table,
+    number: u64,
+}
+
+impl Listener {
+    fn new() -> Self {
+        let text = generate(&Wanted { cells: CELLS, ..Wanted::default() }).expect("a UR5 has room");
+        let skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
+        let mut table = Table::new(&skin, 0);
+        table.set_comparing(false);
+        Self { table, number: 0 }
+    }
+
+    /// Opens the next epoch, as the gateway's own joints do that it reads back.
+    fn open(&mut self) -> Epoch {
+        let epoch = Epoch(self.number.to_le_bytes()[0]);
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        for frame in (Message::Joints { epoch, joints }).encode().frames(Format::Fd) {
+            self.table.handle_frame(Micros(self.number * 16_000), true, &frame, &mut |_| None);
+        }
+        self.number += 1;
+        epoch
+    }
+
+    fn hear(&mut self, frame: &Frame) {
+        let at = Micros((self.number - 1) * 16_000 + 1_000);
+        self.table.handle_frame(at, false, frame, &mut |_| None);
+    }
+}
+
+/// Compiles the C program with the compiler that links Rust programs.
+fn compile() -> PathBuf {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/recv.c");
+    let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("recv");
+    let compiler = std::env::var("CC").unwrap_or_else(|_| "cc".to_owned());
+    let mut command = Command::new(&compiler);
+    let done = command.args(["-O2", "-Wall", "-Werror", "-o"]).arg(&program).arg(&source).status();
+    if !done.is_ok_and(|status| status.success()) {
+        eprintln!(
+            "epoch: {compiler} does not compile {}; install gcc, or name another with CC",
+            source.display()
+        );
+        exit(1);
+    }
+    program
+}
+
+/// Lets the C program take so many epochs; how long it says that took.
+fn in_c(program: &Path, epochs: u64) -> Duration {
+    let output = Command::new(program).args([epochs.to_string(), CELLS.to_string()]).output();
+    let output = output.expect("it was compiled");
+    let text = String::from_utf8_lossy(&output.stdout);
+    let words: Vec<u64> = text.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+    let &[nanos, sum] = words.as_slice() else { unreachable!("recv says two numbers: {output:?}") };
+    assert_eq!(sum, epochs * (1..=253).sum::<u64>(), "every frame was taken");
+    Duration::from_nanos(nanos)
+}
+
+fn main() {
+    let program = compile();
+    let place = tempfile::tempdir().expect("a temporary directory");
+    let mut wire = Wire::new(place.path().join("skinbus"));
+    let mut listener = Listener::new();
+    let mut criterion = Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_millis(300))
+        .measurement_time(Duration::from_secs(2))
+        .configure_from_args();
+
+    let mut group = criterion.benchmark_group("epoch of 253 frames");
+    group.throughput(Throughput::Elements(CELLS as u64));
+    let frames = replies(Epoch(0));
+    group.bench_function("frames", |bencher| {
+        bencher.iter_custom(|epochs| {
+            let mut sum = 0;
+            let took = (0..epochs).map(|_| {
+                wire.put(&frames);
+                wire.take(|at_nanos, frame| sum += u64::from(frame.len()) + (at_nanos & 1))
+            });
+            let took = took.sum();
+            assert!(sum >= epochs * 253 * 16, "every frame was taken");
+            took
+        });
+    });
+    group.bench_function("table", |bencher| {
+        bencher.iter_custom(|epochs| {
+            let mut took = Duration::ZERO;
+            for _ in 0..epochs {
+                let epoch = listener.open();
+                wire.put(&replies(epoch));
+                took += wire.take(|_, frame| listener.hear(frame));
+                assert_eq!(listener.table.snapshot().sums.contributing, 253, "every reply counts");
+            }
+            took
+        });
+    });
+    group.bench_function("recv in C", |bencher| bencher.iter_custom(|epochs| in_c(&program, epochs)));
+    group.finish();
+    criterion.final_summary();
+}

@@ -1,0 +1,180 @@
+//! How long one tick of the control loop takes: `cargo bench -p gateway --bench tick`
+//!
+//! From 1 to 10 000 cells, 253 on a bus, over whole epochs (one tick in eight sends joints to every bus, which take no
+//! time here). *Distributed* leaves the torques to the cells, *central* computes them in the tick, of cells none of which
+//! is in contact, or all. What fills the snapshots is the receivers' work, and not counted.
+
+use std::hint::black_box;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use criterion::{BenchmarkId, Criterion};
+use gateway::controller::Kinesthetic;
+use gateway::cycle::{Cycle, Tick};
+use gateway::generate::{Wanted, generate};
+use gateway::robot::SimulatedArm;
+use gateway::run::realtime;
+use gateway::run::turn::{Line, Shared, Timed, Turn};
+use gateway::scenario::{Mode, ModeChange, Scenario};
+use gateway::table::{Snapshot, Sums};
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::message::SkinSensors;
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::{Bus, Skin};
+use protocol::time::{Micros, Span};
+
+/// Cells on a bus, at most.
+const ON_A_BUS: usize = 253;
+/// Ticks from one broadcast to the next.
+const EPOCH: u64 = 8;
+
+/// What the loop does, and what cells feel.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Case {
+    Distributed,
+    CentralNoneActive,
+    CentralAllActive,
+}
+
+impl Case {
+    const ALL: [Self; 3] = [Self::Distributed, Self::CentralNoneActive, Self::CentralAllActive];
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Distributed => "distributed",
+            Self::CentralNoneActive => "central, none active",
+            Self::CentralAllActive => "central, all active",
+        }
+    }
+
+    fn felt(self) -> SkinSensors {
+        match self {
+            Self::CentralNoneActive => SkinSensors::default(),
+            Self::Distributed | Self::CentralAllActive => SkinSensors {
+                contact: [Q5_10::nearest(0.5); 3],
+                proximity: Q1_14::nearest(0.9),
+                ..SkinSensors::default()
+            },
+        }
+    }
+}
+
+/// A UR5 with so many cells; from the second bus on it wears the first one's again.
+fn skin(cells: usize) -> Skin {
+    let text = generate(&Wanted { cells: cells.min(ON_A_BUS), ..Wanted::default() }).expect("a UR5 has room");
+    let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
+    let first = skin.clone();
+    for bus in 1..cells.div_ceil(ON_A_BUS) {
+        let more = first.buses.iter().map(|first| Bus { name: format!("vcan{bus}"), ..first.clone() });
+        skin.buses.extend(more);
+        let room = cells - skin.cells.len();
+        skin.cells.extend(first.cells.iter().take(room).cloned().map(|mut cell| {
+            cell.bus = bus;
+            cell
+        }));
+    }
+    assert_eq!(skin.cells.len(), cells);
+    skin
+}
+
+/// What a bus' receiver holds.
+struct Receiver {
+    snapshots: triple_buffer::Input<Snapshot>,
+    positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+}
+
+/// A loop, and the ends of it that threads hold in a run.
+struct Bench {
+    turn: Turn,
+    buses: Vec<Receiver>,
+    records: rtrb::Consumer<Timed>,
+    tick: u64,
+}
+
+impl Bench {
+    fn new(skin: &Skin, case: Case) -> Self {
+        let (mut lines, mut buses) = (Vec::new(), Vec::new());
+        for (index, bus) in skin.buses.iter().enumerate() {
+            let felt = skin.cells_of(index).map(|_| case.felt()).collect::<Vec<_>>();
+            let snapshot = Snapshot { sums: Sums::default(), felt };
+            let (snapshots, snapshot) = triple_buffer::triple_buffer(&snapshot);
+            let (producer, positions) = rtrb::RingBuffer::new(64);
+            lines.push(Line {
+                format: bus.format,
+                snapshot,
+                positions: producer,
+                works: Arc::new(AtomicBool::new(true)),
+                commands: Arc::default(),
+                returned: Arc::default(),
+            });
+            buses.push(Receiver { snapshots, positions });
+        }
+        let mode = if case == Case::Distributed { Mode::Distributed } else { Mode::Compare };
+        let modes = vec![ModeChange { at: Micros(0), mode }];
+        let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
+        let controller = Box::new(Kinesthetic::new(skin).expect("a generated skin has one"));
+        let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, [0.1; WORDS])));
+        let (producer, records) = rtrb::RingBuffer::new(64);
+        let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), producer);
+        Self { turn, buses, records, tick: 0 }
+    }
+
+    /// Eight ticks, of which the first sends joints; how long they took, and cells that they found active.
+    fn epoch(&mut self) -> (Duration, u32) {
+        let last = (self.tick / EPOCH).checked_sub(1).map(|epoch| Epoch(epoch.to_le_bytes()[0]));
+        for Receiver { snapshots, .. } in &mut self.buses {
+            let next = snapshots.input_buffer_mut();
+            next.sums.read_back = last;
+            next.sums.contributing = u32::try_from(next.felt.len()).unwrap_or(u32::MAX);
+            next.sums.torque = [0.01, -0.02, 0.03, 0.01, -0.01, 0.0];
+            snapshots.publish();
+        }
+        let mut sent = 0;
+        let began = Instant::now();
+        for number in self.tick..self.tick + EPOCH {
+            let tick = Tick { number, time: Micros(number * 2_000) };
+            self.turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
+                sent += black_box(frames).len();
+                true
+            });
+        }
+        let took = began.elapsed();
+        self.tick += EPOCH;
+        assert_eq!(sent, self.buses.len(), "one broadcast on every bus");
+        self.buses.iter_mut().for_each(|bus| assert!(bus.positions.pop().is_ok(), "its positions"));
+        let mut active = 0;
+        while let Ok(record) = self.records.pop() {
+            assert_eq!((record.record.bad, record.record.halted), (None, None));
+            active = record.central.map_or(0, |(_, felt)| felt.active);
+        }
+        (took, active)
+    }
+}
+
+fn main() {
+    let mut criterion = Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_millis(200))
+        .measurement_time(Duration::from_millis(800))
+        .configure_from_args();
+    for cells in [1, 253, 1_000, 2_160, 10_000_u32] {
+        let skin = skin(usize::try_from(cells).expect("a few"));
+        let mut group = criterion.benchmark_group("tick");
+        for case in Case::ALL {
+            group.bench_function(BenchmarkId::new(case.name(), cells), |bencher| {
+                let mut bench = Bench::new(&skin, case);
+                let (_, active) = bench.epoch();
+                assert_eq!(active, if case == Case::CentralAllActive { cells } else { 0 });
+                bencher.iter_custom(|ticks| {
+                    let epochs = ticks.div_ceil(EPOCH);
+                    let took: Duration = (0..epochs).map(|_| bench.epoch().0).sum();
+                    #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+                    took.mul_f64(ticks as f64 / (epochs * EPOCH) as f64)
+                });
+            });
+        }
+        group.finish();
+    }
+    criterion.final_summary();
+}
