@@ -107,7 +107,8 @@ impl Load {
 pub struct Times {
     /// From the broadcast's turn to its end, in ns.
     pub joints_ns: Option<u64>,
-    /// From the broadcast's turn to the end of the last answer by [`Case::chain_ns`].
+    /// From the broadcast's turn to the end of the last answer in ns, one after the other: blocking, joints,
+    /// computation, blocking, and all answers.
     pub chain_ns: Option<u64>,
     /// The same by response-time analysis, for torques.
     pub response_ns: Option<Response>,
