@@ -166,5 +166,6 @@ mod tests {
             assert!(rates.load(most) <= 1.0 && rates.load(most + 1) > 1.0, "{}", rates.name);
         }
         assert!((all[3].replies(CELLS) - 1.1176).abs() < 1e-3);
+        assert!((all[3].load(CELLS) - 1.1176 - 0.0712).abs() < 1e-3, "four heartbeats of each cell a second");
     }
 }
