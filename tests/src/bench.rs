@@ -8,10 +8,14 @@
 //!
 //! A receiver's frames come in the wire's order, however long each takes, unless a fault delays or
 //! reorders them. Frames that nobody's filters let through are not delivered.
+//!
+//! The wire takes no time unless [`Bench::on_a_bus`] gives it bit rates: then a frame waits for its place by arbitration, takes
+//! the time of its bits, and is everywhere at its end.
 
 use std::collections::HashMap;
 
 use cell_node::node::{Flash, Identity};
+use gateway::bus_model::Attempt;
 use gateway::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;
@@ -19,12 +23,14 @@ use protocol::message::{From, Message, SkinSensors};
 use protocol::packet::Packet;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
+use protocol::wire_time::BitRates;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
 use crate::fault::{Fault, Faults, Party};
 use crate::gateway::Gateway;
+use crate::real_bus::{Asked, RealBus};
 use crate::seat::Seat;
 use crate::witness::{Truth, Witness};
 
@@ -77,6 +83,8 @@ enum Event {
     Wake(usize),
     Tick,
     Look,
+    /// The real bus has got on.
+    Bus,
     Act(Box<Act>),
 }
 
@@ -126,6 +134,7 @@ pub struct Bench {
     gateway_inlet: Inlet,
     dice: Pcg64Mcg,
     ticking: bool,
+    real: Option<RealBus<Sent>>,
 }
 
 impl Bench {
@@ -160,6 +169,7 @@ impl Bench {
             gateway_inlet: Inlet::default(),
             dice: Pcg64Mcg::seed_from_u64(seed ^ 0x5EED),
             ticking: false,
+            real: None,
         };
         for (place, cell) in skin.cells.iter().enumerate() {
             let identity = Identity { cell: Some(cell.node), serial: cell.serial };
@@ -168,6 +178,25 @@ impl Bench {
         }
         bench.agenda.enter(Micros(0), Event::Look);
         bench
+    }
+
+    /// The same on a real bus with these bit rates, from now on.
+    #[must_use]
+    pub fn on_a_bus(mut self, rates: BitRates) -> Self {
+        self.real = Some(RealBus::new(rates));
+        self
+    }
+
+    /// What was asked of the real bus, in order of time.
+    #[must_use]
+    pub fn asked(&self) -> &[Asked] {
+        self.real.as_ref().map_or(&[], |real| &real.asked)
+    }
+
+    /// What has been on the real bus, in order of time; a tag is a place in [`Bench::asked`].
+    #[must_use]
+    pub fn attempts(&self) -> &[Attempt] {
+        self.real.as_ref().map_or(&[], |real| &real.attempts)
     }
 
     /// One more cell, switched off; returns its seat.
@@ -307,7 +336,27 @@ impl Bench {
                 self.say(&messages);
                 self.agenda.enter_in(LOOK, Event::Look);
             }
+            Event::Bus => {
+                let now = self.agenda.now;
+                self.real.iter_mut().for_each(|real| real.look = None);
+                let ended = self.real.as_mut().map(|real| real.ended(now)).unwrap_or_default();
+                for (stood, sent) in ended {
+                    self.reach(stood, &sent);
+                }
+                self.look_at_the_bus();
+            }
             Event::Act(act) => self.perform(*act),
+        }
+    }
+
+    /// Enters when the real bus is looked at next.
+    fn look_at_the_bus(&mut self) {
+        let Some(real) = &mut self.real else { return };
+        if let Some(next) = real.next()
+            && real.look.is_none_or(|look| next < look)
+        {
+            real.look = Some(next);
+            self.agenda.enter(next, Event::Bus);
         }
     }
 
@@ -396,10 +445,20 @@ impl Bench {
         }
     }
 
-    /// A frame has its place in the order, and goes to whoever hears it.
+    /// A frame has its place in the order, or waits for it.
     fn stand(&mut self, sent: &Sent) {
+        if let Some(real) = &mut self.real {
+            real.ask(self.agenda.now, &sent.frame, *sent);
+            self.look_at_the_bus();
+            return;
+        }
         let stood = self.agenda.now.max(self.free);
         self.free = stood + FRAME;
+        self.reach(stood, sent);
+    }
+
+    /// A frame stood on the wire, and goes to whoever hears it.
+    fn reach(&mut self, stood: Micros, sent: &Sent) {
         let from = sent.truth.from;
         self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
         self.pass(Party::Gateway, stood, sent);
@@ -414,7 +473,11 @@ impl Bench {
     /// From the wire to one receiver.
     fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
         let fate = self.faults.fate(self.agenda.now, sent.truth.from, Some(to), sent.frame);
-        let latency = Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        // A real bus is everywhere at once.
+        let latency = match self.real {
+            Some(_) => Span(0),
+            None => Span(self.dice.random_range(LATENCY.0..=LATENCY.1)),
+        };
         let mut at = stood + latency;
         if let Some(inlet) = self.inlet(to) {
             at = at.max(inlet.newest);

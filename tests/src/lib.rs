@@ -19,6 +19,7 @@ pub mod bench;
 pub mod fault;
 pub mod gateway;
 pub mod network;
+pub mod real_bus;
 pub mod seat;
 pub mod skins;
 pub mod witness;

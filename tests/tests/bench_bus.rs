@@ -1,0 +1,145 @@
+//! Whole skins at the exact timing of a real bus, in virtual time: which fit, which do not, and that the shadow says the same.
+
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
+
+use gateway::shadow::{BusShadow, Options, Shaded, Shadow};
+use gateway::table::Replies;
+use protocol::can::Format;
+use protocol::id::{Command, Id};
+use protocol::message::From;
+use protocol::wire_time::BitRates;
+use skinbus_tests::bench::Bench;
+use skinbus_tests::gateway::epoch_of;
+use skinbus_tests::skins;
+
+/// Epochs that are looked at, after all cells have been pressed.
+const EPOCHS: u64 = 40;
+
+fn rates(text: &str) -> BitRates {
+    text.parse().unwrap()
+}
+
+/// A skin of which every cell is pressed, on a real bus.
+fn pressed(cells: u8, format: Format, rates: BitRates, seed: u64) -> Bench {
+    let mut bench = Bench::new(&skins::arm(cells, format), seed).on_a_bus(rates).started();
+    // From the same joints on: stimuli come last on a bus, and on a full one the last of them never.
+    let from = From::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
+    for place in 0..usize::from(cells) {
+        bench.press_from(place, 1.0 + 0.005 * place as f64, from);
+    }
+    bench.run_epochs(8);
+    bench
+}
+
+fn replies(bench: &Bench) -> Replies {
+    Replies::total(bench.gateway.table.cells().iter().map(|cell| cell.replies))
+}
+
+/// What came of the answers to some epochs: due, in time, late.
+fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
+    let before = replies(bench);
+    bench.run_epochs(epochs);
+    let after = replies(bench);
+    (after.due - before.due, after.in_time - before.in_time, after.late - before.late)
+}
+
+/// The traffic of a bench as a capture would have it, through the shadow.
+fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
+    let options = Options { rates, of_bus: Vec::new(), bit_errors: 0.0, seed: 0, each_frame: true };
+    let mut shadow = Shadow::new(options).unwrap();
+    bench.asked().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
+    shadow.finish();
+    let frames = std::iter::from_fn(|| shadow.poll()).collect();
+    (frames, shadow.report().buses.remove(0))
+}
+
+/// The share of the time in which the bus was taken, from some time on.
+fn taken_since(bench: &Bench, nanos: u64) -> f64 {
+    let attempts = bench.attempts().iter().filter(|attempt| attempt.start >= nanos);
+    let taken: u64 = attempts.map(|attempt| attempt.end - attempt.start).sum();
+    taken as f64 / (bench.now().0 * 1_000 - nanos) as f64
+}
+
+/// Every frame went out when the shadow says that it would have gone out.
+fn assert_shaded_alike(bench: &Bench, frames: &[Shaded]) {
+    assert!(bench.attempts().len() > 1_000);
+    for attempt in bench.attempts() {
+        let frame = &frames[usize::try_from(attempt.tag).unwrap()];
+        assert_eq!(frame.sent, Some((attempt.start, attempt.end)), "{frame:?}");
+    }
+}
+
+/// Every cell answers every epoch in time; returns the share of the bus that is taken.
+fn fits(cells: u8, rates: BitRates) -> f64 {
+    let mut bench = pressed(cells, Format::Fd, rates, 1);
+    let since = bench.now().0 * 1_000;
+    let (due, in_time, late) = over_epochs(&mut bench, EPOCHS);
+    assert_eq!((due, in_time, late), (EPOCHS * u64::from(cells), due, 0), "{cells} at {rates}");
+    let taken = taken_since(&bench, since);
+    let (frames, bus) = shadow(&bench, rates);
+    assert_shaded_alike(&bench, &frames);
+    let replies = bus.replies.unwrap();
+    assert_eq!((replies.late, replies.late_before), (0, 0), "{bus:?}");
+    assert!(replies.after_joints_us.max < 16_000.0 && replies.count > EPOCHS * u64::from(cells), "{bus:?}");
+    taken
+}
+
+#[test]
+fn the_whole_skin_fits_one_bus_at_1m_8m() {
+    let taken = fits(253, rates("1M/8M"));
+    assert!((0.85..0.97).contains(&taken), "{taken}");
+}
+
+#[test]
+fn the_whole_skin_fits_three_buses_at_1m_5m() {
+    for cells in [85, 84, 84] {
+        let taken = fits(cells, rates("1M/5M"));
+        assert!((0.30..0.45).contains(&taken), "{cells}: {taken}");
+    }
+}
+
+#[test]
+fn the_whole_skin_is_too_much_for_one_bus_at_1m_5m_and_the_shadow_says_so() {
+    let rates = rates("1M/5M");
+    let mut bench = pressed(253, Format::Fd, rates, 1);
+    let since = bench.now().0 * 1_000;
+    // More than a second.
+    let (due, in_time, late) = over_epochs(&mut bench, 2 * EPOCHS);
+    assert!(due > 0 && in_time < due, "{in_time} of {due}, {late} late");
+    let taken = taken_since(&bench, since);
+    assert!(taken > 0.999, "{taken}");
+    let (frames, bus) = shadow(&bench, rates);
+    assert_shaded_alike(&bench, &frames);
+    assert!((1.05..1.2).contains(&bus.load.worst_1_s.value), "{:?}", bus.load);
+    let replies = bus.replies.unwrap();
+    assert!(replies.late > 1_000, "{replies:?}");
+    // Joints win every arbitration: they wait for one frame at most, and so the robot's side notices nothing.
+    let joints = Id::command(Command::Joints).to_bits();
+    let longest = frames.iter().filter_map(|frame| Some((frame, frame.sent?)));
+    let longest = longest.map(|(_, (start, end))| end - start).max().unwrap();
+    for frame in frames.iter().filter(|frame| frame.id == u32::from(joints)) {
+        let (start, end) = frame.sent.unwrap();
+        assert!(start - frame.nanos <= longest && end > start, "{frame:?}");
+    }
+}
+
+#[test]
+fn a_classic_bus_carries_fifty_cells_and_not_seventy() {
+    let rates = rates("1M");
+    let mut few = pressed(50, Format::Classic, rates, 1);
+    let (due, in_time, _) = over_epochs(&mut few, EPOCHS);
+    assert_eq!((due, in_time), (50 * EPOCHS, due));
+    let mut many = pressed(70, Format::Classic, rates, 1);
+    let (due, in_time, late) = over_epochs(&mut many, EPOCHS);
+    assert!(in_time < due, "{in_time} of {due}, {late} late");
+}
+
+#[test]
+fn a_bench_on_a_real_bus_is_the_same_every_time() {
+    let run = |seed| {
+        let mut bench = pressed(60, Format::Fd, rates("500k/2M"), seed);
+        bench.run_epochs(10);
+        (bench.attempts().to_vec(), bench.transcript())
+    };
+    assert_eq!(run(3), run(3));
+}
