@@ -3,7 +3,7 @@
 //! For FD they are worked out: bits that are the same in all such frames are walked through, free ones both ways, and of all ways
 //! to one of the eight states of stuffing only the one with the fewest and the one with the most stuff bits matter. What follows the
 //! data stuffs by a rule of its own. In classic CAN the CRC is stuffed too, and the data decides it, so there is a table, which the
-//! test `every_frame` makes anew from all frames there are. It is a bit or two below what is mostly given, where the CRC is free.
+//! test `every_frame` makes anew from all frames there are. It is one to four bits below the usual formula, which takes the CRC for free.
 
 use super::{Bits, CLASSIC_TAIL, fd_dlc, parts, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_len};
