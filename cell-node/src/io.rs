@@ -4,10 +4,11 @@ mod clock;
 mod ears;
 mod flash_file;
 mod line;
+mod sockets;
 
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received};
+use protocol::bus::{BusError, Options, Received};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Kind};
 use protocol::packet;
@@ -17,10 +18,14 @@ use protocol::wire::{Lane, PORTS};
 use crate::node::{Flash, Identity, Node};
 use clock::Clock;
 use ears::Ears;
+use sockets::Hearing;
 
 pub use flash_file::FlashFile;
 pub use line::Line;
+pub use sockets::Sockets;
 
+/// From one attempt to open a bus that is away to the next.
+const AGAIN: Duration = Duration::from_millis(100);
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
@@ -38,7 +43,7 @@ pub struct Cells {
     hears_changed: bool,
     /// What waits in the socket has been heard since a timer was due.
     heard_first: bool,
-    filters: Vec<Filter>,
+    hearing: Hearing,
     outbox: Vec<Frame>,
 }
 
@@ -91,7 +96,7 @@ impl Cells {
             ears: Ears::default(),
             hears_changed: false,
             heard_first: false,
-            filters: Vec::new(),
+            hearing: Hearing::default(),
             outbox: Vec::new(),
         }
     }
@@ -115,43 +120,61 @@ impl Cells {
         self.hears_changed = true;
     }
 
-    /// How their bus has to be opened, as things stand.
+    /// Opens their bus.
     ///
     /// Cells that are wired to each other hear each other's sums and wires. When they share a socket it has to
     /// give them their own frames back.
-    pub fn options(&mut self) -> Options {
+    ///
+    /// # Errors
+    /// When it cannot be used as it is asked for.
+    pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         self.listen();
         let wired = self.cells.iter().any(|seat| seat.lanes.iter().any(Option::is_some));
-        Options {
-            filters: self.filters.clone(),
+        let options = Options {
+            filters: self.hearing.at_once.clone(),
             fd: self.format == Format::Fd,
             own_frames: wired && self.cells.len() > 1,
             ..Options::default()
+        };
+        Sockets::open(line, &options, wired.then_some(&self.hearing.aside))
+    }
+
+    /// Opens it as soon as it is there.
+    ///
+    /// # Errors
+    /// When it cannot be used as it is asked for, and waiting would not help.
+    pub fn open_again(&mut self, line: &Line) -> Result<Sockets, Stopped> {
+        loop {
+            std::thread::sleep(AGAIN);
+            match self.open(line) {
+                Err(Stopped::Bus(error)) if error.may_open_later() => {}
+                opened => return opened,
+            }
         }
     }
 
-    /// Asks the cells what they hear, if that has changed; whether the bus has to be told.
-    fn listen(&mut self) -> bool {
+    /// Asks the cells what they hear, if that may have changed; what they heard until now, if it has.
+    fn listen(&mut self) -> Option<Hearing> {
         if !core::mem::take(&mut self.hears_changed) {
-            return false;
+            return None;
         }
         let cells = self.cells.iter().enumerate();
-        self.ears.listen(cells.flat_map(|(place, seat)| seat.node.hears().map(move |id| (place, id))));
-        let filters = self.ears.filters();
-        let changed = filters != self.filters;
-        self.filters = filters;
-        changed
+        self.ears.listen(cells.flat_map(|(place, seat)| {
+            let aside = seat.node.hears_aside();
+            seat.node.hears().map(move |id| (place, id, aside == Some(id)))
+        }));
+        let hearing = self.ears.hearing();
+        (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))
     }
 
     /// Runs the cells until the bus is gone or a number turns out to be taken.
     ///
     /// # Errors
     /// Always: it only ends by stopping.
-    pub fn run(&mut self, mut bus: Bus, line: &Line) -> Result<core::convert::Infallible, Stopped> {
-        let mut inbox = Inbox::new();
+    pub fn run(&mut self, mut sockets: Sockets, line: &Line) -> Result<core::convert::Infallible, Stopped> {
         let mut now = self.clock.now();
         loop {
-            match self.turn(&bus, &mut inbox, now) {
+            match self.turn(&mut sockets, now) {
                 Ok(()) => {}
                 // What was to be sent is lost, as on a microcontroller without a bus.
                 Err(Stopped::Bus(error)) if error.may_pass() => {
@@ -160,24 +183,22 @@ impl Cells {
                 }
                 Err(Stopped::Bus(error)) if line.is_gone(&error) => {
                     self.outbox.clear();
-                    bus = line.open_again(&self.options())?;
+                    sockets = self.open_again(line)?;
                 }
                 Err(error) => return Err(error),
             }
             now = self.clock.now();
-            for received in inbox.frames() {
-                self.take(&received, &bus, now)?;
+            for received in sockets.frames() {
+                self.take(received, sockets.name(), now)?;
             }
         }
     }
 
     /// Lets time pass, sends, and waits for frames.
-    fn turn(&mut self, bus: &Bus, inbox: &mut Inbox, now: Micros) -> Result<(), Stopped> {
-        inbox.clear();
+    fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
         let due = self.cells.iter().any(|seat| seat.node.poll_timeout() <= now);
         // What came before a timer was due is heard first, once.
-        if due && !core::mem::replace(&mut self.heard_first, true) && bus.wait(Some(Duration::ZERO))? {
-            bus.receive(inbox)?;
+        if due && !core::mem::replace(&mut self.heard_first, true) && sockets.look()? {
             return Ok(());
         }
         self.heard_first = false;
@@ -191,30 +212,25 @@ impl Cells {
         }
         self.clock.keep(now);
         // Before what is said now is answered.
-        if self.listen()
-            && let Err(error) = bus.set_filters(&self.filters)
+        if let Some(before) = self.listen()
+            && let Err(error) = sockets.set_filters(&self.hearing, &before)
         {
-            self.filters.clear();
+            self.hearing = before;
             self.hears_changed = true;
             return Err(error.into());
         }
-        self.flush(bus)?;
-        let wait = Duration::from_micros(next.since(now).0);
-        if wait >= Bus::PATIENCE {
-            bus.receive_one_patiently(inbox)?;
-        } else if bus.wait(Some(wait))? {
-            bus.receive(inbox)?;
-        }
-        Ok(())
+        self.flush(sockets)?;
+        Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
     }
 
     /// Gives a frame to the cells that hear it, and takes at once what they say to it.
-    fn take(&mut self, received: &Received, bus: &Bus, now: Micros) -> Result<(), Stopped> {
+    fn take(&mut self, received: &Received, bus: &str, now: Micros) -> Result<(), Stopped> {
         let frame = &received.frame;
         if let Some(lane) = Lane::from_raw_id(frame.raw_id()) {
             let Some((place, port)) = self.ears.of_lane(lane) else { return Ok(()) };
+            let age = self.clock.age(now, received.at_nanos);
             if let (Some(seat), Some(message)) = (self.cells.get_mut(place), lane.read(frame)) {
-                seat.node.handle_port(now, port, message);
+                seat.node.handle_port(now, age, port, message);
                 self.hears_changed |= seat.collect(self.format, &mut self.outbox);
             }
             return Ok(());
@@ -234,7 +250,7 @@ impl Cells {
             let Some(seat) = self.cells.get_mut(place) else { continue };
             seat.node.handle_frame(now, age, frame);
             if let Some(serial) = seat.node.taken() {
-                let (bus, cell) = (bus.name().to_owned(), seat.node.identity().cell.map_or(0, CellId::get));
+                let (bus, cell) = (bus.to_owned(), seat.node.identity().cell.map_or(0, CellId::get));
                 return Err(Stopped::Taken { bus, cell, serial });
             }
             self.hears_changed |= seat.collect(self.format, &mut self.outbox);
@@ -243,9 +259,9 @@ impl Cells {
     }
 
     /// Sends what is to be sent.
-    fn flush(&mut self, bus: &Bus) -> Result<(), Stopped> {
+    fn flush(&mut self, sockets: &Sockets) -> Result<(), Stopped> {
         if !self.outbox.is_empty() {
-            bus.send(&self.outbox).map_err(|error| error.cause)?;
+            sockets.send(&self.outbox)?;
             self.outbox.clear();
         }
         Ok(())

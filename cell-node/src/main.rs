@@ -6,10 +6,10 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use cell_node::flash::Kept;
-use cell_node::io::{Cells, FlashFile, Lanes, Line, Stopped};
+use cell_node::io::{Cells, FlashFile, Lanes, Line, Sockets, Stopped};
 use cell_node::node::{Flash, Identity};
 use clap::Parser;
-use protocol::bus::{Bus, Choice};
+use protocol::bus::Choice;
 use protocol::id::CellId;
 use protocol::skin::{Reply, Skin};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
@@ -81,9 +81,11 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
+    // Hundreds of cells are woken at once; each waits for its turn.
+    protocol::bus::never_interrupt();
     match prepare(&arguments) {
-        Ok((mut cells, bus, line)) => {
-            let Err(stopped) = cells.run(bus, &line);
+        Ok((mut cells, sockets, line)) => {
+            let Err(stopped) = cells.run(sockets, &line);
             // Whoever started hundreds of cells says once that their bus is gone.
             if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
                 say(stopped);
@@ -97,7 +99,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn prepare(arguments: &Arguments) -> Result<(Cells, Bus, Line)> {
+fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     if let Some(parent) = arguments.with_parent {
         // Not TERM, which a stopped process would not take before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
@@ -156,16 +158,15 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Bus, Line)> {
         wires: wires.is_some(),
         reconnect: arguments.reconnect,
     };
-    let options = cells.options();
-    let bus = match line.open(&options) {
+    let sockets = match cells.open(&line) {
         Err(Stopped::Bus(error)) if line.reconnect && error.may_open_later() => {
             // Whoever started hundreds of cells knows it.
             if arguments.with_parent.is_none() {
                 say(format_args!("{error}; waiting for it"));
             }
-            line.open_again(&options)?
+            cells.open_again(&line)?
         }
         opened => opened?,
     };
-    Ok((cells, bus, line))
+    Ok((cells, sockets, line))
 }

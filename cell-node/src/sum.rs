@@ -90,6 +90,8 @@ pub struct Sum {
     ports: u8,
     /// Whether the present epoch's sum may be sent.
     speaks: bool,
+    /// It waits for a sign of the parent.
+    held: bool,
     /// When it is to be sent.
     due: Option<Micros>,
     /// The last one that was sent, and its epoch.
@@ -155,6 +157,7 @@ impl Sum {
         self.began = begin.at;
         self.depth = begin.depth.unwrap_or(slots.deepest);
         self.speaks = begin.speaks && begin.depth.is_some();
+        self.held = false;
         self.own = match own {
             Some(exact) => Some(self.round(exact, slots.carry)),
             None => {
@@ -273,16 +276,32 @@ impl Sum {
         self.due = None;
     }
 
+    /// What is to be said waits until it is released.
+    pub const fn hold(&mut self) {
+        self.held = true;
+    }
+
+    /// What waited may be said.
+    pub const fn release(&mut self) {
+        self.held = false;
+    }
+
+    /// Whether what is to be said waits.
+    #[must_use]
+    pub const fn is_held(&self) -> bool {
+        self.held
+    }
+
     /// When there is something to do.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Micros> {
-        self.due.into_iter().chain(self.check).min()
+        self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
     }
 
     /// The sum to be sent, when its time has come: cumulative, all that is known of this epoch. With it, whether the
     /// parent has to be told that it is for it.
     pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
-        let epoch = self.epoch?;
+        let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
         if !self.speaks {
             return None;
@@ -352,7 +371,17 @@ impl Sum {
         self.epoch = None;
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
+        self.held = false;
         self.judged = true;
+    }
+
+    /// Something was heard so long after it stood on the bus: when that is more than half a period, the machine itself
+    /// is late, nobody is to blame, and it is not looked who is missing in this epoch.
+    pub const fn heard_after(&mut self, age: Span) {
+        if age.0 * 2 > self.period.0 && self.period.0 > 0 {
+            self.judged = true;
+            self.check = None;
+        }
     }
 
     /// Whether it has been looked who is missing in this epoch.

@@ -22,6 +22,7 @@
 //! | 9 | seek | round | I have no way up: a new round, later than this one, please |
 //! | 10 | number | walk, first, last | number yourself and those below you from these |
 //! | 11 | return | walk, first, last | done; these are left (none when first > last) |
+//! | 12 | ask | | are you there? say hello |
 
 use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
@@ -119,6 +120,8 @@ pub enum PortMessage {
     Number(Walk),
     /// Everybody here has a number.
     Return(Walk),
+    /// Are you there?
+    Ask,
 }
 
 /// Numbers to give away, in a walk over the tree.
@@ -159,6 +162,7 @@ impl PortMessage {
             Self::Seek(round) => [9, round, 0, 0, 0, 0],
             Self::Number(walk) => [10, walk.walk, walk.first, walk.last, 0, 0],
             Self::Return(walk) => [11, walk.walk, walk.first, walk.last, 0, 0],
+            Self::Ask => [12, 0, 0, 0, 0, 0],
         }
     }
 
@@ -185,6 +189,7 @@ impl PortMessage {
             9 => Self::Seek(a),
             10 => Self::Number(walk),
             11 => Self::Return(walk),
+            12 => Self::Ask,
             _ => return None,
         })
     }

@@ -202,6 +202,7 @@ impl<'a> Meaning<'a> {
             "refuse" => PortMessage::Refuse,
             "leave" => PortMessage::Leave,
             "left" => PortMessage::Left,
+            "ask" => PortMessage::Ask,
             "state" => PortMessage::State(self.epoch()),
             "missed" => PortMessage::Missed(self.epoch()),
             "seek" => PortMessage::Seek(self.number("round")),
@@ -659,7 +660,7 @@ fn wires_bytes_and_meaning_agree_both_ways() {
             }
         }
     }
-    assert!(kinds.into_iter().eq(1..=11), "every kind is there");
+    assert!(kinds.into_iter().eq(1..=12), "every kind is there");
     assert_eq!(odd, 4, "frames that nobody should write so");
     let hello = lines(WIRE).into_iter().find(|golden| golden.comment.contains("number=7")).unwrap();
     assert!(PROTOCOL_MD.contains(hello.text), "the document's hello is {}", hello.text);

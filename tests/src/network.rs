@@ -336,7 +336,7 @@ impl Wiring {
             match inlet {
                 Inlet::Frame(frame) => node.handle_frame(now, now.since(stood), &frame),
                 Inlet::Port(port, _) if place.deaf[port] => {}
-                Inlet::Port(port, message) => node.handle_port(now, port, message),
+                Inlet::Port(port, message) => node.handle_port(now, Span(0), port, message),
             }
         }
         self.after(cell);

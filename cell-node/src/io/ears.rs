@@ -7,14 +7,24 @@ use protocol::can::{EXTENDED, REMOTE};
 use protocol::id::Id;
 use protocol::wire::{FLAG, Lane};
 
+use super::sockets::Hearing;
+
 /// The frames of all simulated wires of a bus.
 const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
 
 /// By identifier and by lane, who hears it: cells by their place in the process.
 #[derive(Debug, Default)]
 pub(super) struct Ears {
-    by_id: HashMap<Id, Vec<usize>>,
+    by_id: HashMap<Id, Heard>,
     by_lane: HashMap<Lane, (usize, usize)>,
+}
+
+/// Who hears an identifier.
+#[derive(Debug, Default)]
+struct Heard {
+    by: Vec<usize>,
+    /// Somebody has to be woken for it.
+    wakes: bool,
 }
 
 impl Ears {
@@ -23,17 +33,20 @@ impl Ears {
         self.by_lane.insert(lane, (cell, port));
     }
 
-    /// Forgets who hears which identifiers, and takes these in place of it.
-    pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id)>) {
+    /// Forgets who hears which identifiers, and takes these in place of it: cell, identifier, and whether it is
+    /// enough to hear it aside.
+    pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
-        for (cell, id) in hears {
-            self.by_id.entry(id).or_default().push(cell);
+        for (cell, id, aside) in hears {
+            let heard = self.by_id.entry(id).or_default();
+            heard.by.push(cell);
+            heard.wakes |= !aside;
         }
     }
 
     /// The cells that hear an identifier.
     pub(super) fn of_id(&self, id: Id) -> &[usize] {
-        self.by_id.get(&id).map_or(&[], Vec::as_slice)
+        self.by_id.get(&id).map_or(&[], |heard| &heard.by)
     }
 
     /// The cell, and its port, that hears a lane.
@@ -43,15 +56,21 @@ impl Ears {
 
     /// One exact filter for each identifier and each lane; for more than a socket takes, one for each kind that is
     /// heard, and one for all wires.
-    pub(super) fn filters(&self) -> Vec<Filter> {
-        let ids: BTreeSet<_> = self.by_id.keys().copied().collect();
+    pub(super) fn hearing(&self) -> Hearing {
         let lanes: BTreeSet<_> = self.by_lane.keys().copied().collect();
-        if ids.len() + lanes.len() <= Filter::MAX {
-            return ids.into_iter().map(Filter::exact).chain(lanes.into_iter().map(Filter::lane)).collect();
+        let ids = |wakes| -> BTreeSet<_> {
+            self.by_id.iter().filter(|(_, heard)| heard.wakes == wakes).map(|(id, _)| *id).collect()
+        };
+        if self.by_id.len() + lanes.len() <= Filter::MAX {
+            let at_once = ids(true).into_iter().map(Filter::exact).chain(lanes.into_iter().map(Filter::lane));
+            return Hearing {
+                at_once: at_once.collect(),
+                aside: ids(false).into_iter().map(Filter::exact).collect(),
+            };
         }
-        let kinds: BTreeSet<_> = ids.into_iter().map(|id| id.kind).collect();
+        let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
         let wires = (!lanes.is_empty()).then_some(ALL_WIRES);
-        kinds.into_iter().map(Filter::kind).chain(wires).collect()
+        Hearing { at_once: kinds.into_iter().map(Filter::kind).chain(wires).collect(), aside: Vec::new() }
     }
 }
 
@@ -68,7 +87,7 @@ mod tests {
         let mut ears = Ears::default();
         let id = |kind, cell| Id::new(kind, Node::Cell(cell));
         let cells = || CellId::all().take(cells).enumerate();
-        let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell)));
+        let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell), false));
         ears.listen(cells().flat_map(hears));
         for (at, cell) in cells() {
             ears.wire(Lane { wire: cell.get().into(), back: true }, at, 2);
@@ -79,7 +98,7 @@ mod tests {
     #[test]
     fn each_identifier_and_lane_has_an_exact_filter_as_long_as_they_fit() {
         let lane = |wire, back| Lane { wire, back }.raw_id();
-        let filters = ears(100).filters();
+        let filters = ears(100).hearing().at_once;
         assert_eq!(filters.len(), 300);
         for id in [0x401, 0x464, 0x101, lane(1, true), lane(100, true)] {
             assert!(passes(&filters, id), "{id:X}");
@@ -94,7 +113,7 @@ mod tests {
     #[test]
     fn too_many_become_kinds_and_all_wires() {
         let lane = |wire, back| Lane { wire, back }.raw_id();
-        let filters = ears(254).filters();
+        let filters = ears(254).hearing().at_once;
         assert_eq!(filters.len(), 3);
         for id in [0x401, 0x4FE, 0x101, lane(1, false), lane(65_535, true)] {
             assert!(passes(&filters, id), "{id:X}");
@@ -109,10 +128,21 @@ mod tests {
         let mut ears = ears(3);
         let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
         assert_eq!(ears.of_id(id(Kind::Sum, 2)), [1]);
-        ears.listen([(0, id(Kind::Sum, 2)), (2, id(Kind::Sum, 2))].into_iter());
+        ears.listen([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
         assert_eq!(ears.of_id(id(Kind::Sum, 2)), [0, 2]);
         assert_eq!(ears.of_id(id(Kind::Sum, 1)), [0; 0]);
         assert_eq!(ears.of_lane(Lane { wire: 2, back: true }), Some((1, 2)));
         assert_eq!(ears.of_lane(Lane { wire: 2, back: false }), None);
+    }
+
+    #[test]
+    fn nobody_is_woken_for_what_all_who_hear_it_hear_aside() {
+        let mut ears = Ears::default();
+        let id = |number| Id::new(Kind::Sum, Node::Cell(CellId::new(number).unwrap()));
+        ears.listen([(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter());
+        let Hearing { at_once, aside } = ears.hearing();
+        assert_eq!(at_once, [id(2), id(3)].map(Filter::exact));
+        assert_eq!(aside, [id(1)].map(Filter::exact));
+        assert_eq!(ears.of_id(id(2)), [1, 2]);
     }
 }

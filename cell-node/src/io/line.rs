@@ -1,13 +1,8 @@
 //! Where the bus of a process comes from.
 
-use std::time::Duration;
-
 use protocol::bus::{Bus, BusError, BusKind, Choice, Options};
 
 use super::Stopped;
-
-/// From one attempt to open a bus that is away to the next.
-const AGAIN: Duration = Duration::from_millis(100);
 
 /// A bus that can be opened, and opened again.
 #[derive(Clone, Debug)]
@@ -33,20 +28,6 @@ impl Line {
             return Err(Stopped::Real { bus: self.name.clone() });
         }
         Ok(bus)
-    }
-
-    /// Opens it as soon as it is there.
-    ///
-    /// # Errors
-    /// When it cannot be used as it is asked for, and waiting would not help.
-    pub fn open_again(&self, options: &Options) -> Result<Bus, Stopped> {
-        loop {
-            std::thread::sleep(AGAIN);
-            match self.open(options) {
-                Err(Stopped::Bus(error)) if error.may_open_later() => {}
-                opened => return opened,
-            }
-        }
     }
 
     /// Whether this is a reason to open it again.

@@ -32,8 +32,8 @@ const HELLO: Span = Span::from_millis(250);
 const JOIN_PATIENCE: Span = Span::from_millis(5);
 /// From one search for a way to the next, at first and at most.
 const SEEK: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
-/// So long a cell without a way looks for another before it tells those below it.
-const GRACE: Span = Span::from_millis(10);
+/// From one time that the gateway's side is told that it was left to the next; it takes sums until it knows.
+const AGAIN: Span = Span::from_millis(20);
 /// Ports, and a root's wire to the gateway's side.
 const ALL: usize = PORTS + 1;
 /// Messages that wait for ports; a shell takes them after every call.
@@ -56,6 +56,27 @@ struct Parent {
     label: Label,
 }
 
+/// A parent that was left.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+struct LeftBehind {
+    port: usize,
+    /// It takes no sum any more.
+    heard: bool,
+    since: Micros,
+    /// When it is told again.
+    again: Micros,
+}
+
+impl LeftBehind {
+    const fn new(port: usize, heard: bool, now: Micros) -> Self {
+        Self { port, heard, since: now, again: Self::next(port, now) }
+    }
+
+    const fn next(port: usize, now: Micros) -> Micros {
+        Micros(now.0 + if port == UPLINK { AGAIN.0 } else { HELLO.0 })
+    }
+}
+
 /// A cell's part of the network.
 #[derive(Debug)]
 pub struct Network {
@@ -66,17 +87,19 @@ pub struct Network {
     parent: Option<Parent>,
     /// The best label that this cell ever had: only better ones are followed.
     best: Option<Label>,
+    /// The label that its ports were told last, or that there is none.
+    offered: Option<Label>,
     joining: Option<(usize, Micros)>,
     /// Sums go up: a parent is not left without need.
     busy: bool,
-    /// Since when there is no parent, and whether those below know it.
-    orphan: Option<(Micros, bool)>,
+    /// The parent has no way itself.
+    deserted: bool,
     /// When a new round is asked for again, and how long after the last time that is.
     seek: Option<(Micros, Span)>,
     /// The last round that somebody below asked for, and when.
     passed_on: Option<(u8, Micros)>,
-    /// The parent that was left last: its port, and whether it has heard that.
-    left: Option<(usize, bool)>,
+    /// The parent that was left last.
+    left: Option<LeftBehind>,
     walking: Option<Walking>,
     last_walk: Option<u8>,
     given: Option<u8>,
@@ -99,9 +122,10 @@ impl Network {
             ports: [Port::default(); ALL],
             parent: None,
             best: None,
+            offered: None,
             joining: None,
             busy: false,
-            orphan: None,
+            deserted: false,
             seek: None,
             passed_on: None,
             left: None,
@@ -195,12 +219,20 @@ impl Network {
     /// Whether the parent that was left last has heard so, or there was none: then it takes no sum any more.
     #[must_use]
     pub fn is_let_go(&self) -> bool {
-        self.left.is_none_or(|(_, heard)| heard)
+        self.left.is_none_or(|left| left.heard)
     }
 
-    /// The parent that was left last takes no sum any more, for another reason.
-    pub const fn forget_left(&mut self) {
-        self.left = None;
+    /// The cell was silent for an epoch: a parent that was left takes no sum any more. The gateway's side needs longer:
+    /// it goes by what it hears over the wire.
+    pub fn forget_left(&mut self, now: Micros) {
+        self.left.take_if(|left| left.port != UPLINK || now.since(left.since) >= HELLO);
+    }
+
+    /// Asks the parent whether it is there.
+    pub fn ask_parent(&mut self) {
+        if let Some(up) = self.up() {
+            self.say(up, PortMessage::Ask);
+        }
     }
 
     /// How often the parent changed.
@@ -265,9 +297,9 @@ impl Network {
         }
         let join = self.joining.map(|(_, asked)| asked + JOIN_PATIENCE);
         let seek = self.seek.map(|(at, _)| at).filter(|_| self.joining.is_none());
-        let tell = self.orphan.filter(|(_, told)| !told).map(|(since, _)| since + GRACE);
         let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.silent_at());
-        [join, seek, tell, silent].into_iter().flatten().fold(self.next_hello, Micros::min)
+        let leave = self.to_be_told().map(|left| left.again);
+        [join, seek, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
     /// Says something to the cell at a port.
@@ -289,10 +321,14 @@ impl Network {
             unnumbered: self.is_unnumbered(),
             label: self.parent.map(|parent| parent.label.below()),
         };
+        if hello.label.is_some() {
+            self.ports.get_mut(port).into_iter().for_each(Port::told);
+        }
         self.say(port, PortMessage::Hello(hello));
     }
 
     fn hello_to_all(&mut self, now: Micros) {
+        self.offered = self.parent.map(|parent| parent.label.below());
         for port in 0..ALL {
             self.hello(now, port);
         }
@@ -317,11 +353,12 @@ impl Network {
                 self.say(port, PortMessage::Left);
             }
             PortMessage::Left => {
-                if let Some((left, heard)) = &mut self.left {
-                    *heard |= *left == port;
+                if let Some(left) = &mut self.left {
+                    left.heard |= left.port == port;
                 }
             }
             PortMessage::Seek(round) => self.pass_on(now, port, round),
+            PortMessage::Ask => self.hello(now, port),
             PortMessage::Number(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
             PortMessage::Return(walk) => self.go_on_walking(port, walk),
             PortMessage::Number(_) | PortMessage::State(_) | PortMessage::Missed(_) => {}
@@ -350,6 +387,8 @@ impl Network {
                 _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
                 // It is as near as it was, or nearer, or of a later round.
                 Some(label) if !parent.label.is_better_than(label) => self.follow(now, port, label),
+                // It has no way itself, and looks for one; so do those below, and what they say meanwhile is missed soon.
+                None if self.busy => self.pass_on(now, port, parent.label.round),
                 // It started anew, or has no way itself.
                 Some(_) | None => self.lose_parent(now, Lost::Unsure),
             },
@@ -358,12 +397,9 @@ impl Network {
         }
     }
 
-    /// Takes in that time has passed. Harmless when called early.
-    pub fn handle_time(&mut self, now: Micros) {
-        if !self.exists() {
-            return;
-        }
-        if now >= self.next_hello {
+    /// Says the hellos that are due until then: while the cell is awake anyway, it need not wake for them.
+    pub fn hello_by(&mut self, now: Micros, until: Micros) {
+        if self.exists() && until >= self.next_hello {
             // After a hang the missed ones are skipped.
             let missed = now.since(self.next_hello).0 / HELLO.0;
             self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
@@ -371,11 +407,23 @@ impl Network {
             self.ports.iter_mut().for_each(|port| port.pass(now));
             self.tree_changed |= before != self.children();
             self.hello_to_all(now);
-            if let Some((port, false)) = self.left
-                && self.up() != Some(port)
-            {
-                self.say(port, PortMessage::Leave);
-            }
+        }
+    }
+
+    /// A parent that was left and may not know it.
+    fn to_be_told(&self) -> Option<LeftBehind> {
+        self.left.filter(|left| !left.heard && self.up() != Some(left.port))
+    }
+
+    /// Takes in that time has passed. Harmless when called early.
+    pub fn handle_time(&mut self, now: Micros) {
+        if !self.exists() {
+            return;
+        }
+        self.hello_by(now, now);
+        if let Some(left) = self.to_be_told().filter(|left| now >= left.again) {
+            self.left = Some(LeftBehind { again: LeftBehind::next(left.port, now), ..left });
+            self.say(left.port, PortMessage::Leave);
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
@@ -384,12 +432,6 @@ impl Network {
                 self.joining = Some((UPLINK, now + HELLO));
             }
             self.lose_parent(now, Lost::Unsure);
-        }
-        if let Some((since, false)) = self.orphan
-            && now.since(since) >= GRACE
-        {
-            self.orphan = Some((since, true));
-            self.hello_to_all(now);
         }
         if self.parent.is_none() {
             self.search(now);

@@ -18,6 +18,8 @@ pub(super) struct Port {
     child: Option<Micros>,
     /// Its hellos count again when they are later than this: it was a parent and was lost.
     distrusted: Option<Micros>,
+    /// Somebody there asked for a later round, and has not heard a label since.
+    sought: bool,
 }
 
 impl Port {
@@ -58,6 +60,21 @@ impl Port {
     /// Whether a cell without a number is there or below.
     pub(super) fn is_unnumbered(&self) -> bool {
         self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
+    }
+
+    /// A later round is asked for there.
+    pub(super) const fn seek(&mut self) {
+        self.sought = true;
+    }
+
+    /// It has been told the present label.
+    pub(super) const fn told(&mut self) {
+        self.sought = false;
+    }
+
+    /// Whether a later round makes a difference there at once: to a child, and to who looks for a way.
+    pub(super) fn needs_round(&self, now: Micros) -> bool {
+        self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.label.is_none())
     }
 
     pub(super) const fn is_child(&self) -> bool {

@@ -1,29 +1,47 @@
 //! The way up: whom a cell joins, follows, leaves, and lets in.
 
 use protocol::time::{Micros, Span};
-use protocol::wire::{Label, PortMessage};
+use protocol::wire::{Label, PortMessage, UPLINK};
 
-use super::{ALL, JOIN_PATIENCE, Lost, Network, Parent, SEEK};
+use super::port::Port;
+use super::{ALL, JOIN_PATIENCE, LeftBehind, Lost, Network, Parent, SEEK};
 
 impl Network {
+    /// Whether nothing is lost by moving: no sums go up, or the parent has no way itself.
+    const fn may_move(&self) -> bool {
+        !self.busy || self.deserted
+    }
+
     /// A port that is nearer than the parent is asked, when nothing is lost by moving.
     pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
         let label = self.ports.get(port).and_then(|port| port.label(now));
         let nearer = label.is_some_and(|label| label.is_better_than(parent.label));
-        if nearer && !self.busy && self.joining.is_none() {
+        if nearer && self.may_move() && self.joining.is_none() {
             self.joining = Some((port, now));
             self.say(port, PortMessage::Join);
         }
     }
 
-    /// The parent's label is this: those below hear it when that is news.
+    /// The parent's label is this. All ports hear another depth; another round only those that need it: children,
+    /// and who looks for a way. So a round costs one message a cell, and not one a port.
     pub(super) fn follow(&mut self, now: Micros, port: usize, label: Label) {
-        let news = self.parent.is_none_or(|parent| parent.label != label);
-        self.parent = Some(Parent { port, label });
-        if news {
-            self.best = Some(label.below());
-            self.tree_changed = true;
-            self.hello_to_all(now);
+        let before = self.parent.replace(Parent { port, label });
+        if before == self.parent {
+            return;
+        }
+        let own = label.below();
+        self.best = Some(own);
+        self.deserted = false;
+        let offered = self.offered.replace(own);
+        let is_as_deep = offered.is_some_and(|offered| offered.depth == own.depth);
+        self.tree_changed |= !is_as_deep || before.is_none_or(|before| before.port != port);
+        if !is_as_deep {
+            return self.hello_to_all(now);
+        }
+        for port in (0..ALL).filter(|_| offered != Some(own)) {
+            if self.ports.get(port).is_some_and(|port| port.needs_round(now)) {
+                self.hello(now, port);
+            }
         }
     }
 
@@ -57,27 +75,30 @@ impl Network {
         if self.up() == Some(port) {
             return;
         }
-        let moves = self.parent.is_none_or(|parent| !self.busy && label.is_better_than(parent.label));
+        let moves = self.parent.is_none_or(|parent| self.may_move() && label.is_better_than(parent.label));
         if !moves || !self.is_good(label) {
             return self.say(port, PortMessage::Leave);
         }
         if let Some(before) = self.parent {
-            self.left = Some((before.port, false));
+            self.left = Some(LeftBehind::new(before.port, false, now));
             self.say(before.port, PortMessage::Leave);
         }
         self.joining = None;
-        self.orphan = None;
         self.seek = None;
         self.changes = self.changes.wrapping_add(1);
         self.follow(now, port, label);
+        if port == UPLINK {
+            // The gateway's side takes sums from then on.
+            self.hello(now, port);
+        }
     }
 
     /// The parent does not take this cell's sums any more: another way has to be found.
     pub fn lose_parent(&mut self, now: Micros, how: Lost) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
-        self.orphan = Some((now, false));
-        self.left = Some((parent.port, how == Lost::Done));
+        self.deserted = false;
+        self.left = Some(LeftBehind::new(parent.port, how == Lost::Done, now));
         self.say(parent.port, PortMessage::Leave);
         self.distrust(now, parent.port);
         self.search(now);
@@ -91,9 +112,6 @@ impl Network {
     pub(super) fn search(&mut self, now: Micros) {
         if self.parent.is_some() {
             return;
-        }
-        if self.orphan.is_none() {
-            self.orphan = Some((now, false));
         }
         if let Some((asked, at)) = self.joining {
             if now.since(at) < JOIN_PATIENCE {
@@ -115,24 +133,42 @@ impl Network {
         let (at, wait) = self.seek.unwrap_or((now, SEEK.0));
         if now >= at {
             self.seek = Some((now + wait, Span(wait.0 * 2).min(SEEK.1)));
-            for port in 0..ALL {
-                if self.ports.get(port).is_some_and(|port| port.label(now).is_some()) {
-                    self.say(port, PortMessage::Seek(best.round));
-                }
+            // Where no other port leads to the gateway, or none did so far, the way may be through those below, or
+            // through who was a parent.
+            let is_first = wait == SEEK.0;
+            let leads = self.ports.iter().any(|port| port.label(now).is_some());
+            self.seek_at(now, best.round, None, !(leads && is_first));
+        }
+    }
+
+    /// Asks for a round later than this one, on all ports that lead to the gateway but one, or on all that work.
+    fn seek_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
+        for port in (0..ALL).filter(|port| Some(*port) != but) {
+            let leads = |port: &Port| port.label(now).is_some() || (all && port.works(now));
+            if self.ports.get(port).is_some_and(leads) {
+                self.say(port, PortMessage::Seek(round));
             }
         }
     }
 
-    /// Somebody needs a round later than this one.
+    /// Somebody needs a round later than this one: above they pass it on to the gateway, below to whoever has another
+    /// way there.
     pub(super) fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
-        let Some(parent) = self.parent.filter(|parent| parent.port != port) else { return };
+        let Some(parent) = self.parent else { return };
         if parent.label.round.wrapping_sub(round).cast_signed() > 0 {
             return self.hello(now, port);
         }
+        self.ports.get_mut(port).into_iter().for_each(Port::seek);
+        let is_deserted = parent.port == port;
+        self.deserted |= is_deserted;
         if self.passed_on.is_some_and(|(of, at)| of == round && now.since(at) < SEEK.0) {
             return;
         }
         self.passed_on = Some((round, now));
-        self.say(parent.port, PortMessage::Seek(round));
+        if is_deserted {
+            self.seek_at(now, round, Some(port), true);
+        } else {
+            self.say(parent.port, PortMessage::Seek(round));
+        }
     }
 }

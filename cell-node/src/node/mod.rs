@@ -37,6 +37,7 @@ use crate::sum::{Sum, Words};
 use configuration::{Configuration, Written};
 use sensing::Sensing;
 use stimuli::{Arrival, Stimuli};
+use summing::Sign;
 use switches::Switches;
 
 pub use configuration::Flash;
@@ -49,6 +50,8 @@ pub const CLAIM: Span = Span::from_millis(250);
 /// First words are spread over this time by serial number: two cells under one number that are switched
 /// on together would else send different data under one identifier in the same bit time.
 const FIRST_WORD: Span = Span::from_millis(64);
+/// The shortest time between two words about its place in the tree.
+const TREE: Span = Span::from_millis(50);
 /// The shortest time between two answers to another cell under our number.
 const DEFEND: Span = Span::from_millis(10);
 
@@ -141,16 +144,25 @@ pub struct Node {
     hears_changed: bool,
     /// The parent that this epoch's sum is for, and its port.
     parent: Option<(usize, Option<CellId>)>,
-    /// Whether the parent's sum of this epoch was heard.
-    heard_parent: bool,
+    /// What was heard of the parent in this epoch.
+    sign: Sign,
     /// Whether a sum was said in the epoch before the present one.
     said_before: bool,
     /// Sums in a row that the parent did not take, without and with the present epoch's.
     misses: (u8, u8),
+    /// How many misses more than usual it bears: whoever lost parents lately is in a storm, or on a machine that is
+    /// late, and would only lose the next one too.
+    patience: u8,
+    /// Nothing was heard of it at one of them: it may have taken that sum after all.
+    doubt: bool,
     changes: u16,
     /// A sync that waits for the present epoch's end.
     asked: bool,
     tell_tree: bool,
+    /// Not before this its place in the tree is told again.
+    next_tree: Micros,
+    /// The round that was told last.
+    told_round: u8,
     claim: Claim,
     next_heartbeat: Micros,
     defended: Option<Micros>,
@@ -185,12 +197,16 @@ impl Node {
             sensing: Sensing::default(),
             hears_changed: false,
             parent: None,
-            heard_parent: false,
+            sign: Sign::Nothing,
             said_before: false,
             misses: (0, 0),
+            patience: 0,
+            doubt: false,
             changes: 0,
             asked: false,
             tell_tree: true,
+            next_tree: now,
+            told_round: 0,
             claim: Claim::Unsaid,
             next_heartbeat: first_word(identity, now),
             defended: None,
@@ -275,6 +291,15 @@ impl Node {
         self.slots().into_iter().flatten()
     }
 
+    /// The one of them that it need not be woken for, as long as it hears it before whatever comes next: the
+    /// parent's sum, which only tells that the parent is there.
+    #[must_use]
+    pub fn hears_aside(&self) -> Option<Id> {
+        let up = self.network.up()?;
+        let parent = self.heard_sums.get(up).copied().flatten()?;
+        Some(Id::new(Kind::Sum, Address::Cell(parent)))
+    }
+
     /// By slot of a pair's waiting half.
     fn slots(&self) -> [Option<Id>; HEARD] {
         let mut slots = [None; HEARD];
@@ -306,6 +331,8 @@ impl Node {
     fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
         if self.network.exists() {
+            // Another round alone is no news for anybody else.
+            self.tell_tree |= self.told_round != self.network.round();
             self.tell_tree(now);
             if self.network.ports_changed(now) {
                 self.push_ports(now);
@@ -376,7 +403,7 @@ impl Node {
                     self.sense(now);
                 }
                 self.sense_before_the_next_joints(now);
-                self.heartbeat_before_the_next_joints(now);
+                self.speak_before_the_next_joints(now);
             }
             Message::Halt => {
                 self.flags = self.flags.with(State::HALTED, true);
@@ -408,7 +435,7 @@ impl Node {
                 self.sense(now);
             }
             Message::Sum { from, epoch, torque, count } => {
-                self.take_sum(now, from, epoch, Words { torque, count });
+                self.take_sum(now, age, from, (epoch, Words { torque, count }));
             }
             // None of these is heard, see `Identity::hears`.
             Message::Torque { .. } | Message::Sensors { .. } | Message::Configured { .. } => {}
@@ -460,10 +487,12 @@ impl Node {
         self.push_torque(epoch, torque.words());
     }
 
-    /// A heartbeat that is due before the next joints is said now, while the cell is awake.
-    fn heartbeat_before_the_next_joints(&mut self, now: Micros) {
+    /// What is due before the next joints is said now, while the cell is awake: hellos and a heartbeat.
+    fn speak_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + Span(in_use.parameters.period_us.into());
+        self.network.hello_by(now, next_joints);
+        self.tell_tree(now);
         if self.claim == Claim::Settled && next_joints > self.next_heartbeat {
             self.regular_heartbeat(now);
         }

@@ -6,21 +6,39 @@ use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
 
-use super::{Claim, Node, Storing, first_word};
+use super::{Claim, Node, Storing, TREE, first_word};
 use crate::contact::Torque;
 use crate::network::Lost;
 use crate::sum::{Begin, Check, Words};
 
 /// Sums in a row that a parent does not take, after which it is no parent any more.
 const MISSES: u8 = 2;
+/// So many more it bears after each parent that it lost that way, and at most; one less after each sum of a parent.
+const PATIENT: u8 = 12;
+const PATIENCE: u8 = 48;
+
+/// What is heard of a parent in one epoch.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Sign {
+    /// Nothing.
+    Nothing,
+    /// A sum: it is there, and takes what it hears.
+    Sum,
+    /// It did not take this cell's sum.
+    Missed,
+}
 
 impl Node {
-    /// Takes what came in through a port.
-    pub fn handle_port(&mut self, now: Micros, port: usize, message: PortMessage) {
+    /// Takes what came in through a port `age` ago.
+    pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         if !self.network.hears(port) {
             return;
         }
+        self.sums.heard_after(age);
         self.network.set_busy(self.sums.is_busy());
+        if self.network.up() == Some(port) {
+            self.sums.release();
+        }
         match message {
             PortMessage::State(epoch) if self.network.is_child(port) => {
                 self.sums.state(now, port, epoch);
@@ -35,7 +53,8 @@ impl Node {
             | PortMessage::Left
             | PortMessage::Seek(_)
             | PortMessage::Number(_)
-            | PortMessage::Return(_) => self.network.handle(now, port, message),
+            | PortMessage::Return(_)
+            | PortMessage::Ask => self.network.handle(now, port, message),
         }
         self.after_network(now);
     }
@@ -57,21 +76,23 @@ impl Node {
         }
         if core::mem::replace(&mut self.changes, self.network.changes()) != self.network.changes() {
             self.misses = (0, 0);
+            self.doubt = false;
             self.sums.break_off();
         }
         if self.network.up().is_none() {
             self.sums.fall_silent();
         }
         self.tell_tree |= self.network.tree_changed();
-        if self.claim == Claim::Settled {
-            self.tell_tree(now);
-        }
+        self.tell_tree(now);
         self.listen();
     }
 
-    /// Says where it is in the tree, if that is news.
+    /// Says where it is in the tree, if that is news; while everything changes, not every change.
     pub(super) fn tell_tree(&mut self, now: Micros) {
-        if core::mem::replace(&mut self.tell_tree, false) {
+        let may = self.network.exists() && self.claim == Claim::Settled;
+        if may && self.tell_tree && now >= self.next_tree {
+            self.tell_tree = false;
+            self.next_tree = now + TREE;
             self.push_tree(now);
         }
     }
@@ -95,11 +116,11 @@ impl Node {
         let up = self.network.up();
         // A parent that was left and may not know it takes no sum from who was silent for an epoch.
         if !self.said_before {
-            self.network.forget_left();
+            self.network.forget_left(at);
         }
         let number = up.and_then(|up| CellId::new(self.network.number_at(up)?.into()).ok());
         self.parent = up.map(|up| (up, number));
-        self.heard_parent = false;
+        self.sign = Sign::Nothing;
         Begin {
             epoch,
             at,
@@ -120,19 +141,28 @@ impl Node {
     ) {
         let begin = self.freeze(epoch, now - age, period);
         self.sums.begin(&begin, own.map(|torque| torque.exact()).as_ref());
+        self.sums.heard_after(age);
         if self.misses.1 > 0 {
             self.sums.watch();
+        }
+        if self.doubt && self.network.up().is_some() {
+            self.sums.hold();
+            self.network.ask_parent();
         }
         self.handle_sums(now);
     }
 
     /// A neighbour's sum.
-    pub(super) fn take_sum(&mut self, now: Micros, from: CellId, epoch: Epoch, words: Words) {
+    pub(super) fn take_sum(&mut self, now: Micros, age: Span, from: CellId, (epoch, words): (Epoch, Words)) {
+        self.sums.heard_after(age);
         if let Some((port, Some(parent))) = self.parent
             && parent == from
         {
-            // A late sum of an earlier epoch is a sign of life too.
-            self.heard_parent |= self.network.hears(port);
+            if self.network.hears(port) {
+                // A late sum of an earlier epoch is a sign of life too.
+                self.sign = if self.sign == Sign::Nothing { Sign::Sum } else { self.sign };
+                self.sums.release();
+            }
         } else if let Some(port) = self.network.child_with(from.get())
             && self.network.hears(port)
         {
@@ -168,14 +198,28 @@ impl Node {
         for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
             self.network.say(port, PortMessage::Missed(epoch));
         }
+        if self.sums.is_held() {
+            self.misses.1 = self.misses.1.saturating_add(1);
+            if self.misses.1 >= MISSES + self.patience {
+                // It was silent all this epoch, so the parent takes no more.
+                self.lose_parent(now, Lost::Done);
+            }
+            return;
+        }
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
         let (_, before) = self.misses;
-        self.misses = match self.parent {
-            Some((UPLINK, _)) | None => (0, 0),
-            Some(_) if !said => (before, before),
-            Some(_) if self.heard_parent => (before, 0),
-            Some(_) => (before, before + 1),
+        self.misses = match (self.parent, self.sign) {
+            (Some((UPLINK, _)) | None, _) => (0, 0),
+            _ if !said => (before, before),
+            (_, Sign::Sum) => {
+                self.patience = self.patience.saturating_sub(1);
+                (before, 0)
+            }
+            (_, Sign::Nothing | Sign::Missed) => (before, before + 1),
         };
+        if said {
+            self.doubt = self.misses.1 > 0 && (self.doubt || self.sign == Sign::Nothing);
+        }
         self.give_up(now);
     }
 
@@ -185,8 +229,7 @@ impl Node {
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
         let before = self.sums.epoch().is_some_and(|present| epoch.next() == present);
         if self.sums.epoch() == Some(epoch) && said && !self.sums.is_judged() {
-            self.heard_parent = false;
-            self.parent = self.parent.map(|(port, _)| (port, None));
+            self.sign = Sign::Missed;
         } else if (self.sums.epoch() == Some(epoch) && said) || (before && self.said_before) {
             // It was thought to be taken.
             self.misses.1 = self.misses.0 + 1;
@@ -196,20 +239,26 @@ impl Node {
     }
 
     fn give_up(&mut self, now: Micros) {
-        if self.misses.1 >= MISSES {
-            self.misses = (0, 0);
-            self.sums.fall_silent();
-            self.network.lose_parent(now, Lost::Done);
-            self.after_network(now);
+        if self.misses.1 >= MISSES + self.patience {
+            self.lose_parent(now, if self.doubt { Lost::Unsure } else { Lost::Done });
         }
     }
 
+    fn lose_parent(&mut self, now: Micros, how: Lost) {
+        (self.misses, self.doubt) = ((0, 0), false);
+        self.patience = (self.patience + PATIENT).min(PATIENCE);
+        self.sums.fall_silent();
+        self.network.lose_parent(now, how);
+        self.after_network(now);
+    }
+
     pub(super) fn push_tree(&mut self, now: Micros) {
+        self.told_round = self.network.round();
         self.push_network(NetworkPage::Tree(Tree {
             parent: self.network.parent_number(),
             up: self.network.up().map_or(0, |up| up.to_le_bytes()[0]),
             depth: self.network.depth().unwrap_or(0),
-            round: self.network.round(),
+            round: self.told_round,
             children: self.network.children(),
             works: self.network.working(now),
             sent: self.sums.sent,

@@ -385,7 +385,11 @@ impl Line<'_> {
                 (says.walk, says.first, says.last) = (Some(walk), Some(first), Some(last));
                 None
             }
-            PortMessage::Join | PortMessage::Refuse | PortMessage::Leave | PortMessage::Left => None,
+            PortMessage::Join
+            | PortMessage::Refuse
+            | PortMessage::Leave
+            | PortMessage::Left
+            | PortMessage::Ask => None,
         };
         if let Some(Label { round, depth }) = label {
             (says.round, says.depth) = (Some(round), Some(depth));

@@ -299,6 +299,7 @@ fn what_is_said_over_wires_has_its_text() {
         "wire 12 <-: number, walk 5, 1 to 254",
         "wire 12 ->: return, walk 5, none left",
         "wire 12 ->: leave",
+        "wire 12 ->: ask",
         "wire 12 <-: left",
         "wire 12 <-: refuse",
         "wire 0 ->: hello, version 0, no number, port 0, no way up",

@@ -25,7 +25,11 @@ impl Display for Said {
             PortMessage::Return(Walk { walk, first, last }) => {
                 write!(f, ", walk {walk}, {first} to {last} left")
             }
-            PortMessage::Join | PortMessage::Refuse | PortMessage::Leave | PortMessage::Left => Ok(()),
+            PortMessage::Join
+            | PortMessage::Refuse
+            | PortMessage::Leave
+            | PortMessage::Left
+            | PortMessage::Ask => Ok(()),
         }
     }
 }
@@ -57,6 +61,7 @@ pub(super) const fn name(message: PortMessage) -> &'static str {
         PortMessage::Refuse => "refuse",
         PortMessage::Leave => "leave",
         PortMessage::Left => "left",
+        PortMessage::Ask => "ask",
         PortMessage::State(_) => "state",
         PortMessage::Missed(_) => "missed",
         PortMessage::Seek(_) => "seek",

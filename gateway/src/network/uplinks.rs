@@ -108,26 +108,21 @@ impl Uplinks {
             PortMessage::Hello(hello) => {
                 let anew = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
                 wire.heard = Some((hello, now));
-                let mistaken = hello.up && !wire.is_child;
-                if mistaken {
-                    // This gateway is a new one; the root may stay where it is.
-                    wire.is_child = true;
-                }
+                // Only the root knows whether a grant came, and whether it is still where an earlier gateway let it in.
+                wire.is_child = hello.up;
                 if hello.up && hello.label.is_some_and(|own| own.is_better_than(label.below())) {
                     self.renew(now, hello.label.map_or(self.round, |own| own.round));
                 } else if anew || !hello.hears {
                     self.hello(now, root);
                 }
             }
-            PortMessage::Join => {
-                wire.is_child = true;
-                self.outbox.push_back((root, PortMessage::Grant(label)));
-            }
+            PortMessage::Join => self.outbox.push_back((root, PortMessage::Grant(label))),
             PortMessage::Leave => {
                 wire.is_child = false;
                 self.outbox.push_back((root, PortMessage::Left));
             }
             PortMessage::Seek(round) => self.renew(now, round),
+            PortMessage::Ask => self.hello(now, root),
             PortMessage::Return(walk) => self.end_walk(now, root, walk),
             PortMessage::Grant(_)
             | PortMessage::Refuse

@@ -149,8 +149,9 @@ impl Roots {
 mod tests {
     use super::*;
     use protocol::can::Format;
-    use protocol::message::Message;
+    use protocol::message::{Message, VERSION};
     use protocol::packet::Epoch;
+    use protocol::wire::{Hello, Label};
 
     fn skin(reply: &str) -> Skin {
         let head = crate::testing::SKIN.replace("reply = \"torque\"", reply);
@@ -219,6 +220,17 @@ mod tests {
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::wire::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [], "a grant may be lost");
+        let hello = Hello {
+            version: VERSION,
+            number: 1,
+            port: 4,
+            hears: true,
+            up: true,
+            unnumbered: false,
+            label: Some(Label { round: 1, depth: 1 }),
+        };
+        assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Hello(hello))));
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
         assert_eq!(roots.changes().collect::<Vec<_>>(), []);
         assert!(roots.take(&leave));

@@ -1,4 +1,5 @@
-//! The system calls that have no safe wrapper: many datagrams at once, and an interface's MTU and flags.
+//! The system calls that have no safe wrapper: many datagrams at once, and an interface's MTU and flags,
+//! how a process is scheduled.
 //! Decides nothing.
 
 use std::io;
@@ -6,6 +7,13 @@ use std::mem;
 use std::os::fd::{AsRawFd, BorrowedFd};
 
 use super::batch::{BATCH, Slot};
+
+/// Asks for `SCHED_BATCH`; whether it was granted.
+pub(super) fn set_batch() -> bool {
+    let parameters = libc::sched_param { sched_priority: 0 };
+    // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
+    unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &raw const parameters) == 0 }
+}
 
 /// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's
 /// `SO_RCVTIMEO` says, or not at all.

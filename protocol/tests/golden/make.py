@@ -401,7 +401,7 @@ def hello(lane, number_here, port, flags=(), label=None, version=1):
 
 
 def bare_wire(lane, name):
-    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "left": 6}[name])
+    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "left": 6, "ask": 12}[name])
 
 
 def grant(lane, round_, depth):
@@ -986,6 +986,7 @@ def wire():
         walk(here, "number", 5, 1, 254),
         walk(there, "return", 5, 200, 199),
         bare_wire(there, "leave"),
+        bare_wire(there, "ask"),
         bare_wire(here, "left"),
         bare_wire(here, "refuse"),
     )
@@ -1011,7 +1012,7 @@ def wire():
     odd(grant(here, 3, 0), 3, 3, 0, 9, 9, 9)
 
     log.title("kinds that do not exist")
-    for kind in (0, 12, 255):
+    for kind in (0, 13, 255):
         log.add("bad wire", Wire("", there, kind, 1, 2, 3).classic())
     log.title("damaged, on another lane, of another length")
     good = hello(there, 7, 2, ["hears", "up"], (3, 1))

@@ -56,6 +56,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     // A kernel passes frames on at once; a process that waits its turn among hundreds of cells does not. Whoever may
     // not do this has a slower bus.
     let _ = rustix::process::setpriority_process(None, URGENT);
+    protocol::bus::never_interrupt();
     let server = Server::bind(name)?;
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
