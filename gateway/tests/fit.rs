@@ -35,7 +35,7 @@ fn refusal(arguments: &str) -> String {
 fn the_documents_show_what_is_printed() {
     let table = output("fit gateway/examples/ur5-253.toml");
     assert!(BUS_MD.contains(&table), "docs/bus.md has another table than\n{table}");
-    let (head, rest) = table.split_once("load  ").unwrap();
+    let (head, rest) = table.split_once("\nload ").unwrap();
     assert!(README.contains(head), "README.md has another table than\n{head}");
     assert!(rest.contains("roots"));
     let one = output("fit gateway/examples/ur5-253.toml --nominal 1M --data 5M");
