@@ -169,7 +169,7 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
     let top = pixels(8) + pixels(20) * u32::try_from(rows.len()).unwrap_or(0);
     let (above, below) = area.split_vertically(top);
     let mut chart = ChartBuilder::on(&below)
-        .margin_right(pixels(14))
+        .margin_right(pixels(24))
         .margin_top(pixels(4))
         .x_label_area_size(pixels(44))
         .y_label_area_size(left)
