@@ -310,7 +310,7 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
     let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 17, 18, 19, 20, 21, 99, 126, 127];
     let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]).chain([10, 200, 255]);
     // The joints have one identifier of 2048, and are to be met as surely as the cells.
-    let node = prop_oneof![1 => Just(0_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
+    let node = prop_oneof![1 => Just(1_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
     let cases = (
         (0_u16..8, node).prop_map(|(kind, node)| kind << 8 | node),
         any::<[i16; WORDS]>(),
