@@ -154,7 +154,6 @@ impl Node {
 
     /// A neighbour's sum.
     pub(super) fn take_sum(&mut self, now: Micros, age: Span, from: CellId, (epoch, words): (Epoch, Words)) {
-        self.sums.heard_after(age);
         if let Some((port, Some(parent))) = self.parent
             && parent == from
         {
@@ -166,6 +165,8 @@ impl Node {
         } else if let Some(port) = self.network.child_with(from.get())
             && self.network.hears(port)
         {
+            // A parent's sum may have waited aside; a child's is heard as it comes.
+            self.sums.heard_after(age);
             self.sums.take(now, port, epoch, words);
             self.handle_sums(now);
         }
