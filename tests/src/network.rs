@@ -23,7 +23,7 @@ use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use protocol::id::CellId;
 use protocol::message::{From, Joints, Message, NetworkPage, Ports, Request, SensorPage, SkinSensors, Tree};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{self, Epoch, WORDS};
 use protocol::parameters::{Contact, Cuts, Parameter, Parameters, Pose, Reply, Row, Slots};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
@@ -334,7 +334,13 @@ impl Wiring {
         let place = &mut self.cells[cell];
         if let Life::Runs(node) = &mut place.life {
             match inlet {
-                Inlet::Frame(frame) => node.handle_frame(now, now.since(stood), &frame),
+                Inlet::Frame(frame) => {
+                    // A process reads what it hears aside when something else wakes it: up to a period later.
+                    let id = packet::data_id(&frame).ok();
+                    let aside = id.is_some() && node.hears_aside() == id;
+                    let age = if aside { PERIOD } else { now.since(stood) };
+                    node.handle_frame(now, age, &frame);
+                }
                 Inlet::Port(port, _) if place.deaf[port] => {}
                 Inlet::Port(port, message) => node.handle_port(now, Span(0), port, message),
             }
