@@ -4,6 +4,8 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};
@@ -308,7 +310,8 @@ impl Bench {
     }
 
     fn open(&self) -> Bus {
-        let options = Options { directory: Some(self.directory()), ..Options::default() };
+        let (directory, send_patience) = (Some(self.directory()), Duration::from_secs(10));
+        let options = Options { directory, send_patience, ..Options::default() };
         Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap()
     }
 }
@@ -387,6 +390,46 @@ fn a_bus_that_ends_ends_its_dump_with_an_error() {
 }
 
 #[test]
+fn a_dump_says_what_it_missed_though_its_bus_has_ended() {
+    const FLOOD: u32 = 10_000;
+    let bench = Bench::new();
+    let mut dump = bench.dump("");
+    let bus = bench.open();
+    // Nobody reads what it shows: the pipe is full, then its socket, then its queue, and the rest is dropped.
+    let flood = [Frame::classic(0x123, &[0; 8]).unwrap(); 50];
+    (0..FLOOD / 50).for_each(|_| bus.send(&flood).unwrap());
+    let mut shown = BufReader::new(dump.stdout.take().unwrap()).lines().map(Result::unwrap);
+    // A frame that is shown after all of them brings how many are missing; it may be dropped as well.
+    let (after, enough) = (Frame::classic(0x7FF, &[]).unwrap(), AtomicBool::new(false));
+    let (heard, sent) = std::thread::scope(|scope| {
+        let sender = scope.spawn(|| {
+            let mut sent = 0;
+            while !enough.load(Ordering::Relaxed) {
+                bus.send(&[after]).unwrap();
+                sent += 1;
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            sent
+        });
+        let heard = shown.by_ref().take_while(|line| !line.contains(" 7FF#")).count();
+        enough.store(true, Ordering::Relaxed);
+        (u32::try_from(heard).unwrap(), sender.join().unwrap())
+    });
+    drop(bench);
+    let Output { status, stderr, .. } = dump.wait_with_output().unwrap();
+    let said = text(&stderr);
+    let missing = said.strip_prefix("vcan0: ").and_then(|said| {
+        said.strip_suffix(
+            " frames are missing: they came faster than they were shown\n\
+             gateway: the embedded bus vcan0 was closed: its server ended\n",
+        )
+    });
+    let missing: u32 = missing.unwrap_or_else(|| panic!("{said}")).parse().unwrap();
+    assert!(heard < FLOOD && (FLOOD - heard..=FLOOD - heard + sent).contains(&missing), "{heard}, {missing}");
+    assert_eq!(status.code(), Some(1));
+}
+
+#[test]
 fn a_skin_tells_ack_its_buses_and_formats() {
     let bench = Bench::new();
     let skin = bench.parent.path().join("skin.toml");
@@ -396,7 +439,7 @@ fn a_skin_tells_ack_its_buses_and_formats() {
     let mut inbox = Inbox::new();
     let mut frames = Vec::new();
     while frames.len() < 2 {
-        assert!(bus.wait(Some(std::time::Duration::from_secs(5))).unwrap(), "{frames:?}");
+        assert!(bus.wait(Some(Duration::from_secs(5))).unwrap(), "{frames:?}");
         bus.receive(&mut inbox).unwrap();
         frames.extend(inbox.frames().map(|received| received.frame));
     }

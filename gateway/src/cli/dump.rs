@@ -304,7 +304,8 @@ fn live(
                 std::thread::sleep(LOOK);
                 continue;
             }
-            Err(error) => return Err(Failure::run(error)),
+            // What was missed until then is said all the same.
+            Err(error) => break Err(Failure::run(error)),
         }
         // When nothing more comes, the end comes all the same.
         end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
@@ -319,7 +320,7 @@ fn live(
         match flow.and_then(|flow| show.flush().map(|()| flow)) {
             Ok(Flow::More) => {}
             Ok(Flow::Enough) => break Ok(()),
-            Err(error) => break Err(error),
+            Err(error) => break written(Err(error)),
         }
     };
     if inbox.dropped() > 0 {
@@ -329,5 +330,5 @@ fn live(
             "{name}: {dropped} frames are missing: they came faster than they were shown"
         ));
     }
-    written(done)
+    done
 }
