@@ -25,6 +25,7 @@ use protocol::usage::{Failure, print, quoted};
 use super::input::stopped;
 use super::output::note;
 use super::print::Rows;
+use super::programs::Programs;
 use bench::Benches;
 use folder::Folder;
 
@@ -51,15 +52,8 @@ pub(crate) struct Experiment {
     /// Measure little: a few cells, a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
-    /// Put up to N cells into one process
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
-    cells_per_process: u8,
-    /// The program of the cells, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    cell_node: Option<PathBuf>,
-    /// The program that serves embedded buses, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    vcan_setup: Option<PathBuf>,
+    #[command(flatten)]
+    programs: Programs,
     /// Show no progress and no findings
     #[arg(long, short)]
     quiet: bool,
@@ -109,13 +103,8 @@ impl Experiment {
     fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
         let effort = if self.quick { Effort::Quick } else { Effort::Full };
         let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
-        let benches = Benches {
-            folder: folder.inside(),
-            cell_node: self.cell_node.clone(),
-            vcan_setup: self.vcan_setup.clone(),
-            cells_per_process: self.cells_per_process,
-            stop: Arc::clone(&stop),
-        };
+        let benches =
+            Benches { folder: folder.inside(), programs: self.programs.clone(), stop: Arc::clone(&stop) };
         let mut lab = Here { benches, stop, idle: None };
         let mut session = Session::new(effort);
         let mut sections = Vec::with_capacity(named.len());

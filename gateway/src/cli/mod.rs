@@ -14,6 +14,7 @@ mod frame;
 mod input;
 mod output;
 mod print;
+mod programs;
 mod recover;
 mod replay;
 mod report;

@@ -21,6 +21,7 @@ use protocol::usage::Failure;
 use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::print;
+use super::programs::Programs;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../../examples/ur5-253.toml");
@@ -41,15 +42,8 @@ struct Common {
     /// Write the figures of the end as JSON; docs/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
-    /// Put up to N cells into one process
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
-    cells_per_process: u8,
-    /// The program of the cells, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    cell_node: Option<PathBuf>,
-    /// The program that serves embedded buses, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    vcan_setup: Option<PathBuf>,
+    #[command(flatten)]
+    programs: Programs,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
@@ -260,10 +254,10 @@ impl Common {
             scenario,
             kinds: Kinds::default(),
             spawn: true,
-            cells_per_process: self.cells_per_process.into(),
+            cells_per_process: self.programs.cells_per_process.into(),
             flash: None,
-            cell_node: self.cell_node.clone(),
-            vcan_setup: self.vcan_setup.clone(),
+            cell_node: self.programs.cell_node.clone(),
+            vcan_setup: self.programs.vcan_setup.clone(),
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
             record: record::Options::default(),
             quiet: self.quiet,

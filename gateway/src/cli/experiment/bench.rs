@@ -16,14 +16,14 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::cli::programs::Programs;
+
 /// Where benches are run, and with what.
 #[derive(Debug)]
 pub(super) struct Benches {
     /// For their skins, scenarios, recordings and summaries.
     pub(super) folder: PathBuf,
-    pub(super) cell_node: Option<PathBuf>,
-    pub(super) vcan_setup: Option<PathBuf>,
-    pub(super) cells_per_process: u8,
+    pub(super) programs: Programs,
     /// Set when it shall end.
     pub(super) stop: Arc<AtomicBool>,
 }
@@ -50,8 +50,9 @@ impl Benches {
         let mut command = Command::new(&own);
         command.arg("run").arg(&skin).arg("--scenario").arg(&scenario).arg("--record").arg(&recording);
         command.arg("--summary").arg(&summary).args(["--bus-kind", "embedded", "--quiet"]);
-        command.arg("--cells-per-process").arg(self.cells_per_process.to_string());
-        for (option, path) in [("--cell-node", &self.cell_node), ("--vcan-setup", &self.vcan_setup)] {
+        let Programs { cells_per_process, cell_node, vcan_setup } = &self.programs;
+        command.arg("--cells-per-process").arg(cells_per_process.to_string());
+        for (option, path) in [("--cell-node", cell_node), ("--vcan-setup", vcan_setup)] {
             if let Some(path) = path {
                 command.arg(option).arg(path);
             }
