@@ -15,6 +15,7 @@ pub mod fit;
 pub mod generate;
 pub mod listing;
 pub mod network;
+pub mod paper;
 pub mod record;
 pub mod replay;
 pub mod report;

@@ -3,13 +3,9 @@
 use std::fmt::Display;
 
 use comfy_table::{ColumnConstraint, ContentArrangement, Table, presets};
+use gateway::paper;
 use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
 use protocol::usage::{Failure, print};
-
-/// The paper's mean absolute error of single torques, in Nm.
-const PAPER_SINGLE_NM: f64 = 0.0054;
-/// The paper's mean absolute error of sums in Q7.8, in Nm.
-const PAPER_SUMS_NM: f64 = 0.0356;
 
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 110;
@@ -77,13 +73,13 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
     }
     rows.section("accuracy", "mean (greatest) error, Nm", "distributed against central");
     if single {
-        let paper = format!("paper {PAPER_SINGLE_NM}");
+        let paper = format!("paper {}", paper::SINGLE_NM);
         rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
         rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
         rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
     }
     if sums {
-        let paper = format!("paper {PAPER_SUMS_NM}");
+        let paper = format!("paper {}", paper::SUMMED_NM);
         rows.row("sums, loaded joints", errors(&accuracy.sums), paper);
         rows.row("  averaged over 32 epochs", errors(&accuracy.sums_averaged), "");
     }

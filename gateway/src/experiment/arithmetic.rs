@@ -8,8 +8,8 @@ use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::skin::Skin;
 
 use super::line::count;
-use super::paper;
 use super::ticks::POSE;
+use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table};
 
 /// One in so many angles is drawn.

@@ -13,9 +13,10 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::line::{Line, Weighted, count, quantile};
+use super::samples;
 use super::ticks::{POSE, nanos, touch};
-use super::{paper, samples};
 use crate::central::Central;
+use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
 
 /// Computations between two looks at the clock.

@@ -20,7 +20,6 @@ pub mod files;
 pub mod line;
 pub mod load;
 pub mod moving;
-pub mod paper;
 pub mod recorded;
 pub mod samples;
 pub mod sums;

@@ -3,8 +3,8 @@
 use serde_json::Value;
 
 use super::line::{Line, Weighted, count, quantile};
-use super::paper;
 use super::recorded::Row;
+use crate::paper;
 use crate::report::figure::{
     Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
 };

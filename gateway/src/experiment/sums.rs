@@ -10,8 +10,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::line::count;
-use super::paper;
 use super::tree::{Came, Tree};
+use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
 
 /// Numbers of active cells; the paper's arm had about twenty.
@@ -179,7 +179,10 @@ pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
              side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
              carries what rounding took away into its next value errs more in one epoch and not at all in the long run."
                 .to_owned(),
-            "The paper's 0.0356 Nm is what cutting off gives for about twenty active cells.".to_owned(),
+            format!(
+                "The paper's {} Nm is what cutting off gives for about twenty active cells.",
+                number(paper::SUMMED_NM)
+            ),
         ],
         figures: vec![single],
         findings,

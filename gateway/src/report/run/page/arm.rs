@@ -2,7 +2,8 @@
 
 use protocol::packet::WORDS;
 
-use super::{Draft, PAPER_SINGLE_NM, PAPER_SUMS_NM};
+use super::Draft;
+use crate::paper;
 use crate::report::figure::{Axis, Figure, Mark, On, Section, Series, Shape, Size, Table, number};
 use crate::report::thin::Thinned;
 use crate::summary::Quantiles;
@@ -28,6 +29,11 @@ impl Draft<'_> {
         let mut figures: Vec<_> = figures.collect();
         let errors: Vec<_> = self.run.lanes.iter().filter(|lane| lane.error.count() > 0).collect();
         if !errors.is_empty() {
+            let papers = |format: &str, mean| Mark {
+                on: On::Y,
+                at: mean,
+                label: format!("paper, {format}: {} Nm", number(mean)),
+            };
             figures.push(Figure {
                 name: "torque-error".to_owned(),
                 title: "Mean absolute error of an epoch that all cells answered in time".to_owned(),
@@ -35,10 +41,7 @@ impl Draft<'_> {
                 x: self.time(),
                 y: Axis::new("error", "Nm").log(),
                 series: errors.iter().map(|lane| self.line(self.named(lane), &lane.error)).collect(),
-                marks: vec![
-                    Mark { on: On::Y, at: PAPER_SINGLE_NM, label: "paper, Q3.12: 0.0054 Nm".to_owned() },
-                    Mark { on: On::Y, at: PAPER_SUMS_NM, label: "paper, Q7.8: 0.0356 Nm".to_owned() },
-                ],
+                marks: vec![papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)],
             });
         }
         let text = vec![
@@ -79,10 +82,10 @@ impl Draft<'_> {
         rows.push(row("all".to_owned(), &accuracy.single, &accuracy.whole));
         rows.push(vec![
             "paper".to_owned(),
-            number(PAPER_SINGLE_NM),
+            number(paper::SINGLE_NM),
             String::new(),
             String::new(),
-            number(PAPER_SUMS_NM),
+            number(paper::SUMMED_NM),
             String::new(),
             String::new(),
         ]);
