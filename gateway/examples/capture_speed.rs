@@ -7,19 +7,17 @@
 //!
 //! Half of the lines are classic frames of 8 bytes, half FD frames of 16. Files of LINES lines (10 million unless told) lie
 //! in FOLDER for the conversions, and are gone afterwards.
-#![allow(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    clippy::cast_precision_loss,
-    reason = "a measurement may stop"
-)]
+#![expect(clippy::unwrap_used, reason = "a measurement may stop")]
+#![expect(clippy::print_stdout, reason = "the figures are its output")]
+#![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+
+mod watched;
 
 /// A line as `candump -L` writes it.
 fn write_line(log: &mut String, line: u64) {
@@ -36,24 +34,10 @@ fn write_line(log: &mut String, line: u64) {
 
 /// Million lines a second, and the greatest memory of the process in MB.
 fn convert(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
-    let begun = Instant::now();
     let mut command = Command::new(gateway);
     command.arg("convert").arg(from).arg(to).arg("--force").stderr(Stdio::null());
-    let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");
-    let status = Path::new("/proc").join(child.id().to_string()).join("status");
-    let mut kib = 0.0_f64;
-    let done = loop {
-        let text = std::fs::read_to_string(&status).unwrap_or_default();
-        let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-        let peak = peak.and_then(|peak| peak.trim().trim_end_matches(" kB").parse().ok());
-        kib = kib.max(peak.unwrap_or(0.0));
-        if let Some(done) = child.try_wait().unwrap() {
-            break done;
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    };
-    assert!(done.success(), "{command:?}");
-    (lines as f64 / begun.elapsed().as_secs_f64() / 1e6, kib / 1024.0)
+    let (seconds, memory) = watched::run(&mut command);
+    (lines as f64 / seconds / 1e6, memory)
 }
 
 fn main() {
@@ -61,8 +45,7 @@ fn main() {
     let lines: u64 = arguments.next().map_or(10_000_000, |lines| lines.parse().expect("LINES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
 
-    let program = std::env::current_exe().unwrap();
-    let gateway = program.parent().and_then(Path::parent).unwrap().join("gateway");
+    let gateway = watched::gateway();
     let place = tempfile::tempdir_in(folder).unwrap();
     let [log, mcap, back] = ["run.log", "run.mcap", "back.log"].map(|name| place.path().join(name));
     let mut out = BufWriter::new(File::create(&log).unwrap());

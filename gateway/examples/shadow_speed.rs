@@ -7,23 +7,21 @@
 //! The capture (60 minutes unless told, 4 GB in FOLDER, gone afterwards) is a skin's: joints at 62.5 Hz, after which each of
 //! 253 cells answers, 16 thousand frames a second in all, with every fourth cell's heartbeat. Replies are spread as processes
 //! spread them, over 6 ms.
-#![allow(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    clippy::cast_precision_loss,
-    reason = "a measurement may stop"
-)]
+#![expect(clippy::unwrap_used, reason = "a measurement may stop")]
+#![expect(clippy::print_stdout, reason = "the figures are its output")]
+#![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
 use std::fs::File;
 use std::io::{BufWriter, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp, write_record};
 use protocol::id::{self, CellId, Id};
 use protocol::packet::{Epoch, Packet, WORDS};
+
+mod watched;
 
 /// From joints to joints, in µs.
 const PERIOD: u64 = 16_000;
@@ -61,34 +59,11 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
     frames
 }
 
-/// Seconds, and the greatest memory of the process in MB.
-fn run(gateway: &Path, log: &Path, arguments: &[&str]) -> (f64, f64) {
-    let begun = Instant::now();
-    let mut command = Command::new(gateway);
-    command.arg("shadow").arg(log).args(arguments).stdout(Stdio::null());
-    let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");
-    let status = Path::new("/proc").join(child.id().to_string()).join("status");
-    let mut kib = 0.0_f64;
-    let done = loop {
-        let text = std::fs::read_to_string(&status).unwrap_or_default();
-        let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-        let peak = peak.and_then(|peak| peak.trim().trim_end_matches(" kB").parse().ok());
-        kib = kib.max(peak.unwrap_or(0.0));
-        if let Some(done) = child.try_wait().unwrap() {
-            break done;
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    };
-    assert!(done.success(), "{command:?}");
-    (begun.elapsed().as_secs_f64(), kib / 1024.0)
-}
-
 fn main() {
     let mut arguments = std::env::args().skip(1);
     let minutes: u64 = arguments.next().map_or(60, |minutes| minutes.parse().expect("MINUTES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
-    let program = std::env::current_exe().unwrap();
-    let gateway = program.parent().and_then(Path::parent).unwrap().join("gateway");
+    let gateway = watched::gateway();
     let place = tempfile::tempdir_in(folder).unwrap();
     let log = place.path().join("run.log");
     let mut out = BufWriter::with_capacity(1 << 20, File::create(&log).unwrap());
@@ -107,7 +82,9 @@ fn main() {
         ("tables, 1M/5M", &[]),
         ("--json, 1M/8M", &["--data", "8M", "--json"]),
     ] {
-        let (seconds, memory) = run(&gateway, &log, arguments);
+        let mut command = Command::new(&gateway);
+        command.arg("shadow").arg(&log).args(arguments).stdout(Stdio::null());
+        let (seconds, memory) = watched::run(&mut command);
         let (rate, times) = (frames as f64 / seconds / 1e6, lasts / seconds);
         println!("{name:25}{rate:.2} million frames/s, {times:.0} times real time, {memory:.0} MB");
     }
