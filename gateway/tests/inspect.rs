@@ -55,7 +55,8 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     output(folder, "dbc classic.toml --joined -o one.dbc --force");
     assert!(written().contains("Classic: a packet travels in two frames of 8 bytes under one identifier"));
     let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 1);
-    assert!(said.starts_with("gateway: nowhere/one.dbc: "), "{said}");
+    assert!(said.starts_with("gateway: -o nowhere/one.dbc: "), "{said}");
+    assert!(said.ends_with("; name a file in a folder that can be written"), "{said}");
 }
 
 #[test]

@@ -182,6 +182,9 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
             .starts_with("gateway: a.zip: it is no MCAP file: it begins with 50 4b 03 04")
     );
     assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));
+    let nowhere = "gateway: -o none/new.mcap: No such file or directory (os error 2); name a file in a folder that can be \
+                   written";
+    assert_eq!(says("recover run.mcap.part -o none/new.mcap", 1), nowhere);
     let held = fs::File::open(path("run.mcap.part")).unwrap();
     rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).unwrap();
     let recorded = "gateway: run.mcap.part is being recorded: wait for the run's end";

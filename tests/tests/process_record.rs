@@ -218,7 +218,9 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     assert_eq!(refused("--record run.log"), "gateway: --record run.log: a recording's name ends in .mcap");
     fs::create_dir(place.path("dir.mcap")).unwrap();
     assert!(refused("--record dir.mcap").contains("is no regular file"));
-    assert!(refused("--record gone/run.mcap").contains("gone/run.mcap: No such file or directory"));
+    let gone = refused("--record gone/run.mcap");
+    let why = "No such file or directory (os error 2); name a file in a folder that can be written";
+    assert_eq!(gone, format!("gateway: --record gone/run.mcap: {why}"));
     assert!(refused("--record run.mcap --record-split 10").contains("a size from 1MB on"));
     assert!(
         refused("--record same.mcap --summary same.mcap")

@@ -172,7 +172,8 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
         ] {
             let said =
                 refusal(&place, "gateway", &format!("run skin.toml --bus-kind embedded {option} {file}"), 2);
-            assert_eq!(said, format!("gateway: {option} {file}: {why}"));
+            let remedy = "name a file in a folder that can be written";
+            assert_eq!(said, format!("gateway: {option} {file}: {why}; {remedy}"));
         }
     }
     let both = "run skin.toml --bus-kind embedded --candump file --summary file";

@@ -183,11 +183,24 @@ fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_sa
     assert_eq!(after, ["figures", "run.html"]);
 
     // Where nothing can be written nothing is left.
-    let refused = place.start("gateway", "report run.mcap -o run.mcap/run.html").end();
-    assert!(refused.refusal(1).starts_with("gateway: run.mcap/run.html: "), "{refused:?}");
-    let refused = place.start("gateway", "report run.mcap -o nowhere/run.html --svg more").end();
-    assert!(refused.refusal(1).starts_with("gateway: nowhere/run.html: "), "{refused:?}");
-    assert!(!place.path("more").exists());
+    for (options, said) in [
+        (
+            "-o run.mcap/run.html",
+            "-o run.mcap/run.html: Not a directory (os error 20); name a file in a folder that can be written",
+        ),
+        (
+            "-o nowhere/run.html --svg more",
+            "-o nowhere/run.html: No such file or directory (os error 2); name a file in a folder that can be written",
+        ),
+        (
+            "-o new.html --svg run.mcap/more",
+            "--svg run.mcap/more: Not a directory (os error 20); name a folder that can be written",
+        ),
+    ] {
+        let refused = place.start("gateway", &format!("report run.mcap {options}")).end();
+        assert_eq!(refused.refusal(1), format!("gateway: {said}"));
+    }
+    assert!(!place.path("more").exists() && !place.path("new.html").exists());
     let refused = place.start("gateway", "report run.mcap -o new.html --nominal 2M").end();
     assert!(refused.refusal(2).contains("nominal bit rate 2000000 bit/s"), "{refused:?}");
 

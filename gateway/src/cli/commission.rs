@@ -130,7 +130,7 @@ impl Commission {
             let copy = renumbered(&skin, &text, &numbers);
             let copy =
                 copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", path.display())))?;
-            output::write_file(path, &copy)?;
+            output::write_file("--numbers", path, &copy)?;
         }
         whole.end()
     }

@@ -78,7 +78,7 @@ impl Dbc {
             Some(path) if !self.force && path.is_file() => {
                 Err(Failure::usage(format!("{} is there already; --force writes over it", path.display())))
             }
-            Some(path) => output::write_file(&path, &text),
+            Some(path) => output::write_file("-o", &path, &text),
             None => print(&text),
         }
     }

@@ -12,12 +12,12 @@ pub(crate) fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "{text}");
 }
 
-/// Writes a whole file, or leaves what was there.
-pub(crate) fn write_file(path: &Path, text: &str) -> Result<(), Failure> {
+/// Writes a whole file that an option names, or leaves what was there.
+pub(crate) fn write_file(option: &str, path: &Path, text: &str) -> Result<(), Failure> {
     let write = || {
         let (whole, mut file) = WholeFile::create(path)?;
         file.write_all(text.as_bytes())?;
         whole.finish()
     };
-    write().map_err(|error: io::Error| Failure::run(format!("{}: {error}", path.display())))
+    write().map_err(|error: io::Error| Failure::run(format!("{option} {}: {error}", path.display())))
 }

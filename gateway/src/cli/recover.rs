@@ -5,6 +5,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
+use gateway::record::recover::RecoverError;
 use gateway::record::{names, repair};
 use protocol::usage::Failure;
 
@@ -46,7 +47,12 @@ impl Recover {
                 "-o {out}: {out} exists: name another file, or overwrite it with --force"
             )));
         }
-        let failure = |error| Failure::run(format!("{name}: {error}"));
+        let failure = |error| {
+            if let RecoverError::Write(error) = error {
+                return Failure::run(format!("-o {out}: {error}"));
+            }
+            Failure::run(format!("{name}: {error}"))
+        };
         let line = match repair::copy_unless_sound(&self.file, &output).map_err(failure)? {
             (recovered, None) => {
                 format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)

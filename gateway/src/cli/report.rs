@@ -49,12 +49,12 @@ impl Report {
         let command: Vec<_> = std::env::args().collect();
         let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
         let report = run::report(&self.file, &options).map_err(refused)?;
-        let mut files = vec![(output.clone(), page::html(&report.page))];
+        let mut files = vec![("-o", output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {
             for (name, drawing) in drawings(&report.page) {
                 let path = folder.join(name);
                 self.is_free(&path, "--svg")?;
-                files.push((path, drawing));
+                files.push(("--svg", path, drawing));
             }
         }
         let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
@@ -108,19 +108,25 @@ fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
 fn make(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);
-    made.map_err(|error| Failure::run(format!("--svg {}: {error}", folder.display())))
+    made.map_err(|error| {
+        Failure::run(format!("--svg {}: {error}; name a folder that can be written", folder.display()))
+    })
 }
 
-/// Writes all of them, or none: each gets its name when all are whole.
-fn write(files: &[(PathBuf, String)]) -> Result<(), Failure> {
-    let failed = |path: &Path, error: io::Error| Failure::run(format!("{}: {error}", path.display()));
+/// Writes all of them, each beside the option that is for it, or none: each gets its name when all are whole.
+fn write(files: &[(&str, PathBuf, String)]) -> Result<(), Failure> {
+    let failed = |option: &str, path: &Path, error: io::Error| {
+        Failure::run(format!("{option} {}: {error}", path.display()))
+    };
     let mut whole = Vec::with_capacity(files.len());
-    for (path, text) in files {
+    for (option, path, text) in files {
         let written = WholeFile::create(path).and_then(|(whole, mut file)| {
             file.write_all(text.as_bytes())?;
             Ok(whole)
         });
-        whole.push((path, written.map_err(|error| failed(path, error))?));
+        whole.push((option, path, written.map_err(|error| failed(option, path, error))?));
     }
-    whole.into_iter().try_for_each(|(path, whole)| whole.finish().map_err(|error| failed(path, error)))
+    whole
+        .into_iter()
+        .try_for_each(|(option, path, whole)| whole.finish().map_err(|error| failed(option, path, error)))
 }

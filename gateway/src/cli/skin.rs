@@ -69,7 +69,7 @@ impl Generate {
     fn run(self) -> Result<(), Failure> {
         let text = generate::generate(&self.wanted).map_err(Failure::usage)?;
         match self.output {
-            Some(path) => output::write_file(&path, &text),
+            Some(path) => output::write_file("-o", &path, &text),
             None => print(&text),
         }
     }

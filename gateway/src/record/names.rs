@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 
 use super::sink::folder_of;
+use crate::run::file::with_remedy;
 
 /// What a file is called in addition until it is whole.
 const PART: &str = "part";
@@ -87,7 +88,7 @@ impl Part {
                 let why = format!("{} is there: another run records to this name now", path.display());
                 return io::Error::new(io::ErrorKind::AlreadyExists, why);
             }
-            error
+            with_remedy(error)
         })?;
         hold(&file)?;
         Ok((Self { path, goal }, file))

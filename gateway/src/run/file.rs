@@ -34,9 +34,12 @@ impl WholeFile {
     /// Opens a file, so that what makes that impossible is known before there is anything to write.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// When it cannot be written, and what to do.
     pub fn create(path: &Path) -> io::Result<(Self, File)> {
-        let path = path.to_owned();
+        Self::open(path.to_owned()).map_err(with_remedy)
+    }
+
+    fn open(path: PathBuf) -> io::Result<(Self, File)> {
         if path.is_dir() {
             return Err(io::ErrorKind::IsADirectory.into());
         }
@@ -89,6 +92,23 @@ impl WholeFile {
     }
 }
 
+/// Why a file cannot be begun, and what to do when it is because of where it is to be.
+#[must_use]
+pub fn with_remedy(error: io::Error) -> io::Error {
+    let place = matches!(
+        error.kind(),
+        io::ErrorKind::NotFound
+            | io::ErrorKind::NotADirectory
+            | io::ErrorKind::IsADirectory
+            | io::ErrorKind::PermissionDenied
+            | io::ErrorKind::ReadOnlyFilesystem
+    );
+    if !place {
+        return error;
+    }
+    io::Error::new(error.kind(), format!("{error}; name a file in a folder that can be written"))
+}
+
 impl Drop for WholeFile {
     fn drop(&mut self) {
         if matches!(self.state, State::Part) {
@@ -120,7 +140,23 @@ mod tests {
         whole.finish().unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
         assert_eq!(names(folder.path()), ["run.json"]);
-        assert!(WholeFile::create(folder.path()).is_err(), "a directory is no file");
+    }
+
+    #[test]
+    fn who_names_a_place_for_no_file_is_told_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        fs::write(&file, "mine").unwrap();
+        for (path, why) in [
+            (folder.path().to_owned(), "is a directory"),
+            (folder.path().join("none/run.json"), "No such file or directory (os error 2)"),
+            (file.join("run.json"), "Not a directory (os error 20)"),
+        ] {
+            let error = WholeFile::create(&path).unwrap_err();
+            assert_eq!(error.to_string(), format!("{why}; name a file in a folder that can be written"));
+        }
+        let full = with_remedy(io::ErrorKind::StorageFull.into());
+        assert_eq!(full.to_string(), "no storage space", "another folder may be as full");
     }
 
     #[test]
