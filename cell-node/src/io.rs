@@ -160,8 +160,7 @@ impl Cells {
         }
         let cells = self.cells.iter().enumerate();
         self.ears.listen(cells.flat_map(|(place, seat)| {
-            let aside = seat.node.hears_aside();
-            seat.node.hears().map(move |id| (place, id, aside == Some(id)))
+            seat.node.hears().map(move |id| (place, id, seat.node.hears_aside(id)))
         }));
         let hearing = self.ears.hearing();
         (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))

@@ -252,12 +252,30 @@ impl Sum {
         let at = if self.children.iter().enumerate().all(is_in) {
             0
         } else if self.children.iter().any(is_late) {
-            // Half a slot for each wire to the root, so that who waits above does not wait in vain.
-            (self.period.0 * 7 / 8).saturating_sub(u64::from(self.depth) * width / 2).max(slot)
+            self.late().0.max(slot)
         } else {
             slot
         };
         self.due = Some(self.began + Span(at));
+    }
+
+    /// After joints, by when a sum that waits for a late child is said: half a slot for each wire to the root before all
+    /// is said, so that who waits above does not wait in vain.
+    fn late(&self) -> Span {
+        let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
+        Span((self.period.0 * 7 / 8).saturating_sub(u64::from(self.depth) * width / 2))
+    }
+
+    /// Whether a child's sum is waited for in each epoch: its lease runs.
+    #[must_use]
+    pub fn awaits_children(&self) -> bool {
+        self.children.iter().any(|child| child.last.is_some())
+    }
+
+    /// By when the sum of the next epoch has to be said that waits for a late child.
+    #[must_use]
+    pub fn late_at_next(&self) -> Micros {
+        self.began + self.period + self.late()
     }
 
     /// A child is none any more.

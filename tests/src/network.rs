@@ -85,6 +85,8 @@ pub struct Place {
     force: Force,
     life: Life,
     wake: Option<Micros>,
+    /// What it hears aside, and when that stood on the bus: it does not wake it.
+    aside: VecDeque<(Micros, Frame)>,
     newest: Micros,
     /// What it said in each of the last epochs: words, and who is in it.
     said: HashMap<u8, Vec<(Words, u128)>>,
@@ -247,6 +249,7 @@ impl Wiring {
         let node = Node::new(identity, Format::Fd, &Flash::Sound(place.parameters), true, now);
         place.life = Life::Runs(Box::new(node.with_ports(wired)));
         place.wake = None;
+        place.aside.clear();
         (place.tree, place.ports) = (None, None);
         self.after(cell);
     }
@@ -322,6 +325,7 @@ impl Wiring {
     }
 
     fn pass(&mut self, cell: usize) {
+        self.hear_aside(cell);
         let now = self.agenda.now;
         if let Life::Runs(node) = &mut self.cells[cell].life {
             node.handle_timeout(now);
@@ -329,18 +333,32 @@ impl Wiring {
         self.after(cell);
     }
 
+    /// What a cell hears aside is read when something else wakes it, and before that.
+    fn hear_aside(&mut self, cell: usize) {
+        let now = self.agenda.now;
+        loop {
+            let place = &mut self.cells[cell];
+            let Life::Runs(node) = &mut place.life else { return };
+            let Some((stood, frame)) = place.aside.pop_front() else { return };
+            node.handle_frame(now, now.since(stood), &frame);
+            self.after(cell);
+        }
+    }
+
     fn hand(&mut self, cell: usize, stood: Micros, inlet: Inlet) {
         let now = self.agenda.now;
         let place = &mut self.cells[cell];
+        if let (Life::Runs(node), Inlet::Frame(frame)) = (&place.life, inlet)
+            && packet::data_id(&frame).is_ok_and(|id| node.hears_aside(id))
+        {
+            place.aside.push_back((stood, frame));
+            return;
+        }
+        self.hear_aside(cell);
+        let place = &mut self.cells[cell];
         if let Life::Runs(node) = &mut place.life {
             match inlet {
-                Inlet::Frame(frame) => {
-                    // A process reads what it hears aside when something else wakes it: up to a period later.
-                    let id = packet::data_id(&frame).ok();
-                    let aside = id.is_some() && node.hears_aside() == id;
-                    let age = if aside { PERIOD } else { now.since(stood) };
-                    node.handle_frame(now, age, &frame);
-                }
+                Inlet::Frame(frame) => node.handle_frame(now, now.since(stood), &frame),
                 Inlet::Port(port, _) if place.deaf[port] => {}
                 Inlet::Port(port, message) => node.handle_port(now, Span(0), port, message),
             }
@@ -357,6 +375,8 @@ impl Wiring {
             node.handle_stored(true);
         }
         assert_eq!(node.taken(), None, "cell {cell} gave up its number {:?}", place.number);
+        // What it hears is asked for each frame that comes.
+        let _ = node.poll_hears();
         let mut messages = Vec::new();
         while let Some(message) = node.poll_port_transmit() {
             messages.push(message);
@@ -533,6 +553,18 @@ impl Wiring {
         self.agenda.enter_in(Span(0), Event::Joints);
     }
 
+    /// No more joints are sent.
+    pub const fn stop(&mut self) {
+        self.ticking = false;
+    }
+
+    /// Whether a cell is woken by its children and not by joints.
+    #[must_use]
+    pub fn waits_for_children(&self, cell: usize) -> bool {
+        let joints = protocol::id::Id::command(protocol::id::Command::Joints);
+        matches!(&self.cells[cell].life, Life::Runs(node) if node.hears_aside(joints))
+    }
+
     /// Every cell is told to answer with sums.
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
@@ -697,6 +729,7 @@ impl Place {
             force,
             life: Life::Off,
             wake: None,
+            aside: VecDeque::new(),
             newest: Micros(0),
             said: HashMap::new(),
         }

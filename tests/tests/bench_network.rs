@@ -210,3 +210,60 @@ fn messages_that_are_lost_on_wires_make_no_cell_count_twice() {
         assert!(incomplete(&mut wiring, 80).is_some(), "seed {seed}: not whole again; {}", wiring.ways());
     }
 }
+
+#[test]
+fn without_a_touch_all_have_a_way_again_within_a_second() {
+    let mut slowest = 0;
+    for seed in 0..wirings() / 2 {
+        let mut dice = Pcg64Mcg::seed_from_u64(seed);
+        let mut wiring = Wiring::random(seed);
+        organise(&mut wiring, &mut dice);
+        wiring.switch(deepest(&wiring), false);
+        wiring.begin();
+        wiring.run(Span::from_millis(300));
+        for _ in 0..4 {
+            let what = break_something(&mut wiring, &mut dice);
+            let mends = what.starts_with("mend") || what.starts_with("restart");
+            let from = wiring.now();
+            let whole = |wiring: &Wiring| {
+                let mut reachable = wiring.reachable().into_iter();
+                let goes =
+                    |cell| wiring.way(cell).is_some_and(|way| way.iter().all(|&cell| wiring.runs(cell)));
+                reachable.all(|cell| wiring.cells[cell].number.is_none() || goes(cell))
+            };
+            // What a cell hears no more it believes for 600 ms.
+            wiring.run(Span::from_millis(600));
+            while !whole(&wiring) {
+                let (took, ways) = (wiring.now().since(from), wiring.ways());
+                assert!(took <= Span::from_millis(1_000) || mends, "seed {seed}, {what}: {took:?}, {ways}");
+                wiring.run(Span::from_millis(20));
+            }
+            slowest = slowest.max(wiring.now().since(from).0);
+            wiring.run(Span::from_millis(400));
+        }
+    }
+    println!("the slowest has a way again after {} ms", slowest / 1_000);
+}
+
+#[test]
+fn who_waits_for_children_is_woken_by_them_and_without_joints_by_itself() {
+    let mut wiring = Wiring::new(3, 1);
+    wiring.wire(0, 0, 1, 0);
+    wiring.wire(1, 1, 2, 1);
+    wiring.add_root(0);
+    organise(&mut wiring, &mut Pcg64Mcg::seed_from_u64(1));
+    press_all(&mut wiring);
+    let waits = |wiring: &Wiring| [0, 1, 2].map(|cell| wiring.waits_for_children(cell));
+    assert_eq!(waits(&wiring), [false; 3]);
+    assert_eq!(incomplete(&mut wiring, 20), Some(0));
+    assert_eq!(waits(&wiring), [true, true, false], "the leaf has nobody to wait for");
+    wiring.kill(2);
+    assert_eq!(incomplete(&mut wiring, 10), Some(0), "cell 1 looks by itself when nobody wakes it");
+    assert_eq!(waits(&wiring), [true, false, false]);
+    wiring.stop();
+    wiring.run(Span(2 * PERIOD.0));
+    assert_eq!(waits(&wiring), [false; 3], "joints wake again");
+    wiring.begin();
+    assert_eq!(incomplete(&mut wiring, 20), Some(0));
+    assert_eq!(waits(&wiring), [true, false, false]);
+}

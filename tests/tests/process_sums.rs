@@ -129,6 +129,30 @@ fn holds(guest: &Guest, wanted: u32) {
     panic!("waited {PATIENCE:?} for sums of {wanted} cells; they were of {seen:?}");
 }
 
+/// Waits until, by what cells say, each of these has a way to a root that leads over these only.
+fn have_ways(guest: &Guest, cells: &BTreeSet<u8>) {
+    let mut parents = BTreeMap::new();
+    let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
+        let up = |cell: &u8| parents.get(cell).copied().flatten();
+        let mut way = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
+        way.find(|cell| !cells.contains(cell)) == Some(0)
+    };
+    guest.sends(&Message::Report);
+    let give_up = Instant::now() + PATIENCE;
+    let mut inbox = Inbox::new();
+    while !cells.iter().all(|&cell| leads(&parents, cell)) {
+        assert!(Instant::now() < give_up, "waited {PATIENCE:?} for ways of {cells:?}: {parents:?}");
+        guest.0.wait(Some(Duration::from_millis(100))).unwrap();
+        guest.0.receive(&mut inbox).unwrap();
+        let packets = inbox.frames().filter_map(|received| Packet::from_fd(&received.frame).ok());
+        for message in packets.filter_map(|packet| Message::decode(&packet).ok()) {
+            if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } = message {
+                parents.insert(cell.get(), tree.parent);
+            }
+        }
+    }
+}
+
 /// Ends a bench, and sees that all is accounted for.
 fn end(place: &Place, bench: Running) -> Ended {
     bench.signal(Signal::TERM);
@@ -227,6 +251,29 @@ fn sums_go_round_a_cell_that_is_killed_or_hangs_and_who_comes_back_is_in_them_ag
     summary.adds_up();
     assert!(summary.of_bus("/network/parent_changes") >= 12, "{:#}", summary.0);
     assert!(summary.of_bus("/sums/contributions/missing") > 0, "{:#}", summary.0);
+}
+
+#[test]
+fn without_a_touch_hellos_tell_who_is_gone_and_the_rest_finds_another_way() {
+    let place = Place::new();
+    grid(&place);
+    place.scenario(PRESSED.split("[[touch]]").next().unwrap());
+    let bench = unrecorded(&place, 120.0, "");
+    bench.hears_the_loop();
+    let guest = place.guest();
+    let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
+    have_ways(&guest, &cells);
+    process::signal(bench.cell(6), Signal::KILL);
+    cells.remove(&6);
+    have_ways(&guest, &cells);
+    let stopped = bench.cell(7);
+    process::signal(stopped, Signal::STOP);
+    cells.remove(&7);
+    have_ways(&guest, &cells);
+    process::signal(stopped, Signal::CONT);
+    cells.insert(7);
+    have_ways(&guest, &cells);
+    end(&place, bench);
 }
 
 /// Wires are cut while the loop runs: one of many in one direction, and all of the cell in a corner.

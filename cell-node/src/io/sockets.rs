@@ -58,13 +58,18 @@ impl Sockets {
 
     /// Puts other filters in force than those that are.
     pub(super) fn set_filters(&self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
+        // What moves from one socket to the other comes by both for a moment rather than by none.
+        let (news, old) = (only_in(&hearing.aside, &before.aside), only_in(&before.aside, &hearing.aside));
+        if let (Some(aside), true) = (&self.aside, !news.is_empty()) {
+            aside.set_filters(&[&before.aside[..], &news].concat())?;
+        }
         if hearing.at_once != before.at_once {
             self.bus.set_filters(&hearing.at_once)?;
         }
-        match &self.aside {
-            Some(aside) if hearing.aside != before.aside => aside.set_filters(&hearing.aside),
-            Some(_) | None => Ok(()),
+        if let (Some(aside), true) = (&self.aside, !old.is_empty()) {
+            aside.set_filters(&hearing.aside)?;
         }
+        Ok(())
     }
 
     pub(super) fn send(&self, frames: &[Frame]) -> Result<(), BusError> {
@@ -120,4 +125,9 @@ impl Sockets {
     pub(super) fn frames(&self) -> &[Received] {
         &self.came
     }
+}
+
+/// What is in one list and not in the other.
+fn only_in(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
+    these.iter().filter(|filter| !those.contains(filter)).copied().collect()
 }

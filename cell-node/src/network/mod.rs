@@ -96,8 +96,8 @@ pub struct Network {
     deserted: bool,
     /// When a new round is asked for again, and how long after the last time that is.
     seek: Option<(Micros, Span)>,
-    /// The last round that somebody below asked for, and when.
-    passed_on: Option<(u8, Micros)>,
+    /// The last round that somebody asked for, whether all were asked for it or the parent only, and when.
+    passed_on: Option<(u8, bool, Micros)>,
     /// The parent that was left last.
     left: Option<LeftBehind>,
     walking: Option<Walking>,
@@ -388,9 +388,9 @@ impl Network {
                 // It is as near as it was, or nearer, or of a later round.
                 Some(label) if !parent.label.is_better_than(label) => self.follow(now, port, label),
                 // It has no way itself, and looks for one; so do those below, and what they say meanwhile is missed soon.
-                None if self.busy => self.pass_on(now, port, parent.label.round),
-                // It started anew, or has no way itself.
-                Some(_) | None => self.lose_parent(now, Lost::Unsure),
+                None => self.pass_on(now, port, parent.label.round),
+                // It started anew.
+                Some(_) => self.lose_parent(now, Lost::Unsure),
             },
             Some(parent) => self.improve(now, port, parent),
             None => self.search(now),

@@ -35,7 +35,7 @@ impl Network {
         let offered = self.offered.replace(own);
         let is_as_deep = offered.is_some_and(|offered| offered.depth == own.depth);
         self.tree_changed |= !is_as_deep || before.is_none_or(|before| before.port != port);
-        if !is_as_deep {
+        if !is_as_deep && !self.busy {
             return self.hello_to_all(now);
         }
         for port in (0..ALL).filter(|_| offered != Some(own)) {
@@ -161,10 +161,13 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(Port::seek);
         let is_deserted = parent.port == port;
         self.deserted |= is_deserted;
-        if self.passed_on.is_some_and(|(of, at)| of == round && now.since(at) < SEEK.0) {
+        // Upwards is not everywhere: a parent may have two wires to this cell, and seek on both.
+        let again =
+            |(of, everywhere, at)| of == round && now.since(at) < SEEK.0 && (everywhere || !is_deserted);
+        if self.passed_on.is_some_and(again) {
             return;
         }
-        self.passed_on = Some((round, now));
+        self.passed_on = Some((round, is_deserted, now));
         if is_deserted {
             self.seek_at(now, round, Some(port), true);
         } else {

@@ -37,7 +37,7 @@ use crate::sum::{Sum, Words};
 use configuration::{Configuration, Written};
 use sensing::Sensing;
 use stimuli::{Arrival, Stimuli};
-use summing::Sign;
+use summing::STEADY;
 use switches::Switches;
 
 pub use configuration::Flash;
@@ -142,19 +142,25 @@ pub struct Node {
     heard_sums: [Option<CellId>; PORTS],
     sensing: Sensing,
     hears_changed: bool,
+    /// Epochs in a row in which a child was waited for and nothing was amiss.
+    steady: u8,
+    /// Joints are heard aside: what wakes this cell is its children.
+    waits_for_children: bool,
     /// The parent that this epoch's sum is for, and its port.
     parent: Option<(usize, Option<CellId>)>,
-    /// What was heard of the parent in this epoch.
-    sign: Sign,
+    /// Whether a sum of the parent was heard in this epoch.
+    heard_parent: bool,
     /// Whether a sum was said in the epoch before the present one.
     said_before: bool,
-    /// Sums in a row that the parent did not take, without and with the present epoch's.
-    misses: (u8, u8),
-    /// How many misses more than usual it bears: whoever lost parents lately is in a storm, or on a machine that is
+    /// The parent may not have taken a sum: it is asked whether it hears this cell, until it answers.
+    asks_parent: bool,
+    /// Epochs in a row in which it did not.
+    unanswered: u16,
+    /// How many of them are borne, times 16: whose parents were there all the time when they were lost is on a machine that is
     /// late, and would only lose the next one too.
-    patience: u8,
-    /// Nothing was heard of it at one of them: it may have taken that sum after all.
-    doubt: bool,
+    patience: u16,
+    /// The port of a parent that was lost and may have been there all the time.
+    suspected: Option<usize>,
     changes: u16,
     /// A sync that waits for the present epoch's end.
     asked: bool,
@@ -196,12 +202,15 @@ impl Node {
             heard_sums: [None; PORTS],
             sensing: Sensing::default(),
             hears_changed: false,
+            steady: 0,
+            waits_for_children: false,
             parent: None,
-            sign: Sign::Nothing,
+            heard_parent: false,
             said_before: false,
-            misses: (0, 0),
+            asks_parent: false,
+            unanswered: 0,
             patience: 0,
-            doubt: false,
+            suspected: None,
             changes: 0,
             asked: false,
             tell_tree: true,
@@ -230,8 +239,10 @@ impl Node {
     }
 
     /// Whether the identifiers that it hears have changed since the last call.
-    pub const fn poll_hears(&mut self) -> bool {
-        core::mem::replace(&mut self.hears_changed, false)
+    pub fn poll_hears(&mut self) -> bool {
+        let waits = self.steady == STEADY && !self.asks_parent && self.sums.awaits_children();
+        let changed = core::mem::replace(&mut self.waits_for_children, waits) != waits;
+        core::mem::replace(&mut self.hears_changed, false) | changed
     }
 
     /// Who it is.
@@ -262,7 +273,8 @@ impl Node {
     pub fn poll_timeout(&self) -> Micros {
         let sums = self.sums.poll_timeout().unwrap_or(Micros(u64::MAX));
         let sensing = self.sensing_due().unwrap_or(Micros(u64::MAX));
-        self.next_heartbeat.min(self.network.poll_timeout()).min(sums).min(sensing)
+        let look = if self.waits_for_children { self.sums.late_at_next() } else { Micros(u64::MAX) };
+        self.next_heartbeat.min(self.network.poll_timeout()).min(sums).min(sensing).min(look)
     }
 
     /// What has to go into flash; then comes [`Node::handle_stored`].
@@ -291,13 +303,16 @@ impl Node {
         self.slots().into_iter().flatten()
     }
 
-    /// The one of them that it need not be woken for, as long as it hears it before whatever comes next: the
-    /// parent's sum, which only tells that the parent is there.
+    /// Whether it need not be woken for one of them, as long as it hears it before whatever comes next: the
+    /// parent's sum, which only tells that the parent is there; and joints while it would only wait for its children's
+    /// sums, which come after them.
     #[must_use]
-    pub fn hears_aside(&self) -> Option<Id> {
-        let up = self.network.up()?;
-        let parent = self.heard_sums.get(up).copied().flatten()?;
-        Some(Id::new(Kind::Sum, Address::Cell(parent)))
+    pub fn hears_aside(&self, id: Id) -> bool {
+        if id == Id::command(Command::Joints) {
+            return self.waits_for_children;
+        }
+        let parent = self.network.up().and_then(|up| self.heard_sums.get(up).copied().flatten());
+        parent.is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
     /// By slot of a pair's waiting half.
@@ -312,6 +327,12 @@ impl Node {
 
     /// Takes in that time has passed. Harmless when called early.
     pub fn handle_timeout(&mut self, now: Micros) {
+        if self.waits_for_children && now >= self.sums.late_at_next() {
+            // No joints came, or they have been heard by now.
+            self.steady = 0;
+            self.waits_for_children = false;
+            self.hears_changed = true;
+        }
         self.network.handle_time(now);
         self.after_network(now);
         self.handle_sums(now);

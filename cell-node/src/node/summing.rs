@@ -11,22 +11,13 @@ use crate::contact::Torque;
 use crate::network::Lost;
 use crate::sum::{Begin, Check, Words};
 
-/// Sums in a row that a parent does not take, after which it is no parent any more.
-const MISSES: u8 = 2;
-/// So many more it bears after each parent that it lost that way, and at most; one less after each sum of a parent.
-const PATIENT: u8 = 12;
-const PATIENCE: u8 = 48;
-
-/// What is heard of a parent in one epoch.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Sign {
-    /// Nothing.
-    Nothing,
-    /// A sum: it is there, and takes what it hears.
-    Sum,
-    /// It did not take this cell's sum.
-    Missed,
-}
+/// Epochs in a row without an answer that are borne, once a parent that was lost that way says that it was there and
+/// heard: so many more each time, and at most. One less after so many epochs with a sum of the parent.
+const PATIENT: u16 = 2 * FORGETS;
+const PATIENCE: u16 = 12 * FORGETS;
+const FORGETS: u16 = 16;
+/// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
+pub(super) const STEADY: u8 = 8;
 
 impl Node {
     /// Takes what came in through a port `age` ago.
@@ -36,21 +27,27 @@ impl Node {
         }
         self.sums.heard_after(age);
         self.network.set_busy(self.sums.is_busy());
-        if self.network.up() == Some(port) {
+        if self.network.up() == Some(port) && matches!(message, PortMessage::Hello(_)) {
+            (self.asks_parent, self.unanswered) = (false, 0);
             self.sums.release();
         }
         match message {
             PortMessage::State(epoch) if self.network.is_child(port) => {
                 self.sums.state(now, port, epoch);
             }
-            PortMessage::Missed(epoch) if self.network.up() == Some(port) => self.was_missed(now, epoch),
+            PortMessage::Missed(epoch) if self.network.up() == Some(port) => self.was_missed(epoch),
             PortMessage::State(_) | PortMessage::Missed(_) => {}
+            PortMessage::Left => {
+                if self.suspected.take_if(|suspected| *suspected == port).is_some() {
+                    self.patience = (self.patience + PATIENT).min(PATIENCE);
+                }
+                self.network.handle(now, port, message);
+            }
             PortMessage::Hello(_)
             | PortMessage::Join
             | PortMessage::Grant(_)
             | PortMessage::Refuse
             | PortMessage::Leave
-            | PortMessage::Left
             | PortMessage::Seek(_)
             | PortMessage::Number(_)
             | PortMessage::Return(_)
@@ -75,9 +72,10 @@ impl Node {
             self.sums.disown(port);
         }
         if core::mem::replace(&mut self.changes, self.network.changes()) != self.network.changes() {
-            self.misses = (0, 0);
-            self.doubt = false;
+            (self.asks_parent, self.unanswered) = (false, 0);
             self.sums.break_off();
+            // What was said in this epoch may have been taken by the parent before.
+            self.sums.fall_silent();
         }
         if self.network.up().is_none() {
             self.sums.fall_silent();
@@ -120,7 +118,7 @@ impl Node {
         }
         let number = up.and_then(|up| CellId::new(self.network.number_at(up)?.into()).ok());
         self.parent = up.map(|up| (up, number));
-        self.sign = Sign::Nothing;
+        self.heard_parent = false;
         Begin {
             epoch,
             at,
@@ -141,13 +139,16 @@ impl Node {
     ) {
         let begin = self.freeze(epoch, now - age, period);
         self.sums.begin(&begin, own.map(|torque| torque.exact()).as_ref());
-        self.sums.heard_after(age);
-        if self.misses.1 > 0 {
-            self.sums.watch();
+        // What waited aside is no sign of a late machine.
+        if !self.waits_for_children {
+            self.sums.heard_after(age);
         }
-        if self.doubt && self.network.up().is_some() {
-            self.sums.hold();
-            self.network.ask_parent();
+        if self.asks_parent {
+            // Without an answer the parent is lost in this epoch, and what was not said is free for another.
+            if self.unanswered >= self.patience.div_ceil(FORGETS) {
+                self.sums.hold();
+            }
+            self.ask_parent();
         }
         self.handle_sums(now);
     }
@@ -157,15 +158,12 @@ impl Node {
         if let Some((port, Some(parent))) = self.parent
             && parent == from
         {
-            if self.network.hears(port) {
-                // A late sum of an earlier epoch is a sign of life too.
-                self.sign = if self.sign == Sign::Nothing { Sign::Sum } else { self.sign };
-                self.sums.release();
-            }
+            // A late sum of an earlier epoch is a sign of life too.
+            self.heard_parent |= self.network.hears(port);
         } else if let Some(port) = self.network.child_with(from.get())
             && self.network.hears(port)
         {
-            // A parent's sum may have waited aside; a child's is heard as it comes.
+            // Unlike a parent's, a child's is heard as it comes.
             self.sums.heard_after(age);
             self.sums.take(now, port, epoch, words);
             self.handle_sums(now);
@@ -185,7 +183,12 @@ impl Node {
         }
         match self.sums.check(now) {
             Check::NotYet => return,
-            Check::Now => self.judge(now),
+            Check::Now => {
+                self.judge(now);
+                if self.asks_parent {
+                    self.ask_parent();
+                }
+            }
             Check::Late => {}
         }
         if core::mem::replace(&mut self.asked, false) {
@@ -199,55 +202,45 @@ impl Node {
         for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
             self.network.say(port, PortMessage::Missed(epoch));
         }
-        if self.sums.is_held() {
-            self.misses.1 = self.misses.1.saturating_add(1);
-            if self.misses.1 >= MISSES + self.patience {
-                // It was silent all this epoch, so the parent takes no more.
-                self.lose_parent(now, Lost::Done);
-            }
-            return;
-        }
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
-        let (_, before) = self.misses;
-        self.misses = match (self.parent, self.sign) {
-            (Some((UPLINK, _)) | None, _) => (0, 0),
-            _ if !said => (before, before),
-            (_, Sign::Sum) => {
-                self.patience = self.patience.saturating_sub(1);
-                (before, 0)
+        if self.asks_parent {
+            self.unanswered += 1;
+            if self.unanswered > self.patience.div_ceil(FORGETS) {
+                // Of who was silent all this epoch it takes no more.
+                self.lose_parent(now, if said { Lost::Unsure } else { Lost::Done });
             }
-            (_, Sign::Nothing | Sign::Missed) => (before, before + 1),
-        };
-        if said {
-            self.doubt = self.misses.1 > 0 && (self.doubt || self.sign == Sign::Nothing);
+        } else if self.heard_parent {
+            self.patience = self.patience.saturating_sub(1);
+        } else {
+            self.asks_parent = said && self.parent.is_some_and(|(port, _)| port != UPLINK);
         }
-        self.give_up(now);
+        let well = said && missed == 0 && !self.asks_parent && self.sums.awaits_children();
+        self.steady = if well { (self.steady + 1).min(STEADY) } else { 0 };
     }
 
-    /// The parent says that it did not take a sum: it has to be told anew whom they are for.
-    fn was_missed(&mut self, now: Micros, epoch: Epoch) {
+    /// The parent says that it did not take a sum: it has to be told anew whom they are for, and asked whether it hears
+    /// this cell at all.
+    fn was_missed(&mut self, epoch: Epoch) {
         self.sums.break_off();
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
         let before = self.sums.epoch().is_some_and(|present| epoch.next() == present);
-        if self.sums.epoch() == Some(epoch) && said && !self.sums.is_judged() {
-            self.sign = Sign::Missed;
-        } else if (self.sums.epoch() == Some(epoch) && said) || (before && self.said_before) {
+        if (self.sums.epoch() == Some(epoch) && said) || (before && self.said_before) {
             // It was thought to be taken.
-            self.misses.1 = self.misses.0 + 1;
-            self.give_up(now);
+            self.asks_parent = true;
+            self.ask_parent();
         }
+    }
+
+    /// Asks the parent whether it is there; it is looked for the answer before the next joints.
+    fn ask_parent(&mut self) {
+        self.network.ask_parent();
         self.sums.watch();
     }
 
-    fn give_up(&mut self, now: Micros) {
-        if self.misses.1 >= MISSES + self.patience {
-            self.lose_parent(now, if self.doubt { Lost::Unsure } else { Lost::Done });
-        }
-    }
-
+    /// The parent is lost that did not answer.
     fn lose_parent(&mut self, now: Micros, how: Lost) {
-        (self.misses, self.doubt) = ((0, 0), false);
-        self.patience = (self.patience + PATIENT).min(PATIENCE);
+        (self.asks_parent, self.unanswered) = (false, 0);
+        self.suspected = self.network.up();
         self.sums.fall_silent();
         self.network.lose_parent(now, how);
         self.after_network(now);
