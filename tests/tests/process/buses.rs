@@ -74,8 +74,14 @@ impl Listener {
         Message::decode(&packet).ok()
     }
 
-    /// Waits for messages until somebody has enough.
-    fn waits_until(&self, what: &str, mut enough: impl FnMut(&Message) -> bool) {
+    /// Says something to everyone.
+    pub(crate) fn sends(&self, message: &Message) {
+        let frames: Vec<_> = message.encode().frames(self.format).collect();
+        self.bus.send(&frames).unwrap();
+    }
+
+    /// Hears messages until somebody has enough, or until `PATIENCE` is over: whether somebody had.
+    pub(crate) fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
         let mut inbox = Inbox::new();
         let give_up = Instant::now() + PATIENCE;
         while Instant::now() < give_up {
@@ -84,11 +90,15 @@ impl Listener {
             for received in inbox.frames() {
                 let message = self.message(Micros(received.at_nanos / 1_000), &received.frame);
                 if message.is_some_and(|message| enough(&message)) {
-                    return;
+                    return true;
                 }
             }
         }
-        panic!("waited {PATIENCE:?} for {what} on {}", self.bus.name());
+        false
+    }
+
+    fn waits_until(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
+        assert!(self.hears(enough), "waited {PATIENCE:?} for {what} on {}", self.bus.name());
     }
 
     /// Waits until each of these cells has said a torque that is not zero.

@@ -14,6 +14,7 @@
 pub(crate) mod buses;
 pub(crate) mod log;
 pub(crate) mod replay;
+pub(crate) mod sums;
 pub(crate) mod vcan;
 pub(crate) mod whole;
 

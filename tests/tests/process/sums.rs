@@ -1,0 +1,230 @@
+//! Cells in a grid that answer with sums along their tree, on a bus of either format: whole, broken and mended.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use gateway::generate::{Reply, Wanted, generate};
+use protocol::can::Format;
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage};
+use rustix::process::Signal;
+
+use super::buses::{Listener, mixed_skin};
+use super::{Ended, PATIENCE, PRESSED, Place, Running, is_stopped, until};
+
+/// Cells, in rows of four; those at two opposite corners are roots.
+pub(crate) const CELLS: u8 = 12;
+pub(crate) const ROOTS: [u8; 2] = [1, 12];
+
+/// Where the ports of a cell of the grid lead: left, right, up, down.
+pub(crate) fn neighbors(cell: u8) -> [u8; 4] {
+    let (row, column) = ((cell - 1) / 4, (cell - 1) % 4);
+    [
+        if column > 0 { cell - 1 } else { 0 },
+        if column < 3 { cell + 1 } else { 0 },
+        if row > 0 { cell - 4 } else { 0 },
+        if row < 2 { cell + 4 } else { 0 },
+    ]
+}
+
+/// `skin.toml`: a grid, with joints so seldom that a machine that does something else too keeps up.
+pub(crate) fn grid(place: &Place, format: Format) {
+    wired(place, format, neighbors);
+}
+
+pub(crate) fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
+    let wanted = Wanted { cells: CELLS.into(), reply: Reply::Sum, ..Wanted::default() };
+    let classic: &[_] = if format == Format::Classic { &["vcan0"] } else { &[] };
+    let text = mixed_skin(&generate(&wanted).unwrap(), classic);
+    let mut node = 0;
+    let mut lines = Vec::new();
+    for line in text.lines() {
+        let value = line.split_once(" = ").map(|(_, value)| value);
+        match line.split(' ').next() {
+            Some("node") => node = value.unwrap().parse().unwrap(),
+            Some("root") => continue,
+            Some("joint_broadcast_hz") => {
+                lines.push("joint_broadcast_hz = 20.0".to_owned());
+                continue;
+            }
+            Some("slot_us") => {
+                lines.push("slot_us = 6000".to_owned());
+                continue;
+            }
+            Some("neighbors") => {
+                lines.push(format!("neighbors = {:?}", neighbors(node)));
+                lines.push(format!("root = {}", ROOTS.contains(&node)));
+                continue;
+            }
+            _ => {}
+        }
+        lines.push(line.to_owned());
+    }
+    place.write("skin.toml", &(lines.join("\n") + "\n"));
+}
+
+/// A bench that records nothing.
+pub(crate) fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
+    let words = format!(
+        "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json {more}",
+        place.kind()
+    );
+    place.start("gateway", &words)
+}
+
+/// Waits until the roots' sums of three epochs in a row hold so many cells.
+pub(crate) fn holds(listener: &Listener, wanted: u32) {
+    let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
+    // A root that found another way is in another one's sum.
+    let mut below = BTreeSet::new();
+    listener.sends(&Message::Report);
+    let mut seen = Vec::new();
+    let whole = listener.hears(|message| match message {
+        Message::Joints { epoch: of, .. } => {
+            let roots = counts.iter().filter(|(root, _)| !below.contains(*root));
+            let count: u32 = roots.map(|(_, &count)| u32::from(count)).sum();
+            seen.push(count);
+            row = if epoch.is_some() && count == wanted { row + 1 } else { 0 };
+            (epoch, counts) = (Some(*of), BTreeMap::new());
+            row == 3
+        }
+        Message::Sum { from, epoch: of, count, .. } if ROOTS.contains(&from.get()) && epoch == Some(*of) => {
+            let most = counts.entry(from.get()).or_default();
+            *most = (*count).max(*most);
+            false
+        }
+        Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } => {
+            if tree.parent == Some(0) {
+                below.remove(&cell.get())
+            } else {
+                below.insert(cell.get())
+            };
+            false
+        }
+        _ => false,
+    });
+    assert!(whole, "waited {PATIENCE:?} for sums of {wanted} cells; they were of {seen:?}");
+}
+
+/// Waits until, by what cells say, each of these has a way to a root that leads over these only.
+fn have_ways(listener: &Listener, cells: &BTreeSet<u8>) {
+    let mut parents = BTreeMap::new();
+    let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
+        let up = |cell: &u8| parents.get(cell).copied().flatten();
+        let mut way = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
+        way.find(|cell| !cells.contains(cell)) == Some(0)
+    };
+    listener.sends(&Message::Report);
+    let all = listener.hears(|message| {
+        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } = message {
+            parents.insert(cell.get(), tree.parent);
+        }
+        cells.iter().all(|&cell| leads(&parents, cell))
+    });
+    assert!(all, "waited {PATIENCE:?} for ways of {cells:?}: {parents:?}");
+}
+
+/// Ends a bench, and sees that all is accounted for.
+pub(crate) fn end(place: &Place, bench: Running) -> Ended {
+    bench.signal(Signal::TERM);
+    let ended = bench.end().well();
+    place.is_left_clean();
+    place.summary().adds_up();
+    ended
+}
+
+/// Sums go round a cell that is killed, and one that hangs; who comes back is in them again.
+pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
+    grid(place, format);
+    place.scenario(PRESSED);
+    let bench = unrecorded(place, 120.0, "");
+    bench.hears_the_loop();
+    let guest = Listener::on(place, "vcan0", format);
+    holds(&guest, 12);
+
+    super::signal(bench.cell(6), Signal::KILL);
+    holds(&guest, 11);
+    bench.tells(6, "fallen silent");
+
+    let stopped = bench.cell(7);
+    super::signal(stopped, Signal::STOP);
+    until("a stopped cell", || is_stopped(stopped).then_some(()));
+    holds(&guest, 10);
+    super::signal(stopped, Signal::CONT);
+    holds(&guest, 11);
+
+    // It is told again when to speak, and what it feels.
+    let words = format!("--bus vcan0 --bus-kind {} --node 6 --skin skin.toml", place.kind());
+    let again = place.start("cell-node", &words);
+    bench.hears("cell 6 on vcan0 started anew");
+    holds(&guest, 12);
+    bench.signal(Signal::TERM);
+    bench.end().well();
+    drop(again);
+    let summary = place.summary();
+    summary.adds_up();
+    assert!(summary.of_bus("/network/parent_changes") >= 12, "{:#}", summary.0);
+    assert!(summary.of_bus("/sums/contributions/missing") > 0, "{:#}", summary.0);
+}
+
+/// Without a touch, hellos tell who is gone, and the rest finds another way.
+pub(crate) fn keeps_ways_without_a_touch(place: &Place, format: Format) {
+    grid(place, format);
+    place.scenario(PRESSED.split("[[touch]]").next().unwrap());
+    let bench = unrecorded(place, 120.0, "");
+    bench.hears_the_loop();
+    let guest = Listener::on(place, "vcan0", format);
+    let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
+    have_ways(&guest, &cells);
+    super::signal(bench.cell(6), Signal::KILL);
+    cells.remove(&6);
+    have_ways(&guest, &cells);
+    let stopped = bench.cell(7);
+    super::signal(stopped, Signal::STOP);
+    cells.remove(&7);
+    have_ways(&guest, &cells);
+    super::signal(stopped, Signal::CONT);
+    cells.insert(7);
+    have_ways(&guest, &cells);
+    end(place, bench);
+}
+
+/// Wires are cut while the loop runs: one of many in one direction, and all of the cell in a corner.
+const CUTS: &str = r#"
+[[fault]]
+at_s = 2.0
+kind = "cut"
+cells = [6, 5]
+one_way = true
+
+[[fault]]
+at_s = 5.0
+kind = "cut"
+cells = [3, 4]
+for_s = 8.0
+
+[[fault]]
+at_s = 5.0
+kind = "cut"
+cells = [8, 4]
+for_s = 8.0
+"#;
+
+/// Who has no way any more is named, and the rest finds another.
+pub(crate) fn goes_on_without_a_wire(place: &Place, format: Format) {
+    grid(place, format);
+    place.scenario(&format!("{PRESSED}{CUTS}"));
+    let bench = unrecorded(place, 120.0, "");
+    bench.hears_the_loop();
+    let guest = Listener::on(place, "vcan0", format);
+    bench.hears("scenario: Cut the wires one way, from cell 6 and cell 5 on vcan0");
+    holds(&guest, 12);
+    bench.hears("cell 4 on vcan0 has no way to a root: no sum holds it since");
+    holds(&guest, 11);
+    bench.hears("scenario: Mend the wires between cell 8 and cell 4 on vcan0");
+    bench.hears("cell 4 on vcan0 has a way to a root again, after");
+    holds(&guest, 12);
+    end(place, bench);
+    let summary = place.summary();
+    assert!(summary.figure("/buses/0/network/longest_without_way_s") > 1.0, "{:#}", summary.0);
+    assert_eq!(summary.0["buses"][0]["network"]["without_way"].as_array().unwrap().len(), 0);
+}
