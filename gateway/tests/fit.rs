@@ -83,6 +83,7 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
 fn what_can_does_not_allow_is_refused_in_one_line() {
     let skin = "gateway/examples/ur5-253.toml";
     for (arguments, said) in [
+        ("--nominal 0", "nominal bit rate 0 bit/s: CAN allows 10000 to 1000000 (10k to 1M)"),
         ("--nominal 2M --data 5M", "nominal bit rate 2000000 bit/s: CAN allows 10000 to 1000000 (10k to 1M)"),
         (
             "--nominal 1M --data 9M",

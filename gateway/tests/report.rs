@@ -57,7 +57,7 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     );
     assert_eq!(
         refuses(&folder, "run.log", 2),
-        "run.log is a candump log: a report needs a recording, which `gateway run SKIN --record run.mcap` makes"
+        format!("run.log is no MCAP recording, and frames alone are not enough: {made}")
     );
     assert!(refuses(&folder, "picture.mcap", 1).contains("is a zip archive"));
     assert!(refuses(&folder, "nowhere.mcap", 1).starts_with("nowhere.mcap: "));

@@ -98,10 +98,13 @@ impl Fit {
         let rates = |format| match (format, self.data) {
             (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage),
             (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage),
-            (Format::Fd, None) => Err(Failure::usage(format!(
-                "CAN FD needs a data bit rate: say --data, {nominal} to {}, or --format classic",
-                BitRates::GREATEST_DATA
-            ))),
+            (Format::Fd, None) => {
+                BitRates::classic(nominal).map_err(Failure::usage)?;
+                Err(Failure::usage(format!(
+                    "CAN FD needs a data bit rate: say --data, {nominal} to {}, or --format classic",
+                    BitRates::GREATEST_DATA
+                )))
+            }
         };
         formats.into_iter().map(|format| Ok((format, rates(format)?))).collect::<Result<_, _>>().map(Some)
     }

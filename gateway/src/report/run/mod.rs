@@ -43,7 +43,8 @@ pub enum ReportError {
     Capture(#[from] CaptureError),
     /// Frames alone.
     #[error(
-        "{name} is a candump log: a report needs a recording, which `gateway run SKIN --record run.mcap` makes"
+        "{name} is no MCAP recording, and frames alone are not enough: `gateway run SKIN --record run.mcap` makes what a \
+         report needs"
     )]
     Log {
         /// Its name.
