@@ -156,7 +156,7 @@ pub struct Node {
     asks_parent: bool,
     /// Epochs in a row in which it did not.
     unanswered: u16,
-    /// How many of them are borne, times 16: whose parents were there all the time when they were lost is on a machine that is
+    /// How many of them are borne, in sixteenths: who lost parents that were there all the time is on a machine that is
     /// late, and would only lose the next one too.
     patience: u16,
     /// The port of a parent that was lost and may have been there all the time.
@@ -328,10 +328,8 @@ impl Node {
     /// Takes in that time has passed. Harmless when called early.
     pub fn handle_timeout(&mut self, now: Micros) {
         if self.waits_for_children && now >= self.sums.late_at_next() {
-            // No joints came, or they have been heard by now.
+            // No joints came: from now on they wake it again.
             self.steady = 0;
-            self.waits_for_children = false;
-            self.hears_changed = true;
         }
         self.network.handle_time(now);
         self.after_network(now);

@@ -145,7 +145,7 @@ impl Node {
         }
         if self.asks_parent {
             // Without an answer the parent is lost in this epoch, and what was not said is free for another.
-            if self.unanswered >= self.patience.div_ceil(FORGETS) {
+            if self.unanswered >= self.borne() {
                 self.sums.hold();
             }
             self.ask_parent();
@@ -205,7 +205,7 @@ impl Node {
         let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
         if self.asks_parent {
             self.unanswered += 1;
-            if self.unanswered > self.patience.div_ceil(FORGETS) {
+            if self.unanswered > self.borne() {
                 // Of who was silent all this epoch it takes no more.
                 self.lose_parent(now, if said { Lost::Unsure } else { Lost::Done });
             }
@@ -229,6 +229,11 @@ impl Node {
             self.asks_parent = true;
             self.ask_parent();
         }
+    }
+
+    /// Epochs in a row without an answer that are borne.
+    const fn borne(&self) -> u16 {
+        self.patience.div_ceil(FORGETS)
     }
 
     /// Asks the parent whether it is there; it is looked for the answer before the next joints.
