@@ -16,7 +16,7 @@
 use thiserror::Error;
 
 use crate::can::{self, Format, Frame};
-use crate::id::Id;
+use crate::id::{Command, Id, Kind};
 use crate::time::{Micros, Span};
 
 /// CRC-16/CCITT-FALSE, which the catalogue of CRCs calls IBM-3740.
@@ -207,7 +207,7 @@ pub enum Paired {
 
 /// The waiting first half of a packet in two classic frames, one of these per identifier.
 ///
-/// Halves come in order and within [`Half::WITHIN`] of each other. When the CRC of a pair fails, only
+/// Halves come in order and within [`Half::within`] of each other. When the CRC of a pair fails, only
 /// the older half is dropped, so that a lost frame costs one packet and not every later one.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Half {
@@ -223,11 +223,21 @@ struct Waiting {
 }
 
 impl Half {
-    /// The longest time between the two halves.
-    pub const WITHIN: Span = Span::from_millis(4);
+    /// The longest time between the arrivals of two halves of joints and of what answers them, in µs: less than the
+    /// 16 ms after which the next ones come, for of 65 536 pairs of halves of two packets one has a right CRC.
+    const WITHIN_A_PERIOD: Span = Span::from_millis(15);
+    /// The longest time between those of everything else, most of which is said once.
+    const WITHIN: Span = Span::from_millis(100);
 
     /// Nothing waiting.
     pub const NONE: Self = Self { waiting: None };
+
+    /// The longest time between the arrivals of the two halves of a packet.
+    #[must_use]
+    pub fn within(id: Id) -> Span {
+        let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
+        if is_periodic { Self::WITHIN_A_PERIOD } else { Self::WITHIN }
+    }
 
     /// Takes the next classic frame of this identifier.
     ///
@@ -243,7 +253,7 @@ impl Half {
         let (head, tail) = bytes.split_at_mut(older.data.len());
         head.copy_from_slice(&older.data);
         tail.copy_from_slice(&data);
-        let (packet, in_time) = (Packet::decode(id, &bytes), at.since(older.since) <= Self::WITHIN);
+        let (packet, in_time) = (Packet::decode(id, &bytes), at.since(older.since) <= Self::within(id));
         let Some(packet) = packet.as_ref().ok().filter(|_| in_time) else {
             let of_one_packet = in_time || packet.is_ok();
             if let Some(newer) = &mut self.waiting {
@@ -259,7 +269,6 @@ impl Half {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::id::{Command, Kind};
     use proptest::prelude::*;
 
     fn packet() -> impl Strategy<Value = Packet> {
@@ -292,7 +301,25 @@ mod tests {
         assert_eq!(push(1_000, &halves(2)[0]), Paired::Incomplete);
         assert_eq!(push(1_100, &halves(2)[1]), Paired::Whole(make(2)));
         assert_eq!(push(9_000, &halves(3)[0]), Paired::Waiting);
-        assert_eq!(push(13_001, &halves(3)[1]), Paired::Incomplete, "more than 4 ms apart");
+        assert_eq!(push(24_001, &halves(3)[1]), Paired::Incomplete, "more than 15 ms apart");
+    }
+
+    #[test]
+    fn what_is_said_once_may_take_longer() {
+        let cell = |kind| Id { kind, node: 12 };
+        let periodic = [Id::command(Command::Joints), cell(Kind::Sum), cell(Kind::Torque)];
+        let once =
+            [Id::command(Command::Halt), cell(Kind::Network), cell(Kind::Configure), cell(Kind::Stimulus)];
+        let longest = periodic.map(|id| (id, 15_000)).into_iter().chain(once.map(|id| (id, 100_000)));
+        for (id, longest) in longest {
+            let packet = Packet { id, words: [7; WORDS], epoch: Epoch(1), count: 1 };
+            let came = [longest, longest + 1].map(|apart| {
+                let mut half = Half::NONE;
+                let halves = packet.frames(Format::Classic).zip([0, apart]);
+                halves.map(|(frame, at)| half.push(Micros(at), id, frame.data()).unwrap()).last().unwrap()
+            });
+            assert_eq!(came, [Paired::Whole(packet), Paired::Incomplete], "{id:?}");
+        }
     }
 
     #[test]
@@ -301,7 +328,7 @@ mod tests {
         let make = |epoch| Packet { id, words: [7; WORDS], epoch: Epoch(epoch), count: 6 };
         let halves = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
         let damaged = Frame::classic(halves(2)[0].raw_id(), &[9; 8]).unwrap();
-        for (first, apart) in [(halves(2)[0], 4_001), (damaged, 100)] {
+        for (first, apart) in [(halves(2)[0], 15_001), (damaged, 100)] {
             let mut half = Half::NONE;
             let mut push = |at, frame: &Frame| half.push(Micros(at), id, frame.data()).unwrap();
             assert_eq!(push(0, &first), Paired::Waiting);
@@ -310,8 +337,8 @@ mod tests {
             assert_eq!(push(50_100, &halves(3)[1]), Paired::Whole(make(3)));
             // Halves of two packets, each of which lost its other one, are counted each.
             assert_eq!(push(90_000, &halves(4)[0]), Paired::Waiting);
-            assert_eq!(push(100_000, &halves(5)[0]), Paired::Incomplete);
-            assert_eq!(push(110_000, &halves(6)[0]), Paired::Incomplete);
+            assert_eq!(push(110_000, &halves(5)[0]), Paired::Incomplete);
+            assert_eq!(push(130_000, &halves(6)[0]), Paired::Incomplete);
         }
     }
 

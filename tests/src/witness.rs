@@ -253,8 +253,10 @@ impl Witness {
         }
         // An equal first half is as good as the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
-        let whole = truth.half == 1
-            && last.is_some_and(|(waits, since)| Some(waits) == first && stood.since(since) <= Half::WITHIN);
+        let in_time =
+            |since| truth.packet.is_some_and(|packet| stood.since(since) <= Half::within(packet.id));
+        let whole =
+            truth.half == 1 && last.is_some_and(|(waits, since)| Some(waits) == first && in_time(since));
         *last = if whole { None } else { Some((*frame, stood)) };
         whole
     }

@@ -372,7 +372,7 @@ impl Node {
         let Some(slot) = self.slots().iter().position(|&heard| heard == Some(id)) else { return };
         let packet = match self.format {
             Format::Fd => Packet::from_fd(frame),
-            Format::Classic => match self.pair(now, id, slot, frame) {
+            Format::Classic => match self.pair(now - age, id, slot, frame) {
                 Some(result) => result,
                 None => return,
             },
@@ -388,7 +388,7 @@ impl Node {
     /// Two classic frames make a packet; `None` while there is none.
     fn pair(
         &mut self,
-        now: Micros,
+        arrived: Micros,
         id: Id,
         slot: usize,
         frame: &Frame,
@@ -397,7 +397,7 @@ impl Node {
         if frame.format() != Format::Classic {
             return Some(Err(PacketError::Length { expected: 8, got: frame.data().len() }));
         }
-        match half.push(now, id, frame.data()) {
+        match half.push(arrived, id, frame.data()) {
             Ok(Paired::Waiting) => None,
             Ok(Paired::Incomplete) => {
                 count(&mut self.refused.incomplete);

@@ -367,6 +367,16 @@ fn the_classic_format_works_in_halves() {
     let first = joints(1).encode().frames(Format::Classic).next().unwrap();
     node.handle_frame(NOW, Span(0), &first);
     assert_eq!(hear(&mut node, &joints(2)), [torque(2, -2.0)]);
+    // How far apart they are is a matter of when they arrived, not of when the cell came to hear them.
+    let within = Half::within(Id::command(Command::Joints));
+    let mut apart = |epoch, second: Micros, age| {
+        let mut halves = joints(epoch).encode().frames(Format::Classic);
+        node.handle_frame(NOW, Span(0), &halves.next().unwrap());
+        node.handle_frame(second, age, &halves.next().unwrap());
+        drain(&mut node)
+    };
+    assert_eq!(apart(3, NOW + within + Span(7), Span(7)), [torque(3, -2.0)]);
+    assert_eq!(apart(4, NOW + within + Span(7), Span(6)), []);
 }
 
 #[test]

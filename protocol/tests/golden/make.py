@@ -788,13 +788,14 @@ def classic():
     half(a[1], 1, second, 120)
     half(b[1], 1, second, 120)
 
-    log.title("exactly 4 ms apart is a pair; 1 us more is not: the packet is counted, once")
-    half(a[2], 0, first, 1000)
-    half(a[2], 1, second, 4000)
-    half(a[3], 0, first, 1000)
-    half(a[3], 1, "incomplete", 4001)
-    half(a[4], 0, first, 4001)
-    half(a[4], 1, second, 150)
+    for (near, far, after), ms in ((a[2:5], 15), ([stimulus(12, None, PRESSED)] * 3, 100)):
+        log.title(f"exactly {ms} ms apart is a pair; 1 us more is not: the packet is counted, once")
+        half(near, 0, first, 1000)
+        half(near, 1, second, ms * 1000)
+        half(far, 0, first, 1000)
+        half(far, 1, "incomplete", ms * 1000 + 1)
+        half(after, 0, first, ms * 1000 + 1)
+        half(after, 1, second, 150)
 
     log.title("a lost second half costs its own packet only")
     half(a[5], 0, first, 1000)
