@@ -223,8 +223,8 @@ struct Waiting {
 }
 
 impl Half {
-    /// The longest time between the arrivals of two halves of joints and of what answers them, in µs: less than the
-    /// 16 ms after which the next ones come, for of 65 536 pairs of halves of two packets one has a right CRC.
+    /// The longest time between the arrivals of two halves of joints and of what answers them: less than the 16 ms
+    /// after which the next ones usually come, for of 65 536 pairs of halves of two packets one has a right CRC.
     const WITHIN_A_PERIOD: Span = Span::from_millis(15);
     /// The longest time between those of everything else, most of which is said once.
     const WITHIN: Span = Span::from_millis(100);

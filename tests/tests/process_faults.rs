@@ -260,7 +260,7 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
     let odd = odd_frames();
     for _ in 0..3 {
         for (frame, _) in &odd {
-            guest.0.send(&[*frame]).unwrap();
+            guest.bus.send(&[*frame]).unwrap();
         }
     }
     guest.waits_for("torques after that", torque_of(8));

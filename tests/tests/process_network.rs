@@ -17,15 +17,16 @@ use cell_node::flash;
 use cell_node::node::Identity;
 use gateway::generate::{Format as Wanted, Reply, generate};
 use gateway::network::Uplinks;
+use process::guest::Guest;
 use process::{PATIENCE, Place, Running, names, until};
-use protocol::bus::{Bus, Inbox};
-use protocol::can::{Format, Frame};
+use protocol::bus::Inbox;
+use protocol::can::Frame;
 use protocol::fixed::Q5_10;
-use protocol::id::{CellId, Id, Node};
+use protocol::id::{CellId, Node};
 use protocol::message::{
     From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, Tree,
 };
-use protocol::packet::{Epoch, Half, Packet, Paired, data_id};
+use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Reply as Answers, Slots};
 use protocol::skin::{Skin, Wires};
 use protocol::time::Micros;
@@ -58,12 +59,10 @@ fn cells(place: &Place, which: &str, more: &str) -> Running {
 
 /// The gateway's side of the bus: the other end of the roots' wires, and an ear.
 struct Side {
-    bus: Bus,
-    format: Format,
+    guest: Guest,
     cells: usize,
     roots: Vec<(CellId, Lane)>,
     uplinks: Uplinks,
-    halves: BTreeMap<Id, Half>,
     start: Instant,
     heartbeats: BTreeMap<u8, Heartbeat>,
     trees: BTreeMap<u8, Tree>,
@@ -76,12 +75,10 @@ impl Side {
         let wires: Wires = skin.wires(0);
         let roots: Vec<_> = wires.roots().collect();
         Self {
-            bus: place.guest().0,
-            format: skin.buses[0].format,
+            guest: Guest::on(place, "vcan0", skin.buses[0].format),
             cells: skin.cells.len(),
             uplinks: Uplinks::new(roots.len(), 0, Micros(0)),
             roots,
-            halves: BTreeMap::new(),
             start: Instant::now(),
             heartbeats: BTreeMap::new(),
             trees: BTreeMap::new(),
@@ -91,11 +88,6 @@ impl Side {
 
     fn now(&self) -> Micros {
         Micros(u64::try_from(self.start.elapsed().as_micros()).unwrap())
-    }
-
-    fn say(&self, message: &Message) {
-        let frames: Vec<_> = message.encode().frames(self.format).collect();
-        self.bus.send(&frames).unwrap();
     }
 
     /// Lets everything happen until it is as wanted.
@@ -120,14 +112,14 @@ impl Side {
         loop {
             self.uplinks.handle_time(self.now());
             while let Some((root, message)) = self.uplinks.poll_transmit() {
-                self.bus.send(&[self.roots[root].1.frame(message)]).unwrap();
+                self.guest.bus.send(&[self.roots[root].1.frame(message)]).unwrap();
             }
             let left = end.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;
             }
-            self.bus.wait(Some(left.min(Duration::from_millis(1)))).unwrap();
-            self.bus.receive(&mut inbox).unwrap();
+            self.guest.bus.wait(Some(left.min(Duration::from_millis(1)))).unwrap();
+            self.guest.bus.receive(&mut inbox).unwrap();
             for received in inbox.frames() {
                 self.take(&received.frame);
             }
@@ -143,30 +135,22 @@ impl Side {
             }
             return;
         }
-        let Some(packet) = self.packet(now, frame) else { return };
-        match Message::decode(&packet).unwrap() {
-            Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } => {
+        match self.guest.message(now, frame) {
+            Some(Message::Network {
+                from: Node::Cell(cell),
+                page: NetworkPage::Heartbeat(heartbeat),
+                ..
+            }) => {
                 self.uplinks.claimed(cell);
                 self.heartbeats.insert(cell.get(), heartbeat);
             }
-            Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } => {
+            Some(Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. }) => {
                 self.trees.insert(cell.get(), tree);
             }
-            Message::Sum { from, epoch, count, .. } => {
+            Some(Message::Sum { from, epoch, count, .. }) => {
                 self.sums.insert((epoch.0, from.get()), count);
             }
             _ => {}
-        }
-    }
-
-    fn packet(&mut self, now: Micros, frame: &Frame) -> Option<Packet> {
-        if self.format == Format::Fd {
-            return Some(Packet::from_fd(frame).unwrap());
-        }
-        let id = data_id(frame).unwrap();
-        match self.halves.entry(id).or_insert(Half::NONE).push(now, id, frame.data()).unwrap() {
-            Paired::Whole(packet) => Some(packet),
-            Paired::Waiting | Paired::Incomplete => None,
         }
     }
 
@@ -253,16 +237,20 @@ fn sums_reach_the_roots_whoever_shares_a_process() {
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).unwrap();
         let reply = Answers::Sum(Slots { slot_us, deepest, carry: true });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
-        side.say(&Message::Configure { to: Node::Everyone, tag: 1, request });
+        side.guest.sends(&Message::Configure { to: Node::Everyone, tag: 1, request });
         let touch = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-        side.say(&Message::Stimulus { to: Node::Everyone, from: From::Next, page: SensorPage::Skin(touch) });
+        side.guest.sends(&Message::Stimulus {
+            to: Node::Everyone,
+            from: From::Next,
+            page: SensorPage::Skin(touch),
+        });
         // A parent hears a child's sums from the epoch on that the child told it of.
         let (root, _) = side.roots[0];
         let give_up = Instant::now() + PATIENCE;
         let mut epoch = 0_u8;
         loop {
             epoch = epoch.wrapping_add(1);
-            side.say(&Message::Joints {
+            side.guest.sends(&Message::Joints {
                 epoch: Epoch(epoch),
                 joints: Joints { in_use: 6, ..Joints::default() },
             });
@@ -304,7 +292,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
         assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not start anew");
         assert!(heartbeat.sent.wrapping_sub(before[cell].sent) < 0x8000, "cell {cell} went on counting");
     }
-    side.say(&Message::Report);
+    side.guest.sends(&Message::Report);
     side.until("a tree again", Side::is_organised);
     until("nobody said anything else", || (shared.stderr().lines().count() == 1).then_some(()));
     assert_eq!(last.stderr(), "");

@@ -322,7 +322,7 @@ fn listen(place: &Place) -> (Heard, std::thread::JoinHandle<()>) {
     let into = std::sync::Arc::clone(&heard);
     let listen = move || {
         let mut inbox = protocol::bus::Inbox::new();
-        while guest.0.wait(None).and_then(|_| guest.0.receive(&mut inbox)).is_ok() {
+        while guest.bus.wait(None).and_then(|_| guest.bus.receive(&mut inbox)).is_ok() {
             let frames = inbox.frames().map(|received| (received.at_nanos, received.frame));
             into.lock().unwrap().extend(frames);
         }

@@ -357,7 +357,7 @@ fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
     server.prints("serving vcan0 at ");
     let replay = place.replay("many.log", "--patience 1 --loop 3");
     let guest = place.guest();
-    until("a frame", || guest.0.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
+    until("a frame", || guest.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
     server.signal(Signal::STOP);
     until("a stopped server", || process::is_stopped(server.pid()).then_some(()));
     let ended = replay.end();

@@ -5,7 +5,7 @@ mod process;
 
 use std::collections::BTreeMap;
 
-use process::buses::Listener;
+use process::guest::Guest;
 use process::log::Log;
 use process::sums::{
     CELLS, ROOTS, end, goes_on_without_a_wire, goes_round_a_cell, grid, holds, keeps_ways_without_a_touch,
@@ -23,7 +23,7 @@ fn the_gateway_hears_its_roots_and_nobody_else_and_every_cell_is_in_their_sums()
     place.scenario(PRESSED);
     let bench = unrecorded(&place, 60.0, "");
     bench.hears_the_loop();
-    holds(&Listener::on(&place, "vcan0", Format::Fd), CELLS.into());
+    holds(&Guest::on(&place, "vcan0", Format::Fd), CELLS.into());
     let said = bench.stderr();
     end(&place, bench);
     assert!(said.contains("the cells of vcan0 are a tree, "), "{said}");
@@ -53,7 +53,7 @@ fn a_recording_holds_every_sum_and_no_wire() {
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
     let bench = place.running_bench(60.0, "");
-    holds(&Listener::on(&place, "vcan0", Format::Fd), CELLS.into());
+    holds(&Guest::on(&place, "vcan0", Format::Fd), CELLS.into());
     end(&place, bench);
     let summary = place.summary();
     let log = Log::read(&place.read("run.log"), Format::Fd);
@@ -122,7 +122,7 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     let cells = place.start("cell-node", &words);
     let bench = unrecorded(&place, 60.0, "--no-spawn");
     bench.hears_the_loop();
-    holds(&Listener::on(&place, "vcan0", Format::Fd), 12);
+    holds(&Guest::on(&place, "vcan0", Format::Fd), 12);
     bench.signal(Signal::TERM);
     bench.end().well();
     drop((cells, server));

@@ -6,7 +6,8 @@
 mod process;
 
 use gateway::generate::{Wanted, generate};
-use process::buses::{Listener, carries, mixed_skin};
+use process::buses::{carries, mixed_skin};
+use process::guest::Guest;
 use process::vcan::{Vcan, tool};
 use process::{PRESSED, Place, Running, until};
 use protocol::bus::{BusKind, Choice};
@@ -42,7 +43,7 @@ fn run(place: &Place) -> Running {
 
 fn answers(place: &Place, bus: usize) {
     let (bus, format, kind) = BUSES[bus];
-    Listener::on_kind(place, bus, format, Choice::Only(kind)).waits_for_torques(1..=2);
+    Guest::on_kind(place, bus, format, Choice::Only(kind)).waits_for_torques(1..=2);
 }
 
 fn all_answer(place: &Place) {

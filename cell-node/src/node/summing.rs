@@ -11,10 +11,12 @@ use crate::contact::Torque;
 use crate::network::Lost;
 use crate::sum::{Begin, Check, Words};
 
-/// Epochs in a row without an answer that are borne, once a parent that was lost that way says that it was there and
-/// heard: so many more each time, and at most. One less after so many epochs with a sum of the parent.
+/// So many more epochs in a row without an answer are borne each time that a parent that was lost that way says that it
+/// was there and heard.
 const PATIENT: u16 = 2 * FORGETS;
+/// So many at most.
 const PATIENCE: u16 = 12 * FORGETS;
+/// One less after so many epochs with a sum of the parent.
 const FORGETS: u16 = 16;
 /// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
 pub(super) const STEADY: u8 = 8;

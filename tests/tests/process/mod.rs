@@ -12,14 +12,13 @@
 )]
 
 pub(crate) mod buses;
+pub(crate) mod guest;
 pub(crate) mod log;
 pub(crate) mod replay;
 pub(crate) mod sums;
 pub(crate) mod vcan;
 pub(crate) mod whole;
 
-use std::cell::RefCell;
-use std::collections::BTreeSet;
 use std::fs;
 use std::io::Read;
 use std::os::unix::process::ExitStatusExt;
@@ -30,9 +29,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use gateway::generate::{Format, Wanted, generate};
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
-use protocol::message::Message;
-use protocol::packet::Packet;
+use guest::Guest;
+use protocol::bus::BusKind;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -202,9 +200,7 @@ impl Place {
 
     /// Another client of its bus.
     pub(crate) fn guest(&self) -> Guest {
-        let options = Options { directory: Some(self.buses()), ..Options::default() };
-        let open = || Bus::open("vcan0", Choice::Only(self.kind), &options).ok();
-        Guest(until("the bus", open))
+        Guest::on(self, "vcan0", protocol::can::Format::Fd)
     }
 
     /// Processes of this place that live, with their command lines.
@@ -270,48 +266,6 @@ pub(crate) fn is_stopped(pid: Pid) -> bool {
 
 pub(crate) fn signal(pid: Pid, signal: Signal) {
     kill_process(pid, signal).unwrap();
-}
-
-/// Somebody else on an FD bus.
-pub(crate) struct Guest(pub(crate) Bus);
-
-impl Guest {
-    /// Waits for a message of a kind.
-    pub(crate) fn waits_for(&self, what: &str, wanted: impl Fn(&Message) -> bool) {
-        let mut inbox = Inbox::new();
-        let give_up = Instant::now() + PATIENCE;
-        while Instant::now() < give_up {
-            self.0.wait(Some(Duration::from_millis(100))).unwrap();
-            self.0.receive(&mut inbox).unwrap();
-            let packets = inbox.frames().filter_map(|received| Packet::from_fd(&received.frame).ok());
-            if packets.filter_map(|packet| Message::decode(&packet).ok()).any(|message| wanted(&message)) {
-                return;
-            }
-        }
-        panic!("waited {PATIENCE:?} for {what} on the bus");
-    }
-
-    /// Waits until this many joints have been on the bus since the loop began.
-    pub(crate) fn waits_for_epoch(&self, number: u8) {
-        let there = |message: &Message| matches!(message, Message::Joints { epoch, .. } if epoch.0 >= number);
-        self.waits_for(&format!("joints of epoch {number}"), there);
-    }
-
-    /// Waits until the robot has been seen in four positions.
-    pub(crate) fn waits_for_motion(&self) {
-        let seen = RefCell::new(BTreeSet::new());
-        self.waits_for("a robot that moves", |message| {
-            if let Message::Joints { joints, .. } = message {
-                seen.borrow_mut().insert(joints.positions);
-            }
-            seen.borrow().len() >= 4
-        });
-    }
-
-    pub(crate) fn sends(&self, message: &Message) {
-        let frames: Vec<_> = message.encode().frames(protocol::can::Format::Fd).collect();
-        self.0.send(&frames).unwrap();
-    }
 }
 
 /// Whether a bench has said of a cell, alone or with others, that it has done something.

@@ -8,7 +8,8 @@ use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
 use rustix::process::Signal;
 
-use super::buses::{Listener, mixed_skin};
+use super::buses::mixed_skin;
+use super::guest::Guest;
 use super::{Ended, PATIENCE, PRESSED, Place, Running, is_stopped, until};
 
 /// Cells, in rows of four; those at two opposite corners are roots.
@@ -72,13 +73,13 @@ pub(crate) fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
 }
 
 /// Waits until the roots' sums of three epochs in a row hold so many cells.
-pub(crate) fn holds(listener: &Listener, wanted: u32) {
+pub(crate) fn holds(guest: &Guest, wanted: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
     // A root that found another way is in another one's sum.
     let mut below = BTreeSet::new();
-    listener.sends(&Message::Report);
+    guest.sends(&Message::Report);
     let mut seen = Vec::new();
-    let whole = listener.hears(|message| match message {
+    let whole = guest.hears(|message| match message {
         Message::Joints { epoch: of, .. } => {
             let roots = counts.iter().filter(|(root, _)| !below.contains(*root));
             let count: u32 = roots.map(|(_, &count)| u32::from(count)).sum();
@@ -106,15 +107,15 @@ pub(crate) fn holds(listener: &Listener, wanted: u32) {
 }
 
 /// Waits until, by what cells say, each of these has a way to a root that leads over these only.
-fn have_ways(listener: &Listener, cells: &BTreeSet<u8>) {
+fn have_ways(guest: &Guest, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
         let up = |cell: &u8| parents.get(cell).copied().flatten();
         let mut way = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
         way.find(|cell| !cells.contains(cell)) == Some(0)
     };
-    listener.sends(&Message::Report);
-    let all = listener.hears(|message| {
+    guest.sends(&Message::Report);
+    let all = guest.hears(|message| {
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } = message {
             parents.insert(cell.get(), tree.parent);
         }
@@ -138,7 +139,7 @@ pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
     place.scenario(PRESSED);
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Listener::on(place, "vcan0", format);
+    let guest = Guest::on(place, "vcan0", format);
     holds(&guest, 12);
 
     super::signal(bench.cell(6), Signal::KILL);
@@ -172,7 +173,7 @@ pub(crate) fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Listener::on(place, "vcan0", format);
+    let guest = Guest::on(place, "vcan0", format);
     let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
     have_ways(&guest, &cells);
     super::signal(bench.cell(6), Signal::KILL);
@@ -215,7 +216,7 @@ pub(crate) fn goes_on_without_a_wire(place: &Place, format: Format) {
     place.scenario(&format!("{PRESSED}{CUTS}"));
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Listener::on(place, "vcan0", format);
+    let guest = Guest::on(place, "vcan0", format);
     bench.hears("scenario: Cut the wires one way, from cell 6 and cell 5 on vcan0");
     holds(&guest, 12);
     bench.hears("cell 4 on vcan0 has no way to a root: no sum holds it since");

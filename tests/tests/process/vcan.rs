@@ -3,8 +3,7 @@
 //! `tests/vcan` runs the programs that need it: each alone in a network of its own, where `vcan0` is there with
 //! MTU 72 and up, and nobody else's interfaces are.
 
-use std::cell::RefCell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -13,10 +12,9 @@ use std::process::{Child, Command, Output, Stdio};
 use gateway::generate::{Wanted, generate};
 use protocol::can::Frame;
 use protocol::candump::{Line, parse, parse_frame};
-use protocol::id::{Id, Kind, Node};
-use protocol::message::{Message, NetworkPage, State};
+use protocol::id::{Id, Kind};
 
-use super::{Guest, Place, until};
+use super::{Place, until};
 
 /// Sees that an interface is there and that it is nobody else's.
 pub(crate) fn needs(interface: &str) {
@@ -100,24 +98,6 @@ pub(crate) fn cansend(place: &Place, frame: &str) {
     let printed = place.start("gateway", &format!("frame {frame}")).end().well().stdout;
     for line in printed.lines() {
         tool(&format!("cansend vcan0 {line}"));
-    }
-}
-
-impl Guest {
-    /// Waits until the cells 1 to so many have said that they have their numbers and parameters.
-    pub(crate) fn waits_for_settled_cells(&self, cells: usize) {
-        let settled = RefCell::new(BTreeSet::new());
-        self.waits_for("cells that have their numbers", |message| {
-            if let Message::Network {
-                from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), ..
-            } = message
-                && heartbeat.state.has(State::CONFIGURED)
-                && !heartbeat.state.has(State::CLAIMING)
-            {
-                settled.borrow_mut().insert(cell.get());
-            }
-            settled.borrow().len() == cells
-        });
     }
 }
 

@@ -1,0 +1,154 @@
+//! Another client of a bench's bus, which hears and speaks the protocol.
+
+use std::cell::RefCell;
+use std::collections::{BTreeSet, HashMap};
+use std::ops::RangeInclusive;
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, Choice, Inbox, Options};
+use protocol::can::{Format, Frame};
+use protocol::fixed::Q3_12;
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, State};
+use protocol::packet::{Half, Packet, Paired, WORDS, data_id};
+use protocol::time::Micros;
+
+use super::{PATIENCE, Place, until};
+
+/// Another client of a bus of a format.
+pub(crate) struct Guest {
+    pub(crate) bus: Bus,
+    format: Format,
+    halves: RefCell<HashMap<u16, Half>>,
+}
+
+impl Guest {
+    pub(crate) fn on(place: &Place, bus: &str, format: Format) -> Self {
+        Self::on_kind(place, bus, format, Choice::Only(place.kind()))
+    }
+
+    pub(crate) fn on_kind(place: &Place, bus: &str, format: Format, kind: Choice) -> Self {
+        let fd = format == Format::Fd;
+        let options = Options { directory: Some(place.buses()), fd, ..Options::default() };
+        let bus = until("the bus", || Bus::open(bus, kind, &options).ok());
+        Self { bus, format, halves: RefCell::default() }
+    }
+
+    /// The message that a frame makes whole.
+    pub(crate) fn message(&self, at: Micros, frame: &Frame) -> Option<Message> {
+        let packet = match self.format {
+            Format::Fd => Packet::from_fd(frame).ok()?,
+            Format::Classic => {
+                let id = data_id(frame).ok()?;
+                let mut halves = self.halves.borrow_mut();
+                match halves.entry(id.to_bits()).or_insert(Half::NONE).push(at, id, frame.data()) {
+                    Ok(Paired::Whole(packet)) => packet,
+                    _ => return None,
+                }
+            }
+        };
+        Message::decode(&packet).ok()
+    }
+
+    /// Says something to everyone.
+    pub(crate) fn sends(&self, message: &Message) {
+        let frames: Vec<_> = message.encode().frames(self.format).collect();
+        self.bus.send(&frames).unwrap();
+    }
+
+    /// Hears messages until somebody has enough, or until `PATIENCE` is over: whether somebody had.
+    pub(crate) fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
+        let mut inbox = Inbox::new();
+        let give_up = Instant::now() + PATIENCE;
+        while Instant::now() < give_up {
+            self.bus.wait(Some(Duration::from_millis(100))).unwrap();
+            self.bus.receive(&mut inbox).unwrap();
+            for received in inbox.frames() {
+                let message = self.message(Micros(received.at_nanos / 1_000), &received.frame);
+                if message.is_some_and(|message| enough(&message)) {
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Waits for a message after which somebody has enough.
+    pub(crate) fn waits_for(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
+        assert!(self.hears(enough), "waited {PATIENCE:?} for {what} on {}", self.bus.name());
+    }
+
+    /// Waits until each of these cells has said a torque that is not zero.
+    pub(crate) fn waits_for_torques(&self, cells: RangeInclusive<u8>) {
+        let mut missing: BTreeSet<u8> = cells.collect();
+        self.waits_for("torques", |message| {
+            if let Message::Torque { from, torque, .. } = message
+                && *torque != [Q3_12::ZERO; WORDS]
+            {
+                missing.remove(&from.get());
+            }
+            missing.is_empty()
+        });
+    }
+
+    /// Waits for a sum of so many cells.
+    pub(crate) fn waits_for_a_sum_of(&self, cells: u8) {
+        self.waits_for("a sum", |message| matches!(message, Message::Sum { count, .. } if *count == cells));
+    }
+
+    /// Waits for so many joints.
+    pub(crate) fn waits_for_joints(&self, mut count: u32) {
+        self.waits_for("joints", |message| {
+            count -= u32::from(matches!(message, Message::Joints { .. }));
+            count == 0
+        });
+    }
+
+    /// Waits until each of these cells has said that it is halted.
+    pub(crate) fn waits_for_halted_cells(&self, cells: RangeInclusive<u8>) {
+        let mut missing: BTreeSet<u8> = cells.collect();
+        self.waits_for("cells that are halted", |message| {
+            if let Message::Network {
+                from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), ..
+            } = message
+                && heartbeat.state.has(State::HALTED)
+            {
+                missing.remove(&from.get());
+            }
+            missing.is_empty()
+        });
+    }
+
+    /// Waits until this many joints have been on the bus since the loop began.
+    pub(crate) fn waits_for_epoch(&self, number: u8) {
+        let there = |message: &Message| matches!(message, Message::Joints { epoch, .. } if epoch.0 >= number);
+        self.waits_for(&format!("joints of epoch {number}"), there);
+    }
+
+    /// Waits until the robot has been seen in four positions.
+    pub(crate) fn waits_for_motion(&self) {
+        let mut seen = BTreeSet::new();
+        self.waits_for("a robot that moves", |message| {
+            if let Message::Joints { joints, .. } = message {
+                seen.insert(joints.positions);
+            }
+            seen.len() >= 4
+        });
+    }
+
+    /// Waits until the cells 1 to so many have said that they have their numbers and parameters.
+    pub(crate) fn waits_for_settled_cells(&self, cells: usize) {
+        let mut settled = BTreeSet::new();
+        self.waits_for("cells that have their numbers", |message| {
+            if let Message::Network {
+                from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), ..
+            } = message
+                && heartbeat.state.has(State::CONFIGURED)
+                && !heartbeat.state.has(State::CLAIMING)
+            {
+                settled.insert(cell.get());
+            }
+            settled.len() == cells
+        });
+    }
+}
