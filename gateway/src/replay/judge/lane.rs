@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use protocol::id::CellId;
-use protocol::message::{Answer, Heard, Heartbeat, NetworkPage, State as Flags};
+use protocol::id::{CellId, Node};
+use protocol::message::{Answer, Heard, Heartbeat, Message, NetworkPage, State as Flags};
 use protocol::packet::{Epoch, WORDS};
 
 use super::sums::{Sums, Trees};
@@ -124,6 +124,9 @@ pub(super) struct Lane {
     pub(super) speaking: BTreeSet<CellId>,
     /// Whether somebody had cells say what they feel without being asked: then that comes at times of their own.
     pub(super) senses: bool,
+    /// Cells that had taken no joints when they last told their counters in the capture, with the epoch that they say
+    /// until they have: it is of no joints.
+    pub(super) untouched: BTreeMap<CellId, Epoch>,
     /// Rounds that were announced.
     pub(super) sent: u64,
     /// The round after which the capture has no more joints.
@@ -147,6 +150,7 @@ impl Lane {
             answers: BTreeMap::new(),
             speaking: BTreeSet::new(),
             senses: false,
+            untouched: BTreeMap::new(),
             sent: 0,
             last_round: None,
             is_down: false,
@@ -167,6 +171,30 @@ impl Lane {
         }
         if let Some(last) = sent.checked_sub(1).and_then(|last| self.round(last)) {
             last.replies.retain(|(_, what), pair| *what == What::Torque || pair.now.is_some());
+        }
+    }
+
+    /// Takes in what a message of the capture tells of whether its cell has taken any joints yet.
+    pub(super) fn record_first_joints(&mut self, message: &Message) {
+        if let Message::Torque { from, .. } = *message {
+            self.untouched.remove(&from);
+        }
+        let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return };
+        match page {
+            NetworkPage::Heard(Heard { joints: 0, joints_late: 0, .. }) => {
+                self.untouched.insert(cell, epoch);
+            }
+            NetworkPage::Heard(_) => {
+                self.untouched.remove(&cell);
+            }
+            NetworkPage::Heartbeat(_)
+            | NetworkPage::Tree(_)
+            | NetworkPage::Refused(_)
+            | NetworkPage::Ports(_) => {
+                if self.untouched.get(&cell).is_some_and(|said| *said != epoch) {
+                    self.untouched.remove(&cell);
+                }
+            }
         }
     }
 

@@ -127,7 +127,12 @@ impl Judge {
             | Message::Configured { .. }
             | Message::Stimulus { .. } => {}
         }
+        lane.record_first_joints(message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
+        if what != What::Torque && lane.untouched.get(&cell) == Some(&epoch) {
+            // Of no joints, even if joints of that epoch stood on the bus by then.
+            return;
+        }
         let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
         let measured = lane.excuses.get(&cell).is_some_and(|excuse| excuse.cell.measured);
         let has_rounds = !lane.rounds.is_empty();

@@ -243,6 +243,31 @@ fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
 }
 
 #[test]
+fn what_a_cell_felt_before_it_had_taken_any_joints_is_of_none() {
+    let sensors = |epoch| {
+        let page = SensorPage::Acceleration([Q3_12::from_bits(4), Q3_12::ZERO, Q3_12::ZERO]);
+        Message::Sensors { from: cell(1), epoch: Epoch(epoch), page }
+    };
+    // A report that was asked for before the first joints, and answered when they stood on the bus already.
+    let mut recording = run();
+    recording.splice(2..2, [heard(1, 0), sensors(0)]);
+    assert_eq!(counts(&judged(&recording, &run())), [3, 0, 0, 0]);
+    let late = |said: &[Message]| {
+        let mut recording = recording.clone();
+        recording.splice(5..5, said.iter().copied());
+        counts(&judged(&recording, &run()))
+    };
+    // Its counters, its torque and another epoch say that it has taken joints since.
+    assert_eq!(late(&[heard(1, 1), sensors(0)]), [3, 0, 1, 0]);
+    assert_eq!(late(&[torque(1, 0, 0), sensors(0)]), [3, 0, 2, 0]);
+    assert_eq!(late(&[heartbeat(1, 1, 12, Flags::TEST_MODE), sensors(1)]), [3, 0, 1, 0]);
+    // And of a cell that had taken joints before, it is as ever.
+    let mut recording = run();
+    recording.splice(2..2, [heard(1, 7), sensors(0)]);
+    assert_eq!(counts(&judged(&recording, &run())), [3, 0, 1, 0]);
+}
+
+#[test]
 fn joints_that_a_bus_did_not_take_have_no_answer() {
     let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
     judge.mute(false);
