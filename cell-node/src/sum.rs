@@ -393,10 +393,10 @@ impl Sum {
         self.judged = true;
     }
 
-    /// Something was heard so long after it stood on the bus: when that is more than half a period, the machine itself
-    /// is late, nobody is to blame, and it is not looked who is missing in this epoch.
+    /// Something was heard so long after it stood on the bus: when that is more than a quarter of a period, the machine
+    /// itself is late, nobody is to blame, and it is not looked who is missing in this epoch.
     pub const fn heard_after(&mut self, age: Span) {
-        if age.0 * 2 > self.period.0 && self.period.0 > 0 {
+        if age.0 * 4 > self.period.0 && self.period.0 > 0 {
             self.judged = true;
             self.check = None;
         }

@@ -151,3 +151,17 @@ fn saturation_passes_upwards_word_by_word() {
     let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
     assert_eq!(said.torque, [Q7_8::MAX; WORDS]);
 }
+
+#[test]
+fn a_machine_that_hears_late_blames_nobody() {
+    for (age, judged) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
+        let mut sum = sum(false);
+        sum.begin(&begin(1, 1), Some(&own(1_000)));
+        sum.state(at(1, 10), 0, Epoch(1));
+        sum.take(at(1, 500), 0, Epoch(1), words(1, 1));
+        sum.begin(&begin(2, 1), Some(&own(1_000)));
+        sum.watch();
+        sum.heard_after(Span(age));
+        assert_eq!(sum.judge(), judged, "{age} µs");
+    }
+}
