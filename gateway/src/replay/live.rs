@@ -25,9 +25,13 @@ const DOWN: Duration = Duration::from_millis(50);
 const REMIND: Duration = Duration::from_millis(500);
 const PATIENCE: Duration = Duration::from_secs(3);
 /// Joints are asked again so often when cells were too late for them.
-const ASK_AGAIN: u32 = 8;
+const ASK_AGAIN: u32 = 16;
+/// So often after joints for which that was in vain: then lateness is hardly the reason.
+const ASK_AGAIN_IN_VAIN: u32 = 2;
 /// The answers to that are waited for, so long the first time, before cells have a heartbeat to say as well.
 const ANSWERS: Duration = Duration::from_millis(100);
+/// So many times as long at most.
+const LONGEST: u32 = 4;
 
 /// One bus.
 #[derive(Debug)]
@@ -59,6 +63,8 @@ pub(super) struct Live {
     pub(super) silent: Vec<(usize, CellId)>,
     /// Joints that were asked again.
     pub(super) asked_again: u64,
+    /// Whether that was in vain the last time.
+    pub(super) in_vain: bool,
     pub(super) down: Vec<bool>,
 }
 
@@ -133,8 +139,13 @@ impl Stage for Live {
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
         // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
         // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
-        for again in 0..ASK_AGAIN {
-            if self.hall.is_over() || self.hall.judge().unanswered(lane, round) == 0 {
+        let tries = if self.in_vain { ASK_AGAIN_IN_VAIN } else { ASK_AGAIN };
+        for again in 0..tries {
+            if self.hall.is_over() {
+                return;
+            }
+            if self.hall.judge().unanswered(lane, round) == 0 {
+                self.in_vain &= again == 0;
                 return;
             }
             let epoch = if again % 2 == 0 { open.epoch.plus(u8::MAX) } else { open.epoch };
@@ -144,7 +155,7 @@ impl Stage for Live {
             if self.tell(lane, &[joints]).is_err() {
                 return;
             }
-            let give_up = Instant::now() + ANSWERS * (again + 1);
+            let give_up = Instant::now() + ANSWERS * (again + 1).min(LONGEST);
             let mut judge = self.hall.judge();
             while judge.unanswered(lane, round) > 0 && Instant::now() < give_up && !self.hall.is_over() {
                 judge = self.hall.wait(judge, Duration::from_millis(5));
@@ -155,6 +166,7 @@ impl Stage for Live {
             }
             self.wait_until_done(lane);
         }
+        self.in_vain = self.hall.judge().unanswered(lane, round) > 0;
     }
 
     fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String> {

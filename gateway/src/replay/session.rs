@@ -180,6 +180,7 @@ impl<'a> Session<'a> {
             checks: self.checks.clone(),
             silent: Vec::new(),
             asked_again: 0,
+            in_vain: false,
             down: vec![false; lanes.len()],
             lanes,
         };
