@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 
 use cell_node::flash;
 use cell_node::node::Identity;
+use gateway::decode::Decoded;
 use gateway::generate::{Format as Wanted, Reply, generate};
 use gateway::network::Uplinks;
 use process::guest::Guest;
@@ -135,19 +136,20 @@ impl Side {
             }
             return;
         }
-        match self.guest.message(now, frame) {
-            Some(Message::Network {
-                from: Node::Cell(cell),
-                page: NetworkPage::Heartbeat(heartbeat),
-                ..
-            }) => {
+        let message = match self.guest.decodes(now, frame) {
+            Decoded::Message(message) => message,
+            Decoded::Half { .. } => return,
+            other => panic!("{other:?}"),
+        };
+        match message {
+            Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 self.uplinks.claimed(cell);
                 self.heartbeats.insert(cell.get(), heartbeat);
             }
-            Some(Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. }) => {
+            Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } => {
                 self.trees.insert(cell.get(), tree);
             }
-            Some(Message::Sum { from, epoch, count, .. }) => {
+            Message::Sum { from, epoch, count, .. } => {
                 self.sums.insert((epoch.0, from.get()), count);
             }
             _ => {}

@@ -1,16 +1,17 @@
 //! Another client of a bench's bus, which hears and speaks the protocol.
 
 use std::cell::RefCell;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
+use gateway::decode::{Decoded, Decoder};
 use protocol::bus::{Bus, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
-use protocol::packet::{Half, Packet, Paired, WORDS, data_id};
+use protocol::packet::WORDS;
 use protocol::time::Micros;
 
 use super::{PATIENCE, Place, until};
@@ -19,7 +20,7 @@ use super::{PATIENCE, Place, until};
 pub(crate) struct Guest {
     pub(crate) bus: Bus,
     format: Format,
-    halves: RefCell<HashMap<u16, Half>>,
+    decoder: RefCell<Decoder>,
 }
 
 impl Guest {
@@ -31,23 +32,12 @@ impl Guest {
         let fd = format == Format::Fd;
         let options = Options { directory: Some(place.buses()), fd, ..Options::default() };
         let bus = until("the bus", || Bus::open(bus, kind, &options).ok());
-        Self { bus, format, halves: RefCell::default() }
+        Self { bus, format, decoder: RefCell::new(Decoder::new(Some(format))) }
     }
 
-    /// The message that a frame makes whole.
-    pub(crate) fn message(&self, at: Micros, frame: &Frame) -> Option<Message> {
-        let packet = match self.format {
-            Format::Fd => Packet::from_fd(frame).ok()?,
-            Format::Classic => {
-                let id = data_id(frame).ok()?;
-                let mut halves = self.halves.borrow_mut();
-                match halves.entry(id.to_bits()).or_insert(Half::NONE).push(at, id, frame.data()) {
-                    Ok(Paired::Whole(packet)) => packet,
-                    _ => return None,
-                }
-            }
-        };
-        Message::decode(&packet).ok()
+    /// What the next frame says.
+    pub(crate) fn decodes(&self, at: Micros, frame: &Frame) -> Decoded {
+        self.decoder.borrow_mut().decode(at, self.bus.name(), frame)
     }
 
     /// Says something to everyone.
@@ -64,8 +54,10 @@ impl Guest {
             self.bus.wait(Some(Duration::from_millis(100))).unwrap();
             self.bus.receive(&mut inbox).unwrap();
             for received in inbox.frames() {
-                let message = self.message(Micros(received.at_nanos / 1_000), &received.frame);
-                if message.is_some_and(|message| enough(&message)) {
+                let decoded = self.decodes(Micros(received.at_nanos / 1_000), &received.frame);
+                if let Decoded::Message(message) = decoded
+                    && enough(&message)
+                {
                     return true;
                 }
             }
