@@ -1,5 +1,6 @@
 //! The stage of a real replay: the machine's clock and open buses.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -63,8 +64,8 @@ pub(super) struct Live {
     pub(super) silent: Vec<(usize, CellId)>,
     /// Joints that were asked again.
     pub(super) asked_again: u64,
-    /// Whether that was in vain the last time.
-    pub(super) in_vain: bool,
+    /// The buses on which that was in vain the last time.
+    pub(super) in_vain: BTreeSet<usize>,
     pub(super) down: Vec<bool>,
 }
 
@@ -139,13 +140,19 @@ impl Stage for Live {
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
         // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
         // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
-        let tries = if self.in_vain { ASK_AGAIN_IN_VAIN } else { ASK_AGAIN };
-        for again in 0..tries {
+        let tries = if self.in_vain.contains(&lane) { ASK_AGAIN_IN_VAIN } else { ASK_AGAIN };
+        for again in 0.. {
             if self.hall.is_over() {
                 return;
             }
             if self.hall.judge().unanswered(lane, round) == 0 {
-                self.in_vain &= again == 0;
+                if again > 0 {
+                    self.in_vain.remove(&lane);
+                }
+                return;
+            }
+            if again == tries {
+                self.in_vain.insert(lane);
                 return;
             }
             let epoch = if again % 2 == 0 { open.epoch.plus(u8::MAX) } else { open.epoch };
@@ -166,7 +173,6 @@ impl Stage for Live {
             }
             self.wait_until_done(lane);
         }
-        self.in_vain = self.hall.judge().unanswered(lane, round) > 0;
     }
 
     fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String> {

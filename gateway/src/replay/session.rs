@@ -1,5 +1,6 @@
 //! A replay from its cells' first word to its summary.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
@@ -180,7 +181,7 @@ impl<'a> Session<'a> {
             checks: self.checks.clone(),
             silent: Vec::new(),
             asked_again: 0,
-            in_vain: false,
+            in_vain: BTreeSet::new(),
             down: vec![false; lanes.len()],
             lanes,
         };
