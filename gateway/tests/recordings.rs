@@ -1,0 +1,67 @@
+//! Recordings of earlier builds are dumped and explained as they were then (tests/recordings/README.md).
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Command, Output};
+
+/// Where the recordings are.
+fn recordings() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
+}
+
+/// Standard output of a command that has nothing to complain of.
+fn output(arguments: &str) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    command.args(arguments.split(' ')).current_dir(recordings()).env("NO_COLOR", "1").env("COLUMNS", "100");
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), said.as_str()), (Some(0), ""), "{arguments}");
+    String::from_utf8(stdout).unwrap()
+}
+
+/// Compares line by line with `expected/NAME`, or takes the text over where that is asked for.
+fn is_expected(name: &str, text: &str) {
+    let path = recordings().join("expected").join(name);
+    if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
+        fs::write(path, text).unwrap();
+        return;
+    }
+    let expected = fs::read_to_string(path).unwrap();
+    for (number, (now, then)) in text.lines().zip(expected.lines()).enumerate() {
+        assert_eq!(now, then, "line {} of {name}", number + 1);
+    }
+    assert_eq!(text.lines().count(), expected.lines().count(), "lines of {name}");
+}
+
+#[test]
+fn dumps_say_what_they_said() {
+    for name in ["fd", "classic", "sums", "two", "split", "split-1", "split-2"] {
+        is_expected(&format!("{name}.dump.txt"), &output(&format!("dump {name}.mcap --brief")));
+    }
+}
+
+#[test]
+fn a_log_says_what_the_recording_of_the_same_run_says() {
+    // The times of a log have six digits: they are left out.
+    let told = |text: &str| -> Vec<String> {
+        text.lines().map(|line| line.split_once(' ').unwrap().1.to_owned()).collect()
+    };
+    for name in ["classic", "sums"] {
+        let expected = fs::read_to_string(recordings().join(format!("expected/{name}.dump.txt"))).unwrap();
+        assert_eq!(told(&output(&format!("dump {name}.log --brief"))), told(&expected), "{name}");
+    }
+}
+
+#[test]
+fn explanations_are_what_they_were() {
+    for (name, options) in [
+        ("fd", "--epoch 60"),
+        ("classic", "--epoch 60 --cell 1"),
+        ("sums", "--epoch 60"),
+        ("two", "--epoch 40"),
+        ("split-1", "--epoch 80 --cell 2"),
+    ] {
+        is_expected(&format!("{name}.explain.txt"), &output(&format!("explain {name}.mcap {options}")));
+    }
+}
