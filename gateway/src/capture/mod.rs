@@ -16,7 +16,7 @@ mod mcap;
 mod reader;
 
 pub use mcap::ORIGIN;
-pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, Topic};
+pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, SKIN, Topic};
 
 use protocol::candump::Record;
 

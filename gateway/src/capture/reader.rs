@@ -5,6 +5,8 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+use protocol::document::DocumentError;
+use protocol::skin::Skin;
 use protocol::can::Frame;
 use thiserror::Error;
 
@@ -69,6 +71,21 @@ pub struct Extras {
     pub metadata: Vec<(String, Vec<(String, String)>)>,
     /// What is missing at its end, when it was never finished.
     pub unfinished: Option<String>,
+}
+
+/// What the skin in a recording of a run is called.
+pub const SKIN: &str = "skin.toml";
+
+impl Extras {
+    /// The skin that is attached; `None` when none is.
+    ///
+    /// # Errors
+    /// Of the skin, when it is none that this version knows.
+    #[must_use]
+    pub fn skin(&self) -> Option<Result<Skin, DocumentError>> {
+        let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN)?;
+        Some(Skin::parse(SKIN, &String::from_utf8_lossy(text)))
+    }
 }
 
 /// A frame that was on a bus before a recording began, and still says what holds.

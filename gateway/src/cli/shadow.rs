@@ -12,9 +12,11 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use gateway::capture::{Entry, Format, NoteKind, Reader};
+use gateway::fit::rates::Asked;
 use gateway::shadow::{Options, Shadow};
 use protocol::bus::{self, Bus, BusError, Choice, Inbox};
 use protocol::can::EXTENDED_MASK;
+use protocol::skin::Skin;
 use protocol::usage::{Failure, print, written};
 use protocol::wire_time::{BitRates, bit_rate};
 
@@ -31,27 +33,36 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 /// vcan and the embedded bus have no bit rate: everything fits them. This takes the traffic of a capture (a candump
 /// log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, through a model of a bus with bit rates:
 /// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the moment at
-/// which it was to be sent. docs/bus.md says what the figures mean and what the model leaves out.
+/// which it was to be sent. What only a bench sends is left out, start-up stands apart, and where the skin is known (attached
+/// to a recording, or --skin) its worst case stands beside the run. docs/bus.md says what the figures mean and what the model
+/// leaves out.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway shadow run.mcap
   gateway shadow run.log --nominal 500k --data 2M
   gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
+  gateway shadow run.log --skin skin.toml
   gateway shadow run.log --json | jq -c 'select(.end_s - .time > 0.016)'
   gateway shadow vcan0 vcan1 --duration 10")]
 pub(crate) struct ShadowCommand {
     /// A candump log or MCAP recording when there is a file of this name, - for standard input, else buses
     #[arg(value_name = "FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
-    /// The bit rate of identifiers, and of all of classic frames: bit/s, as 500k or 1M
-    #[arg(long, value_name = "RATE", default_value = "1M", value_parser = bit_rate)]
-    nominal: u32,
-    /// The bit rate of the data of CAN FD frames that switch
-    #[arg(long, value_name = "RATE", default_value = "5M", value_parser = bit_rate)]
-    data: u32,
+    /// The bit rate of identifiers, and of all of classic frames: bit/s, as 500k or 1M; else the skin's, else 1M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    nominal: Option<u32>,
+    /// The bit rate of the data of CAN FD frames that switch; else the skin's, else 5M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    data: Option<u32>,
     /// Other bit rates of one bus, as often as there are buses: can0=500k/2M, can1=1M
     #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
+    /// The skin's description, for bit rates and the worst case; else the one attached to the recording
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Count what only a bench sends too: stimuli, sync and report with their answers, simulated wires
+    #[arg(long)]
+    bench_traffic: bool,
     /// The share of bits that arrive damaged, 0 to 0.01: their frames cost an error frame and come again
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, allow_negative_numbers = true)]
     ber: f64,
@@ -61,7 +72,7 @@ pub(crate) struct ShadowCommand {
     /// One JSON object a frame instead of tables, in the order of the file
     ///
     /// Keys: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it), nominal_bits and data_bits
-    /// (stuff bits and intermission included). What is on no real bus has null bits; what never went out has null times.
+    /// (stuff bits and intermission included). What is left out has null bits and null times; what never went out has null times.
     #[arg(long)]
     json: bool,
     /// End a live shadow after so many seconds
@@ -96,35 +107,36 @@ struct Taken {
 
 impl ShadowCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let rates =
-            BitRates::new(self.nominal, self.data).map_err(|error| Failure::usage(format!("{error}")))?;
-        let options = Options {
-            rates,
-            of_bus: self.rates.clone(),
-            bit_errors: self.ber,
-            seed: self.seed,
-            each_frame: self.json,
-        };
-        let mut shadow = Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))?;
+        let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         let out = io::stdout();
         let mut out = BufWriter::new(out.lock());
         let stopped = stopped()?;
         let files = self.sources.iter().filter(|source| is_file(source)).count();
         let name =
             self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
-        let taken = match self.sources.as_slice() {
+        let (mut shadow, taken) = match self.sources.as_slice() {
             [source] if files == 1 => {
                 if self.duration.is_some() {
                     return Err(Failure::usage(format!(
                         "--duration is for live buses, and {name} is a file"
                     )));
                 }
-                captured(source, &mut shadow, &mut out, &stopped)?
+                let reader = opened(source, &stopped)?;
+                let mut shadow = self.shadow(skin.or_else(|| attached(&name, &reader)))?;
+                for before in &reader.extras().in_force {
+                    shadow.in_force(&before.bus, before.nanos, &before.frame);
+                }
+                let taken = captured(reader, &mut shadow, &mut out, &stopped)?;
+                (shadow, taken)
             }
             _ if files > 0 => {
                 return Err(Failure::usage(format!("{name}: one file alone, or buses without a file")));
             }
-            sources => self.live(sources, &mut shadow, &mut out, &stopped)?,
+            sources => {
+                let mut shadow = self.shadow(skin)?;
+                let taken = self.live(sources, &mut shadow, &mut out, &stopped)?;
+                (shadow, taken)
+            }
         };
         shadow.finish();
         written(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
@@ -139,6 +151,28 @@ impl ShadowCommand {
             print(&show::text(&name, taken.what, taken.missing, &report))?;
         }
         taken.ended.map_or(Ok(()), Err)
+    }
+
+    /// With the rates of the command line, else of the skin, else common ones.
+    fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
+        let asked = Asked { nominal: self.nominal, data: self.data };
+        let mut of_bus = self.rates.clone();
+        for bus in skin.iter().flat_map(|skin| &skin.buses) {
+            let rates = asked.of_bus(bus);
+            let rates =
+                rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
+            of_bus.push((bus.name.clone(), rates));
+        }
+        let options = Options {
+            of_bus,
+            bit_errors: self.ber,
+            seed: self.seed,
+            each_frame: self.json,
+            bench_traffic: self.bench_traffic,
+            skin,
+            ..Options::new(asked.rates().map_err(Failure::usage)?)
+        };
+        Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
 
     /// Listens to buses until somebody says stop.
@@ -248,13 +282,8 @@ fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
     }
 }
 
-/// Takes in a capture, and says what is missing of it.
-fn captured(
-    source: &Path,
-    shadow: &mut Shadow,
-    out: &mut impl Write,
-    stopped: &Arc<AtomicBool>,
-) -> Result<Taken, Failure> {
+/// Opens a capture.
+fn opened(source: &Path, stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
     let name = source.display().to_string();
     let file: File = if source.as_os_str() == "-" {
         let input = io::stdin().as_fd().try_clone_to_owned();
@@ -267,7 +296,24 @@ fn captured(
         File::open(source).map_err(|error| Failure::usage(format!("{name}: {error}")))?
     };
     let input = Interruptible { file, stopped: Arc::clone(stopped) };
-    let mut reader = Reader::from_read(&name, input).map_err(Failure::usage)?;
+    Reader::from_read(&name, input).map_err(Failure::usage)
+}
+
+/// The skin that is attached to a recording.
+fn attached(name: &str, reader: &Reader) -> Option<Skin> {
+    let skin = reader.extras().skin()?;
+    skin.inspect_err(|error| output::note(format_args!("{name}: the attached {error}; name one with --skin")))
+        .ok()
+}
+
+/// Takes in a capture, and says what is missing of it.
+fn captured(
+    mut reader: Reader,
+    shadow: &mut Shadow,
+    out: &mut impl Write,
+    stopped: &Arc<AtomicBool>,
+) -> Result<Taken, Failure> {
+    let name = reader.name().to_owned();
     let what = match reader.format() {
         Format::Candump => "candump log",
         Format::Mcap => "MCAP",

@@ -1,6 +1,8 @@
 //! Would it fit on a real bus: load, the longest time from joints to the last answer, and how many cells and buses that makes.
+//! Every command that says whether something fits takes it from here: limits, verdicts and their words ([`verdict`]), bit
+//! rates ([`rates`]), and what of a bench's traffic a real bus carries ([`traffic`]).
 //!
-//! All frames are taken as long as stuffing can make them ([`protocol::wire_time`]), all cells as in contact, and the bus
+//! The worst case: all frames are taken as long as stuffing can make them ([`protocol::wire_time`]), all cells as in contact, and the bus
 //! as free of errors. Every node sends its lowest identifier first. Joints, answers, sensors and heartbeats are counted;
 //! stimuli, commands, configuration and simulated wires are not: they are the bench's, or rare.
 //!
@@ -12,8 +14,11 @@
 pub mod case;
 mod json;
 pub mod limits;
+pub mod rates;
 pub mod remedy;
 pub mod response;
+pub mod traffic;
+pub mod verdict;
 
 use protocol::can::Format;
 use protocol::skin::Skin;
@@ -24,6 +29,7 @@ pub use json::json;
 use case::{Case, Load, Times};
 use limits::{Limit, Most, Need, exceeded};
 use remedy::Remedy;
+use verdict::Verdict;
 
 /// The paper's cell computes 68.5 µs: 1096 instructions at 16 MIPS.
 pub const COMPUTATION_NS: u64 = 68_500;
@@ -80,10 +86,10 @@ impl Judged {
         Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
     }
 
-    /// Whether everything has its time, whatever the transceivers.
+    /// Whether it fits.
     #[must_use]
-    pub fn is_in_time(&self) -> bool {
-        self.exceeded.iter().all(|&limit| limit == Limit::Nodes)
+    pub fn verdict(&self) -> Verdict {
+        Verdict::of(&self.exceeded, self.case.answers.cells())
     }
 }
 
@@ -124,6 +130,18 @@ pub fn bus(
         answers: remedy::answers(skin, index, &case),
         remedies: remedy::remedies(skin, &case),
     })
+}
+
+/// One bus of a skin as it is described, at these rates, with all cells answering; `None` where a cell that answers with
+/// sums has no way to a root.
+#[must_use]
+pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Judged> {
+    let format = skin.buses.get(index)?.format;
+    let rates = match format {
+        Format::Fd => rates,
+        Format::Classic => BitRates::classic(rates.nominal()).ok()?,
+    };
+    Some(Judged::of(&Case::of(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
 /// All cells of a skin, evenly on several buses.

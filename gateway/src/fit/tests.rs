@@ -6,6 +6,7 @@ use protocol::wire_time::BitRates;
 
 use super::case::{Answers, Case};
 use super::limits::{Limit, Most};
+use super::verdict::Verdict;
 use super::{BusFit, COMPUTATION_NS, bus, fullest, json, table, whole};
 use crate::generate::{Reply, Wanted, generate};
 
@@ -64,7 +65,7 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
 fn at_1m_8m_it_is_in_time_and_the_chain_is_the_smaller_bound() {
     let fit = fit(&skin(&text(&Wanted::default())), "1M/8M");
     assert_eq!(fit.judged.exceeded, [Limit::Nodes]);
-    assert!(fit.judged.is_in_time());
+    assert_eq!(fit.judged.verdict(), Verdict::Nodes(254));
     // Blocking, joints, computation, blocking, 253 torques.
     assert_eq!(fit.judged.times.chain_ns, Some(56_000 * (3 + 253) + 68_500));
     let response = fit.judged.times.response_ns.unwrap();

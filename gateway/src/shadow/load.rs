@@ -88,11 +88,6 @@ impl Busy {
         last.close(saturated);
         last.stretches
     }
-
-    /// When the wire was last taken, in ns.
-    pub(super) const fn end(&self) -> u64 {
-        self.end
-    }
 }
 
 #[cfg(test)]

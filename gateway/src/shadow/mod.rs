@@ -9,8 +9,10 @@
 //! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
 //! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`GREATEST_QUEUE`] frames wait on a bus.
 
+mod answering;
 mod lane;
 mod load;
+mod phase;
 mod report;
 #[cfg(test)]
 mod tests;
@@ -19,17 +21,26 @@ mod told;
 use std::fmt::{self, Display, Formatter};
 
 use protocol::can::{ERROR, Frame};
+use protocol::skin::Skin;
 use protocol::wire_time::{BitRates, Bits};
 
 use crate::bus_model::{BitErrors, BitErrorsError};
-use crate::decode::wired;
-use lane::Lane;
+use crate::fit;
+use crate::fit::verdict::Answer;
+use lane::{Known, Lane};
 use told::Told;
 
 pub use crate::replay::order::{WINDOW_FRAMES, WINDOW_NS};
-pub use lane::{GREATEST_QUEUE, SATURATED_NS};
-pub use report::{BusShadow, Delays, KindDelays, Loads, Most, Replies, Report, Stretches};
+pub use answering::Answering;
+pub use lane::GREATEST_QUEUE;
+pub use phase::PAUSE_NS;
+pub use report::{BusShadow, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
 pub use told::Shaded;
+
+/// A bus without a pause for so long, in ns, is saturated: from joints to joints, as mostly set.
+pub const SATURATED_NS: u64 = 16_000_000;
+/// The longer span in which the load is looked at, in ns.
+const SECOND_NS: u64 = 1_000_000_000;
 
 /// Buses that are told apart.
 pub const BUSES: usize = 64;
@@ -47,6 +58,37 @@ pub struct Options {
     pub seed: u64,
     /// Whether each frame is wanted from [`Shadow::poll`].
     pub each_frame: bool,
+    /// Whether what only a bench sends is counted.
+    pub bench_traffic: bool,
+    /// The skin, for the worst case beside what there was.
+    pub skin: Option<Skin>,
+}
+
+impl Options {
+    /// All buses at these rates, and nothing else.
+    #[must_use]
+    pub const fn new(rates: BitRates) -> Self {
+        Self {
+            rates,
+            of_bus: Vec::new(),
+            bit_errors: 0.0,
+            seed: 1,
+            each_frame: false,
+            bench_traffic: false,
+            skin: None,
+        }
+    }
+
+    /// What is known of a bus.
+    fn of(&self, bus: &str) -> Known {
+        let named = self.of_bus.iter().find(|(name, _)| name == bus);
+        let rates = named.map_or(self.rates, |(_, rates)| *rates);
+        let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
+        let cells = described.map(|(skin, bus)| u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX));
+        let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
+        let worst_case = worst_case.as_ref().map(Answer::worst_case);
+        Known { rates, cells, worst_case, bench_traffic: self.bench_traffic }
+    }
 }
 
 /// Traffic on its way through the model.
@@ -84,10 +126,6 @@ impl Shadow {
             return;
         };
         lane.count(nanos);
-        if wired(frame).is_some() {
-            lane.wires += 1;
-            return;
-        }
         let Some(bits) = Bits::of(frame) else {
             lane.error_frames += 1;
             return;
@@ -96,6 +134,12 @@ impl Shadow {
             told.bits(place, bits);
         }
         lane.take(nanos, frame, bits, place, self.told.as_mut());
+    }
+
+    /// A frame that was on a bus before the capture began, and still says what holds.
+    pub fn in_force(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let lane = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane));
+        lane.into_iter().for_each(|lane| lane.in_force(nanos, frame));
     }
 
     /// Frames that whoever took the capture lost.
@@ -139,13 +183,11 @@ impl Shadow {
         if known.is_some() || self.lanes.len() >= BUSES {
             return known;
         }
-        let named = self.options.of_bus.iter().find(|(name, _)| name == bus);
-        let rates = named.map_or(self.options.rates, |(_, rates)| *rates);
         let index = self.lanes.len();
         let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
         let errors = BitErrors::new(self.options.bit_errors, seed).ok();
         let errors = errors.filter(|_| self.options.bit_errors > 0.0);
-        self.lanes.push(Lane::new(bus, rates, errors));
+        self.lanes.push(Lane::new(bus, self.options.of(bus), errors));
         Some(index)
     }
 }

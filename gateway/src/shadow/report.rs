@@ -4,6 +4,10 @@ use hdrhistogram::Histogram;
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
+use super::answering::Answering;
+use crate::fit::traffic::BenchFrames;
+use crate::fit::verdict::Answer;
+
 /// All buses.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
@@ -31,10 +35,22 @@ pub struct BusShadow {
     pub first_ns: u64,
     /// From the first to the last one.
     pub duration_s: f64,
+    /// How long it was in operation: load, stretches, delays and queues are of that time.
+    pub operation_s: f64,
+    /// Whether all cells of the skin fit if all of them answer; none without a skin.
+    pub worst_case: Option<Answer>,
+    /// Whether what there was fits; none without operation.
+    pub this_run: Option<Answer>,
+    /// How many cells answered, where the bus speaks this project's protocol.
+    pub answering: Option<Answering>,
+    /// What was sent before the first joints, and when there were none for a second.
+    pub start_up: Option<StartUp>,
     /// Frames that went through the model.
     pub sent: u64,
-    /// Frames over simulated wires, which no real bus carries.
-    pub wires: u64,
+    /// Frames that only a bench sends.
+    pub bench: BenchFrames,
+    /// Whether they are left out.
+    pub bench_left_out: bool,
     /// The driver's error frames, which never were on a wire.
     pub error_frames: u64,
     /// Frames that whoever took the capture lost: the load is that much too low.
@@ -63,6 +79,21 @@ pub struct BusShadow {
     pub queue_of_one: Most,
     /// That identifier.
     pub queue_of_one_id: u32,
+}
+
+/// Start-up: cells claim numbers, are configured and organise themselves.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct StartUp {
+    /// Frames.
+    pub frames: u64,
+    /// How long it lasted.
+    pub duration_s: f64,
+    /// What was asked of the bus.
+    pub load: Loads,
+    /// Times without a pause.
+    pub stretches: Stretches,
+    /// From wanting to send to the end of the intermission, in µs.
+    pub delay_us: Delays,
 }
 
 /// Shares of the bus that frames ask for, stuff bits and intermissions included; above 1 it cannot carry them.

@@ -10,8 +10,7 @@ use protocol::packet::{Epoch, WORDS};
 const MS: u64 = 1_000_000;
 
 fn options() -> Options {
-    let rates = "1M/5M".parse().unwrap();
-    Options { rates, of_bus: Vec::new(), bit_errors: 0.0, seed: 1, each_frame: true }
+    Options { each_frame: true, ..Options::new("1M/5M".parse().unwrap()) }
 }
 
 fn shadow() -> Shadow {
@@ -124,7 +123,7 @@ fn what_is_on_no_real_bus_takes_no_time() {
     let sent: Vec<_> = frames.iter().map(|frame| (frame.bits.is_some(), frame.sent)).collect();
     assert_eq!(sent, [(false, None), (false, None), (true, Some((0, took(&other))))]);
     let bus = &report.buses[0];
-    assert_eq!((bus.frames, bus.wires, bus.error_frames, bus.sent), (3, 1, 1, 1));
+    assert_eq!((bus.frames, bus.bench.wires, bus.error_frames, bus.sent), (3, 1, 1, 1));
 }
 
 #[test]

@@ -15,7 +15,7 @@ pub struct Shaded {
     pub id: u32,
     /// Whether that is more than 11 bits.
     pub extended: bool,
-    /// Its bits, intermission included; none when it is on no real bus: a simulated wire, a driver's error frame.
+    /// Its bits, intermission included; none when it is on no real bus: what only a bench sends, a driver's error frame.
     pub bits: Option<Bits>,
     /// The first bit and the end of the intermission of the attempt that came through, in ns on the capture's clock; none
     /// when it never went out.
@@ -47,6 +47,14 @@ impl Told {
         self.at(place, |entry| {
             entry.shaded.bits = Some(bits);
             entry.is_open = true;
+        });
+    }
+
+    /// No real bus carries it.
+    pub(super) fn left_out(&mut self, place: u64) {
+        self.at(place, |entry| {
+            entry.shaded.bits = None;
+            entry.is_open = false;
         });
     }
 

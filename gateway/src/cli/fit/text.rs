@@ -3,6 +3,7 @@
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use gateway::fit::case::{Answers, Case};
 use gateway::fit::limits::{Limit, NODES, Need};
+use gateway::fit::verdict::{Answer, percent};
 use gateway::fit::{BusFit, Judged, Row, Whole, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
@@ -30,11 +31,11 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
         table.add_row([
             name(judged.case.format, judged.case.rates),
             micros(judged.case.packet_ns()),
-            percent(judged.load.total()),
+            tenths(judged.load.total()),
             ms(judged),
             most.in_time().to_string(),
             needed_shortly(&row.need),
-            roots.map_or_else(String::new, |it| percent(it.load.total())),
+            roots.map_or_else(String::new, |it| tenths(it.load.total())),
             roots.map_or_else(String::new, ms),
         ]);
     }
@@ -49,7 +50,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     };
     format!(
         "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
-         load    joints, {} of all cells, heartbeats{}; 100 % is all there is\n\
+         load    worst case: all cells answer; joints, {}, heartbeats{}\n\
          last    from the joints' turn on the bus to the end of the last answer at most\n\
          cells   that a bus has time for; transceivers drive about {}\n\
          buses   for {cells} cells, and what asks for so many: time or nodes\n\
@@ -79,7 +80,7 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
         rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
         for (buses, judged) in &whole.spread {
             let on = format!("{} of {} cells", count(*buses), judged.case.answers.cells());
-            rows.row(on, figures(judged), verdict(judged));
+            rows.row(on, figures(judged), judged.verdict());
         }
     }
     format!("{}\n", rows.table())
@@ -89,16 +90,17 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     let BusFit { name: bus_name, judged, most, need, answers, remedies } = bus;
     let Judged { case, load, times, .. } = judged;
     let cells = case.answers.cells();
-    let rates = name(case.format, case.rates);
-    rows.section(format!("{bus_name}, {rates}"), verdict(judged), format!("{cells} cells, {}", what(case)));
+    let worst = Answer::worst_case(judged);
+    rows.section(format!("{bus_name} at {}", worst.rates), format!("{cells} cells, {}", what(case)), "");
+    rows.row(worst.case(), worst.value(), worst.cells);
     let parts = [
         (format!("joints and {}", what(case)), load.joints + load.answers),
         ("sensors".to_owned(), load.sensors),
         ("heartbeats".to_owned(), load.heartbeats),
     ];
     let parts =
-        parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", percent(*share)));
-    rows.row("load", format!("{} %", percent(load.total())), parts.collect::<Vec<_>>().join(", "));
+        parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", tenths(*share)));
+    rows.row("  load", percent(load.total()), parts.collect::<Vec<_>>().join(", "));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let due = format!("due after {} ms", millis(case.deadline_ns()));
@@ -112,12 +114,12 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     if !remedies.is_empty() {
         rows.section("  what to change", "", "");
         for remedy in remedies {
-            rows.row(format!("  {}", remedy.change), figures(&remedy.after), verdict(&remedy.after));
+            rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
         }
     }
     rows.section("  instead of these answers", "", "");
     for remedy in answers {
-        rows.row(format!("  {}", remedy.change), figures(&remedy.after), verdict(&remedy.after));
+        rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
     }
     if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
         rows.row("  sums", "not possible", "a cell has no way to a root");
@@ -145,7 +147,7 @@ const fn sensors(case: &Case) -> &'static str {
 
 /// Load and last answer.
 fn figures(judged: &Judged) -> String {
-    format!("{} %, {}", percent(judged.load.total()), last(judged))
+    format!("{}, {}", percent(judged.load.total()), last(judged))
 }
 
 fn last(judged: &Judged) -> String {
@@ -154,17 +156,6 @@ fn last(judged: &Judged) -> String {
         Some(last_ns) => format!("{} ms", millis(last_ns)),
         None if load.total() > 1.0 => "no bound".to_owned(),
         None => format!("above {} ms", millis(case.period_ns)),
-    }
-}
-
-fn verdict(judged: &Judged) -> String {
-    let nodes = judged.case.answers.cells() + 1;
-    let exceeded = &judged.exceeded;
-    match (judged.is_in_time(), exceeded.contains(&Limit::Nodes)) {
-        (true, false) => "fits".to_owned(),
-        (true, true) => format!("in time, but {nodes} nodes"),
-        (false, _) if exceeded.contains(&Limit::Bandwidth) => "does not fit: bandwidth".to_owned(),
-        (false, _) => "does not fit: deadline".to_owned(),
     }
 }
 
@@ -215,7 +206,8 @@ fn micros(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 
-fn percent(share: f64) -> String {
+/// A share in %, in a column or a list of them.
+fn tenths(share: f64) -> String {
     format!("{:.1}", 100.0 * share)
 }
 

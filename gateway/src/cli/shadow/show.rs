@@ -2,7 +2,11 @@
 
 use std::io::{self, Write};
 
-use gateway::shadow::{BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow};
+use gateway::fit::traffic::BenchFrames;
+use gateway::fit::verdict::percent;
+use gateway::shadow::{
+    BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow, StartUp, Stretches,
+};
 
 use crate::cli::print::Rows;
 
@@ -84,30 +88,20 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
     let missing = if bus.missing > 0 { format!("{} more are missing", bus.missing) } else { String::new() };
     rows.section(format!("{} at {}", bus.bus, bus.rates), count, missing);
-    load(rows, bus);
-    rows.row("delay, µs", "half / 99 % / greatest", "from wanting to send to the end");
-    rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
-    for kind in &bus.kinds {
-        let (name, delay) = (kind.kind, &kind.delay_us);
-        rows.row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+    fit(rows, bus);
+    if bus.this_run.is_some() {
+        operation(rows, bus);
     }
-    if let Some(replies) = &bus.replies {
-        answers(rows, replies);
-    }
-    rows.row("most that waited", format!("{} frames", bus.queue.value), at(bus, bus.queue));
-    if bus.queue_of_one.value > 0.0 {
-        let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
-        rows.row("  of one identifier", of, at(bus, bus.queue_of_one));
+    if let Some(start_up) = &bus.start_up {
+        begin(rows, bus, start_up);
     }
     if bit_error_rate > 0.0 {
         let each = format!("of each bit {bit_error_rate:e}");
         rows.row("damaged, and sent again", format!("{} attempts", bus.damaged), each);
     }
+    bench(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    if bus.wires > 0 {
-        rows.row("left out: simulated wires", bus.wires, format!("{}; on no real bus", of_all(bus.wires)));
-    }
     if bus.error_frames > 0 {
         rows.row("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
     }
@@ -122,23 +116,82 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     }
 }
 
-fn load(rows: &mut Rows, bus: &BusShadow) {
-    let Loads { mean, worst_16_ms, worst_1_s, busy } = bus.load;
-    let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
-    let fits = match mean {
-        Some(mean) if mean > 1.0 => "more than the bus can carry",
-        _ if worst_1_s.value > 1.0 => "for a time more than the bus can carry",
-        _ => "",
+/// Whether it fits, at most and in this run.
+fn fit(rows: &mut Rows, bus: &BusShadow) {
+    match (&bus.worst_case, &bus.answering) {
+        (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
+        (None, Some(_)) => rows.row("worst case", "?", "of a skin, which --skin names"),
+        (None, None) => {}
+    }
+    match &bus.this_run {
+        Some(run) => rows.row(run.case(), run.value(), run.cells),
+        None => rows.row("this run", "no joints in it", ""),
+    }
+    let Some(answering) = bus.answering.filter(|it| it.epochs > 0) else { return };
+    let mean = answering.mean.unwrap_or(0.0);
+    let halted = match answering.epochs_halted {
+        0 => String::new(),
+        halted => format!(", and {halted} while halted are left out"),
     };
-    rows.row("load that is asked for", share(mean), fits);
-    rows.row("  within any 16 ms, at most", percent(worst_16_ms.value), at(bus, worst_16_ms));
-    rows.row("  within any second, at most", percent(worst_1_s.value), at(bus, worst_1_s));
-    let stretches = &bus.stretches;
+    let beside = format!("{} joints{halted}", answering.epochs);
+    rows.row("  cells that answered", format!("{mean:.1} on average"), beside);
+}
+
+fn operation(rows: &mut Rows, bus: &BusShadow) {
+    load(rows, bus, &bus.load, ("load on average", &format!("{:.3} s in operation", bus.operation_s)));
+    rows.row("  bus taken", share(bus.load.busy), "");
+    pauses(rows, bus, &bus.stretches);
+    rows.row("delay, µs", "half / 99 % / greatest", "from wanting to send to the end");
+    rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
+    for kind in &bus.kinds {
+        let (name, delay) = (kind.kind, &kind.delay_us);
+        rows.row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+    }
+    if let Some(replies) = &bus.replies {
+        answers(rows, replies);
+    }
+    rows.row("most that waited", format!("{} frames", bus.queue.value), at(bus, bus.queue));
+    if bus.queue_of_one.value > 0.0 {
+        let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
+        rows.row("  of one identifier", of, at(bus, bus.queue_of_one));
+    }
+}
+
+/// Start-up, which is judged by nobody: it takes as long as it takes.
+fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
+    let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
+    load(rows, bus, &start_up.load, ("start-up: load on average", &beside));
+    pauses(rows, bus, &start_up.stretches);
+    rows.row("  delay, µs", delays(&start_up.delay_us), "half / 99 % / greatest");
+}
+
+fn bench(rows: &mut Rows, bus: &BusShadow) {
+    let BenchFrames { stimuli, syncs, reports, wires } = bus.bench;
+    if bus.bench.total() == 0 {
+        return;
+    }
+    let name =
+        if bus.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
+    let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
+    let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
+    rows.row(name, format!("{} frames", bus.bench.total()), parts.collect::<Vec<_>>().join(", "));
+}
+
+fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
+    rows.row(name, share(load.mean), beside);
+    rows.row("  within any 16 ms, at most", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
+    rows.row("  within any second, at most", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
+}
+
+fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
     let longest = stretches.longest_s;
     let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
-    rows.row("bus taken", share(busy), "");
     let count = format!("{} times, {:.3} s", stretches.count, stretches.total_s);
     rows.row("  without a pause for 16 ms", count, beside);
+}
+
+fn share(share: Option<f64>) -> String {
+    share.map_or_else(|| "?".to_owned(), percent)
 }
 
 fn answers(rows: &mut Rows, replies: &Replies) {
@@ -155,10 +208,6 @@ fn answers(rows: &mut Rows, replies: &Replies) {
 fn delays(delays: &Delays) -> String {
     let Delays { p50, p99, max, .. } = delays;
     format!("{p50:.0} / {p99:.0} / {max:.0}")
-}
-
-fn percent(share: f64) -> String {
-    format!("{:.1} %", 100.0 * share)
 }
 
 fn at(bus: &BusShadow, most: Most) -> String {

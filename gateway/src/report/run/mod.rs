@@ -22,7 +22,7 @@ use protocol::wire_time::{BitRates, BitRatesError};
 use thiserror::Error;
 
 use super::figure::Page;
-use crate::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other};
+use crate::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other, SKIN};
 use crate::record::layout::Layout;
 use lane::Lane;
 use motion::Motion;
@@ -31,8 +31,6 @@ use motion::Motion;
 const COLUMNS: usize = 1_000;
 /// A column's width at first, in s.
 const GRAIN_S: f64 = 0.002;
-/// The skin in a recording.
-const SKIN: &str = "skin.toml";
 
 /// Why there is no report.
 #[derive(Debug, Error)]
@@ -175,13 +173,11 @@ struct Run {
 impl Run {
     fn begin(name: &str, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
-        let text = extras.attachments.iter().find(|(name, _)| name == SKIN);
-        let Some((_, text)) = text else {
+        let Some(skin) = extras.skin() else {
             let why = extras.unfinished.as_ref().map_or_else(String::new, |why| format!(" ({why})"));
             return Err(foreign(format!("{SKIN} is not attached to it{why}")));
         };
-        let text = String::from_utf8_lossy(text);
-        let skin = Skin::parse(SKIN, &text).map_err(|error| foreign(format!("the attached {error}")))?;
+        let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
         let layout = Layout::new(&skin);
         let buses = skin.buses.iter().enumerate();
         let lanes = buses.map(|(at, bus)| Ok(Lane::new(&skin, at, options.rates(bus)?)));

@@ -1,0 +1,218 @@
+//! Start-up and operation, and the figures of each.
+
+use hdrhistogram::Histogram;
+use protocol::id::{Id, Kind};
+
+use super::load::{Busy, Window};
+use super::report::{Delays, KindDelays, Loads, Most, StartUp};
+use super::{SATURATED_NS, SECOND_NS};
+use crate::fit::traffic::Says;
+
+/// Without joints for so long, in ns, cells are not in operation any more.
+pub const PAUSE_NS: u64 = SECOND_NS;
+/// A capture that begins in the middle of a run has joints within so many ns: some periods, and less than a start takes.
+const SOON_NS: u64 = 100_000_000;
+
+/// What a bus is doing.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Phase {
+    /// Cells claim numbers, are configured and organise themselves; until joints come, and when none have for [`PAUSE_NS`].
+    StartUp,
+    /// Joints are sent; or the bus speaks another protocol.
+    Operation,
+}
+
+/// How a capture begins: what has been seen of it before the first of its frames is looked at.
+#[derive(Debug, Default)]
+pub(super) struct Beginning {
+    first: Option<u64>,
+    joints: Option<u64>,
+    is_prepared: bool,
+    is_answered: bool,
+    /// Joints were sent before it.
+    pub(super) in_the_middle: bool,
+}
+
+impl Beginning {
+    pub(super) fn see(&mut self, at: u64, says: Says) {
+        let first = self.first.unwrap_or(at).min(at);
+        self.first = Some(first);
+        if self.joints.is_some() {
+            return;
+        }
+        match says {
+            Says::Joints(_) => self.joints = Some(at),
+            Says::Answer(_) => self.is_answered = true,
+            Says::Preparation | Says::Resume => self.is_prepared = true,
+            Says::Halt | Says::Other => {}
+        }
+    }
+
+    fn phase(&self, is_ours: bool) -> Phase {
+        let soon = self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < SOON_NS);
+        let in_the_middle = self.in_the_middle || self.is_answered || soon && !self.is_prepared;
+        if in_the_middle || !is_ours { Phase::Operation } else { Phase::StartUp }
+    }
+}
+
+/// Which phase it is, and how long each has lasted.
+#[derive(Debug, Default)]
+pub(super) struct Phases {
+    pub(super) beginning: Beginning,
+    now: Option<Phase>,
+    /// Until when time is counted, in ns.
+    until: u64,
+    joints: Option<u64>,
+    spans: [u64; 2],
+}
+
+impl Phases {
+    /// The phase of a frame at a time, which never runs backwards.
+    pub(super) fn at(&mut self, at: u64, says: Says, is_ours: bool) -> Phase {
+        let mut now = *self.now.get_or_insert_with(|| {
+            self.until = at;
+            self.beginning.phase(is_ours)
+        });
+        let over = self.joints.map(|joints| joints.saturating_add(PAUSE_NS)).filter(|&over| over < at);
+        if let (Phase::Operation, Some(over)) = (now, over) {
+            self.count(now, over.max(self.until));
+            now = Phase::StartUp;
+        }
+        self.count(now, at);
+        if matches!(says, Says::Joints(_)) {
+            now = Phase::Operation;
+            self.joints = Some(at);
+        }
+        self.now = Some(now);
+        now
+    }
+
+    fn count(&mut self, phase: Phase, at: u64) {
+        self.spans[phase as usize] += at - self.until;
+        self.until = at;
+    }
+
+    pub(super) fn now(&self) -> Phase {
+        self.now.unwrap_or(Phase::StartUp)
+    }
+
+    /// How long a phase has lasted, in ns.
+    pub(super) const fn span(&self, phase: Phase) -> u64 {
+        self.spans[phase as usize]
+    }
+}
+
+/// How long something took.
+#[derive(Debug)]
+pub(super) struct Delay {
+    histogram: Histogram<u64>,
+    most: u64,
+}
+
+impl Delay {
+    pub(super) fn new() -> Self {
+        Self { histogram: Histogram::new(3).expect("three digits are possible"), most: 0 }
+    }
+
+    pub(super) fn record(&mut self, nanos: u64) {
+        self.histogram.record(nanos).expect("it grows as it has to");
+        self.most = self.most.max(nanos);
+    }
+
+    pub(super) fn report(&self) -> Delays {
+        Delays::of(&self.histogram, self.most)
+    }
+}
+
+/// The figures of one phase.
+#[derive(Debug)]
+pub(super) struct Figures {
+    frames: u64,
+    asked: u64,
+    windows: [Window; 2],
+    pub(super) busy: Busy,
+    all: Delay,
+    kinds: [Delay; 8],
+    /// How many, and when.
+    queue: (usize, u64),
+    /// How many, of which identifier, and when.
+    queue_of_one: (u32, u16, u64),
+}
+
+impl Figures {
+    pub(super) fn new() -> Self {
+        Self {
+            frames: 0,
+            asked: 0,
+            windows: [SATURATED_NS, SECOND_NS].map(Window::new),
+            busy: Busy::default(),
+            all: Delay::new(),
+            kinds: std::array::from_fn(|_| Delay::new()),
+            queue: (0, 0),
+            queue_of_one: (0, 0, 0),
+        }
+    }
+
+    /// A frame wants so many ns of the bus.
+    pub(super) fn ask(&mut self, at: u64, took: u64) {
+        self.frames += 1;
+        self.asked += took;
+        self.windows.iter_mut().for_each(|window| window.ask(at, took));
+    }
+
+    pub(super) const fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    /// So many frames wait, and of one identifier.
+    pub(super) fn queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
+        if waiting > self.queue.0 {
+            self.queue = (waiting, at);
+        }
+        if let Some((queued, id)) = of_one.filter(|(queued, _)| *queued > self.queue_of_one.0) {
+            self.queue_of_one = (queued, id, at);
+        }
+    }
+
+    /// A frame has been sent, so long after it was to be.
+    pub(super) fn sent(&mut self, id: Option<u16>, nanos: u64) {
+        self.all.record(nanos);
+        let kind = id.and_then(|id| self.kinds.get_mut(Id::from_bits(id).kind as usize));
+        kind.into_iter().for_each(|kind| kind.record(nanos));
+    }
+
+    pub(super) fn delays(&self) -> Delays {
+        self.all.report()
+    }
+
+    pub(super) fn kinds(&self) -> Vec<KindDelays> {
+        let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram.is_empty());
+        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: delay.report() }).collect()
+    }
+
+    /// The load of a phase that lasted so long, and went on for a while on the wire.
+    pub(super) fn loads(&self, span: u64, overrun: u64) -> Loads {
+        let share = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
+        let [worst_16_ms, worst_1_s] =
+            self.windows.each_ref().map(Window::most).map(|(value, at_ns)| Most { value, at_ns });
+        let (mean, busy) = (share(self.asked, span), share(self.busy.total, span.saturating_add(overrun)));
+        Loads { mean, worst_16_ms, worst_1_s, busy }
+    }
+
+    pub(super) fn queues(&self) -> (Most, Most, u32) {
+        let most = |value: f64, at_ns| Most { value, at_ns };
+        let (of_one, id, at) = self.queue_of_one;
+        (most(self.queue.0 as f64, self.queue.1), most(f64::from(of_one), at), u32::from(id))
+    }
+
+    /// All of a start-up that lasted so long; none when nothing was sent in it.
+    pub(super) fn start_up(&self, span: u64) -> Option<StartUp> {
+        (self.frames > 0).then(|| StartUp {
+            frames: self.frames,
+            duration_s: span as f64 / 1e9,
+            load: self.loads(span, 0),
+            stretches: self.busy.stretches(SATURATED_NS),
+            delay_us: self.delays(),
+        })
+    }
+}
