@@ -5,9 +5,9 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+use protocol::can::Frame;
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
-use protocol::can::Frame;
 use thiserror::Error;
 
 use super::log::LogReader;

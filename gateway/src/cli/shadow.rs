@@ -159,8 +159,7 @@ impl ShadowCommand {
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
             let rates = asked.of_bus(bus);
-            let rates =
-                rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
+            let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
             of_bus.push((bus.name.clone(), rates));
         }
         let options = Options {

@@ -1,5 +1,7 @@
 //! The bench of Fig. 6 to 8: an arm with 253 cells that gives way to touches.
 
+use protocol::skin::Skin;
+
 use super::Effort;
 use crate::generate::{self, Wanted, generate};
 
@@ -72,6 +74,15 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
     generate(&Wanted { cells, reply, ..Wanted::default() }).expect("so many cells fit on the arm")
 }
 
+/// The paper's arm, whose cells answer with torques.
+///
+/// # Panics
+/// Never: what is generated can be read.
+#[must_use]
+pub fn paper() -> Skin {
+    Skin::parse("skin.toml", &skin(Reply::Torque, Effort::Full)).expect("it has been generated")
+}
+
 /// Its `scenario.toml`.
 #[must_use]
 pub const fn scenario(effort: Effort) -> &'static str {
@@ -85,7 +96,6 @@ pub const fn scenario(effort: Effort) -> &'static str {
 mod tests {
     use super::*;
     use crate::scenario::{Mode, Scenario};
-    use protocol::skin::Skin;
     use protocol::time::Micros;
 
     #[test]

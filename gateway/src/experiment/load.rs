@@ -1,171 +1,124 @@
-//! How much of a real bus a skin needs, over the number of cells and by bit rate: worst-case frames, every cell in contact.
+//! How much of a real bus the paper's arm needs, over the number of cells and by bit rate: the worst case of [`crate::fit`].
 
-use protocol::can::Format;
-use protocol::wire_time::{BitRates, Coding, Shape as Frame};
-
+use super::arm;
 use super::line::count;
+use crate::fit::limits::NODES;
+use crate::fit::verdict::Answer;
+use crate::fit::{self, COMPUTATION_NS, Row};
 use crate::report::figure::{
     Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table, number,
 };
 
-/// From joints to joints, in s.
-const PERIOD_S: f64 = 0.016;
-/// From one heartbeat of a cell to its next, in s.
-const HEARTBEAT_S: f64 = 0.25;
-/// Cells of the paper's arm.
-const CELLS: usize = 253;
-/// Nodes that common transceivers drive.
-const NODES: f64 = 110.0;
 /// Cells in the figure.
-const MOST: usize = 300;
-
-/// Two bit rates and what a packet travels in.
-#[derive(Clone, Copy, Debug)]
-pub struct Rates {
-    /// How people call it.
-    pub name: &'static str,
-    /// One FD frame a packet, or two classic ones.
-    pub format: Format,
-    rates: BitRates,
-}
-
-impl Rates {
-    /// The common ones.
-    #[must_use]
-    pub fn all() -> Vec<Self> {
-        let fd = [
-            ("500k/2M", 500_000, 2_000_000),
-            ("500k/5M", 500_000, 5_000_000),
-            ("1M/2M", 1_000_000, 2_000_000),
-            ("1M/5M", 1_000_000, 5_000_000),
-            ("1M/8M", 1_000_000, 8_000_000),
-        ];
-        let fd = fd.into_iter().filter_map(|(name, nominal, data)| {
-            Some(Self { name, format: Format::Fd, rates: BitRates::new(nominal, data).ok()? })
-        });
-        let classic = BitRates::classic(1_000_000).ok();
-        fd.chain(classic.map(|rates| Self { name: "classic 1M", format: Format::Classic, rates })).collect()
-    }
-
-    /// How long a packet takes at most, in s: its one frame, or its two.
-    #[must_use]
-    pub fn packet_s(&self) -> f64 {
-        let (coding, len, frames) = match self.format {
-            Format::Fd => (Coding::FdSwitched, 16, 1.0),
-            Format::Classic => (Coding::Classic, 8, 2.0),
-        };
-        frames * Frame { coding, extended: false, len }.worst().seconds(self.rates)
-    }
-
-    /// The part of a bus that the joints and so many cells' replies need; more than 1 does not fit.
-    #[must_use]
-    pub fn replies(&self, cells: usize) -> f64 {
-        self.packet_s() * (1.0 + count(cells)) / PERIOD_S
-    }
-
-    /// The same with the cells' heartbeats.
-    #[must_use]
-    pub fn load(&self, cells: usize) -> f64 {
-        self.replies(cells) + self.packet_s() * count(cells) / HEARTBEAT_S
-    }
-
-    /// The most cells whose load fits.
-    #[must_use]
-    pub fn most_cells(&self) -> usize {
-        (1..=10_000).take_while(|&cells| self.load(cells) <= 1.0).last().unwrap_or(0)
-    }
-}
+const MOST: u32 = 300;
 
 /// Loads over cells.
 #[must_use]
 pub fn section() -> Section {
-    let all = Rates::all();
-    let series = |rates: &Rates| {
-        let points = (0..=MOST).step_by(10).map(|cells| (count(cells), 100.0 * rates.load(cells)));
-        Series::new(rates.name, Shape::Line, points.collect())
+    let skin = arm::paper();
+    let rows = fit::table(&skin, None, COMPUTATION_NS);
+    let cells = skin.cells.len();
+    let series = |row: &Row| {
+        let case = &row.fullest.judged.case;
+        let points = (0..=MOST).step_by(10);
+        let points =
+            points.map(|cells| (f64::from(cells), 100.0 * case.with_cells(cells).load().total())).collect();
+        Series::new(Answer::worst_case(&row.fullest.judged).rates, Shape::Line, points)
     };
-    let findings = all.iter().map(|rates| {
-        let what = format!("load of {CELLS} cells on one bus at {}, heartbeats included", rates.name);
-        let load = rates.load(CELLS);
-        Finding::told(what, Quantity::new(100.0 * load, "%")).must("at most 100 %", load <= 1.0)
-    });
+    // Nobody has chosen any of these rates, so none is judged.
+    let finding = |row: &Row| {
+        let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.judged);
+        let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
+        Finding::told(what, Quantity::new(100.0 * load, "%"))
+    };
     Section {
         name: "load".to_owned(),
         title: "Bus load over the number of cells".to_owned(),
         text: vec![
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
-             each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
-             100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. A load \
-             below 100 % says that a bus keeps up in the long run, not that every reply comes in time."
+                 each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
+                 100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
+                 numbers of `gateway fit`, which says more about one skin."
                 .to_owned(),
+            format!(
+                "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
+                 the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
+            ),
         ],
         figures: vec![Figure {
             name: "load".to_owned(),
             title: "Load of one bus, every cell in contact, worst case".to_owned(),
-            x: Axis::new("cells", "").between(0.0, count(MOST)),
+            x: Axis::new("cells", "").between(0.0, f64::from(MOST)),
             y: Axis::new("load", "%").between(0.0, 200.0),
-            series: all.iter().map(series).collect(),
+            series: rows.iter().map(series).collect(),
             marks: vec![
                 Mark { on: On::Y, at: 100.0, label: "full".to_owned() },
-                Mark { on: On::X, at: NODES, label: "nodes electrically".to_owned() },
-                Mark { on: On::X, at: count(CELLS), label: "the paper's arm".to_owned() },
+                Mark { on: On::X, at: f64::from(NODES - 1), label: "nodes electrically".to_owned() },
+                Mark { on: On::X, at: count(cells), label: "the paper's arm".to_owned() },
             ],
             ..Figure::default()
         }],
-        findings: findings.collect(),
-        tables: vec![Table {
-            title: "One bus, worst case".to_owned(),
-            head: [
-                "bit rates",
-                "packet, µs",
-                "load of 253 cells, replies, %",
-                "with heartbeats, %",
-                "most cells",
-                "buses for 253 cells",
-            ]
-            .map(str::to_owned)
-            .to_vec(),
-            rows: all
-                .iter()
-                .map(|rates| {
-                    vec![
-                        rates.name.to_owned(),
-                        format!("{:.1}", rates.packet_s() * 1e6),
-                        number(100.0 * rates.replies(CELLS)),
-                        number(100.0 * rates.load(CELLS)),
-                        rates.most_cells().to_string(),
-                        CELLS.div_ceil(rates.most_cells().max(1)).to_string(),
-                    ]
-                })
-                .collect(),
-        }],
+        findings: rows.iter().map(finding).collect(),
+        tables: vec![table(&rows, cells)],
     }
+}
+
+fn table(rows: &[Row], cells: usize) -> Table {
+    let row = |row: &Row| {
+        let judged = &row.fullest.judged;
+        let Answer { load, rates, .. } = Answer::worst_case(judged);
+        vec![
+            rates,
+            format!("{:.1}", judged.case.packet_ns() as f64 / 1e3),
+            number(100.0 * (load - judged.load.heartbeats)),
+            number(100.0 * load),
+            row.fullest.most.in_time().to_string(),
+            row.need.in_time().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),
+            row.need.in_short(),
+        ]
+    };
+    let head = [
+        "bit rates".to_owned(),
+        "packet, µs".to_owned(),
+        format!("load of {cells} cells without heartbeats, %"),
+        "worst case, %".to_owned(),
+        "cells a bus has time for".to_owned(),
+        format!("buses for {cells} cells: by time"),
+        "needed".to_owned(),
+    ];
+    Table { title: "One bus, worst case".to_owned(), head: head.into(), rows: rows.iter().map(row).collect() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Worst cases that others computed, in µs; of two classic frames, whose CRC cannot be what would stuff most, 2 less.
     #[test]
-    fn a_packet_takes_what_it_takes() {
-        let wanted = [160.0, 102.4, 128.0, 70.4, 56.0, 266.0];
-        for (rates, wanted) in Rates::all().iter().zip(wanted) {
-            assert!((rates.packet_s() * 1e6 - wanted).abs() < 0.05, "{}: {}", rates.name, rates.packet_s());
-        }
-        assert_eq!(Rates::all().len(), wanted.len());
-    }
-
-    #[test]
-    fn the_papers_arm_does_not_fit_one_bus_at_5_megabit_but_at_8() {
-        let all = Rates::all();
-        let fits: Vec<_> = all.iter().map(|rates| rates.load(CELLS) <= 1.0).collect();
-        assert_eq!(fits, [false, false, false, false, true, false]);
-        for rates in &all {
-            let most = rates.most_cells();
-            assert!(rates.load(most) <= 1.0 && rates.load(most + 1) > 1.0, "{}", rates.name);
-        }
-        assert!((all[3].replies(CELLS) - 1.1176).abs() < 1e-3);
-        assert!((all[3].load(CELLS) - 1.1176 - 0.0712).abs() < 1e-3, "four heartbeats of each cell a second");
+    fn numbers_of_buses_are_those_of_fit_and_no_rate_that_nobody_chose_is_judged() {
+        let section = section();
+        let column = |at: usize| section.tables[0].rows.iter().map(move |row| row[at].as_str());
+        let named: Vec<_> = column(0).zip(column(5)).zip(column(6)).collect();
+        assert_eq!(
+            named,
+            [
+                (("classic 500k", "10"), "10 time"),
+                (("classic 1M", "5"), "5 time"),
+                (("500k/2M", "3"), "3 time, nodes"),
+                (("500k/5M", "2"), "3 nodes"),
+                (("1M/2M", "3"), "3 time, nodes"),
+                (("1M/5M", "2"), "3 nodes"),
+                (("1M/8M", "1"), "3 nodes"),
+            ]
+        );
+        assert!(section.findings.iter().all(|finding| finding.bar.is_none()), "{:?}", section.findings);
+        let what = |at: usize| section.findings[at].what.as_str();
+        assert_eq!(
+            (what(5), what(6)),
+            (
+                "worst case of one bus at 1M/5M: does not fit: bandwidth (all 253 cells answer)",
+                "worst case of one bus at 1M/8M: in time, but 254 nodes (all 253 cells answer)"
+            )
+        );
+        assert!((section.findings[5].ours.value - 118.9).abs() < 0.05);
     }
 }

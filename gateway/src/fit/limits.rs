@@ -147,6 +147,22 @@ impl Need {
         let most = needs.iter().map(|&(_, buses)| key(buses)).max();
         needs.into_iter().filter(|&(_, buses)| Some(key(buses)) == most).map(|(limit, _)| limit).collect()
     }
+
+    /// How many buses, and what asks for so many, in few words: `3 nodes`. Bandwidth and deadline are both a matter of time.
+    #[must_use]
+    pub fn in_short(&self) -> String {
+        let word = |limit| match limit {
+            Limit::Bandwidth | Limit::Deadline => "time",
+            Limit::Nodes => "nodes",
+        };
+        let mut words: Vec<_> = self.binding().into_iter().map(word).collect();
+        words.dedup();
+        match self.buses() {
+            Some(1) => "1".to_owned(),
+            Some(buses) => format!("{buses} {}", words.join(", ")),
+            None => format!("none {}", words.join(", ")),
+        }
+    }
 }
 
 #[cfg(test)]

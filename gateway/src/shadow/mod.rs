@@ -84,7 +84,8 @@ impl Options {
         let named = self.of_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
         let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
-        let cells = described.map(|(skin, bus)| u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX));
+        let cells =
+            described.map(|(skin, bus)| u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX));
         let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
         let worst_case = worst_case.as_ref().map(Answer::worst_case);
         Known { rates, cells, worst_case, bench_traffic: self.bench_traffic }

@@ -34,7 +34,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
             tenths(judged.load.total()),
             ms(judged),
             most.in_time().to_string(),
-            needed_shortly(&row.need),
+            row.need.in_short(),
             roots.map_or_else(String::new, |it| tenths(it.load.total())),
             roots.map_or_else(String::new, ms),
         ]);
@@ -163,18 +163,6 @@ fn last(judged: &Judged) -> String {
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn ms(judged: &Judged) -> String {
     judged.times.last_ns().map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
-}
-
-/// As [`needed`], in fewer words: bandwidth and deadline are both a matter of time.
-fn needed_shortly(need: &Need) -> String {
-    let word = |limit| match limit {
-        Limit::Bandwidth | Limit::Deadline => "time",
-        Limit::Nodes => "nodes",
-    };
-    let mut words: Vec<_> = need.binding().into_iter().map(word).collect();
-    words.dedup();
-    let buses = need.buses().map_or_else(|| "none".to_owned(), |buses| buses.to_string());
-    if buses == "1" { buses } else { format!("{buses} {}", words.join(", ")) }
 }
 
 fn needed(need: &Need) -> String {
