@@ -336,9 +336,7 @@ impl Lane {
         let (queue, queue_of_one, queue_of_one_id) = operation.queues();
         let this_run = (operation.frames() > 0).then(|| {
             let who = if is_ours { answering.cells() } else { Cells::Foreign };
-            // Of less than a second, all of it.
-            let fullest = load.mean.unwrap_or(0.0).max(load.worst_1_s.value);
-            Answer::this_run(fullest, replies.late, self.named_rates(), who)
+            Answer::this_run(load.worst_1_s.value, replies.late, self.named_rates(), who)
         });
         BusShadow {
             bus: self.name.clone(),

@@ -195,6 +195,14 @@ impl Figures {
         let share = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
         let [worst_16_ms, worst_1_s] =
             self.windows.each_ref().map(Window::most).map(|(value, at_ns)| Most { value, at_ns });
+        let worst_1_s = match span {
+            // Of less than a second, all of it; but a few frames are no load of theirs alone.
+            0..SECOND_NS => {
+                let all = self.asked as f64 / span.max(SATURATED_NS) as f64;
+                Most { value: worst_1_s.value.max(all), ..worst_1_s }
+            }
+            _ => worst_1_s,
+        };
         let (mean, busy) = (share(self.asked, span), share(self.busy.total, span.saturating_add(overrun)));
         Loads { mean, worst_16_ms, worst_1_s, busy }
     }

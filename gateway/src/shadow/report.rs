@@ -103,7 +103,7 @@ pub struct Loads {
     pub mean: Option<f64>,
     /// Within any 16 ms.
     pub worst_16_ms: Most,
-    /// Within any second.
+    /// Within any second; of less than a second, in all of it.
     pub worst_1_s: Most,
     /// The share of the time in which the bus was taken, by whatever.
     pub busy: Option<f64>,

@@ -1,15 +1,14 @@
 //! What the frames of one bus say: the same accounts that the gateway kept, epoch by epoch.
 
 use protocol::candump::{Direction, Record};
-use protocol::id::Kind;
 use protocol::message::Message;
-use protocol::packet;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::Bits;
 
 use super::{COLUMNS, GRAIN_S};
 use crate::decode::{Decoded, Decoder};
+use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use crate::table::{Replies, Table};
 
@@ -74,17 +73,18 @@ pub(super) struct Lane {
     pub(super) frames: u64,
     /// When the first and the last joints stood on the bus, in s, and how many there were.
     pub(super) joints: Option<(f64, f64, u64)>,
-    pub(super) rates: BitRates,
-    /// Seconds that a real bus would carry what it has to.
+    /// The bit rates of a real bus in its place.
+    pub(super) rates: Chosen,
+    /// Seconds that it would carry what it has to.
     pub(super) load: Binned,
-    /// The same with stimuli and simulated wires, which no real bus carries.
+    /// The same with what only a bench sends.
     pub(super) load_of_all: Binned,
     /// Frames that were lost on the way to the recording, as it says.
     pub(super) dropped: u64,
 }
 
 impl Lane {
-    pub(super) fn new(skin: &Skin, bus: usize, rates: BitRates) -> Self {
+    pub(super) fn new(skin: &Skin, bus: usize, rates: Chosen) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
         let roots: Vec<_> = table.cells().iter().filter(|cell| cell.root).map(|cell| cell.node).collect();
@@ -141,16 +141,18 @@ impl Lane {
         if let Decoded::Message(message) = &decoded {
             self.answer(now, message);
         }
-        let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates));
-        let stimulus = packet::data_id(&record.frame).is_ok_and(|id| id.kind == Kind::Stimulus);
-        let real = !stimulus && !matches!(decoded, Decoded::Wire(..));
+        let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
-        self.load.add(at, if real { seconds } else { 0.0 });
         self.table.handle_frame(now, own, &record.frame, &mut |_| None);
         let newest = self.table.newest().map(|(number, _, _)| number);
         if newest.is_some() && newest != self.open.map(|open| open.number) {
             self.next(newest.unwrap_or(0), at);
         }
+    }
+
+    /// What a real bus would have carried of a frame; nothing of one that only a bench sends.
+    pub(super) fn carried(&mut self, at: f64, bits: Option<Bits>) {
+        self.load.add(at, bits.map_or(0.0, |bits| bits.seconds(self.rates.rates)));
     }
 
     /// How long a cell took, if this is its answer to the newest joints.

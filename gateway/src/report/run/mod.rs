@@ -2,12 +2,14 @@
 //!
 //! ```text
 //!   /ROBOT/…, /gateway/timing ─> motion ─┐
-//!   /can/BUS ─> lane (a Table each) ─────┼─> page
+//!   /can/BUS ─┬> lane (a Table each) ────┼─> page
+//!             └> Shadow ─────────────────┤
 //!   metadata, /can/notes ────────────────┘
 //! ```
 //!
 //! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
-//! [`Table`](crate::table::Table) that the gateway had, and so come to the same accounts.
+//! [`Table`](crate::table::Table) that the gateway had, and so come to the same accounts. What a real bus would have made of
+//! them is what `gateway shadow` says of the same recording.
 
 mod lane;
 pub(crate) mod messages;
@@ -16,14 +18,15 @@ mod page;
 
 use std::path::Path;
 
-use protocol::can;
 use protocol::skin::{Bus, Skin};
-use protocol::wire_time::{BitRates, BitRatesError};
+use protocol::wire_time::BitRatesError;
 use thiserror::Error;
 
 use super::figure::Page;
 use crate::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other, SKIN};
+use crate::fit::rates::{Asked, Chosen};
 use crate::record::layout::Layout;
+use crate::shadow::{self, Shadow};
 use lane::Lane;
 use motion::Motion;
 
@@ -86,20 +89,11 @@ pub struct Options {
     pub data: Option<u32>,
 }
 
-/// Bits in a second where neither the skin nor who asks says anything.
-const NOMINAL: u32 = 1_000_000;
-/// The same of FD frames' data.
-const DATA: u32 = 5_000_000;
-
 impl Options {
     /// The bit rates that a bus' load is reckoned with.
-    fn rates(&self, bus: &Bus) -> Result<BitRates, ReportError> {
-        let nominal = self.nominal.or(bus.bitrate).unwrap_or(NOMINAL);
-        let data = match bus.format {
-            can::Format::Fd => self.data.or(bus.data_bitrate).unwrap_or_else(|| nominal.max(DATA)),
-            can::Format::Classic => nominal,
-        };
-        BitRates::new(nominal, data).map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
+    fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
+        let rates = Asked { nominal: self.nominal, data: self.data }.of_bus(bus);
+        rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
 
@@ -147,6 +141,15 @@ fn read(path: &Path, options: &Options) -> Result<(Run, Option<String>), ReportE
     Ok((run, damaged.map(|error| error.to_string()).or(unfinished)))
 }
 
+/// What a real bus would make of these buses.
+fn shadow(skin: &Skin, lanes: &[Lane]) -> Shadow {
+    let rates = Asked::default().rates().expect("common rates are possible");
+    let of_bus = lanes.iter().map(|lane| (lane.name.clone(), lane.rates.rates)).collect();
+    let options =
+        shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
+    Shadow::new(options).expect("no bit is damaged")
+}
+
 /// What a recording says, as far as it has been read.
 #[derive(Debug)]
 struct Run {
@@ -162,6 +165,7 @@ struct Run {
     began: Option<u64>,
     motion: Motion,
     lanes: Vec<Lane>,
+    shadow: Shadow,
     /// Packets of any network that the kernel dropped on their way to sockets.
     backlog: u64,
     /// Frames of buses that the skin does not have.
@@ -182,7 +186,9 @@ impl Run {
         let buses = skin.buses.iter().enumerate();
         let lanes = buses.map(|(at, bus)| Ok(Lane::new(&skin, at, options.rates(bus)?)));
         let mut lanes = lanes.collect::<Result<Vec<_>, ReportError>>()?;
+        let mut shadow = shadow(&skin, &lanes);
         for before in &extras.in_force {
+            shadow.in_force(&before.bus, before.nanos, &before.frame);
             if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
                 lane.in_force(before.nanos, &before.frame);
             }
@@ -196,6 +202,7 @@ impl Run {
             skin,
             began: None,
             lanes,
+            shadow,
             backlog: 0,
             others: 0,
             unreadable: 0,
@@ -207,7 +214,11 @@ impl Run {
             Item::Entry(Entry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
                 match self.skin.bus_named(record.interface).and_then(|bus| self.lanes.get_mut(bus)) {
-                    Some(lane) => lane.frame(at, record),
+                    Some(lane) => {
+                        lane.frame(at, record);
+                        self.shadow.frame(record.interface, record.time.nanos, &record.frame);
+                        self.carried();
+                    }
                     None => self.others += 1,
                 }
             }
@@ -250,8 +261,20 @@ impl Run {
         if nanos >= began { (nanos - began) as f64 * 1e-9 } else { (began - nanos) as f64 * -1e-9 }
     }
 
+    /// Takes what it is now known of that a real bus would have carried it.
+    fn carried(&mut self) {
+        while let Some(frame) = self.shadow.poll() {
+            let at = self.seconds(frame.nanos);
+            let bus = frame.bus.and_then(|bus| self.skin.bus_named(self.shadow.bus(bus)));
+            let lane = bus.and_then(|bus| self.lanes.get_mut(bus));
+            lane.into_iter().for_each(|lane| lane.carried(at, frame.bits));
+        }
+    }
+
     fn finish(&mut self) {
         self.lanes.iter_mut().for_each(Lane::finish);
+        self.shadow.finish();
+        self.carried();
     }
 
     fn is_empty(&self) -> bool {

@@ -135,13 +135,7 @@ impl Draft<'_> {
             let what = format!("replies not there before the next joints, of {due} that were due");
             findings.push(Finding::told(what, count(due - in_time)).must("none", in_time == due));
         }
-        for lane in &self.run.lanes {
-            let greatest = self.percent(&lane.load).into_iter().map(|(_, load)| load).fold(0.0, f64::max);
-            let what = format!("{}: greatest load of a real bus at {}", lane.name, lane.rates);
-            findings.push(
-                Finding::told(what, Quantity::new(greatest, "%")).must("below 100 %", greatest < 100.0),
-            );
-        }
+        findings.extend(self.fits());
         let uplink =
             Uplink::total(self.run.lanes.iter().flat_map(|lane| lane.table.cells()).map(|cell| cell.uplink));
         findings.push(

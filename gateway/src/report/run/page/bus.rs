@@ -2,8 +2,12 @@
 
 use super::super::lane::{Lane, Latency};
 use super::Draft;
-use crate::report::figure::{Axis, Figure, Mark, On, Section, Series, Shape, Size, Table, number};
+use crate::fit::verdict::{Answer, percent};
+use crate::report::figure::{
+    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
+};
 use crate::report::thin::{Binned, Thinned};
+use crate::shadow::BusShadow;
 use crate::summary::Quantiles;
 use crate::table::{Cell, Event, Uplink};
 
@@ -161,6 +165,28 @@ impl Draft<'_> {
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
+    /// What a real bus would have made of each bus that had frames.
+    fn shadows(&self) -> impl Iterator<Item = BusShadow> {
+        let buses = self.run.shadow.report().buses;
+        buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
+    }
+
+    /// Whether real buses would carry it: in this run, and at most. Only rates that somebody chose are judged.
+    pub(super) fn fits(&self) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        for bus in self.shadows() {
+            let lane = self.run.lanes.iter().find(|lane| lane.name == bus.bus);
+            let is_chosen = lane.is_some_and(|lane| lane.rates.is_chosen);
+            for answer in bus.this_run.iter().chain(&bus.worst_case) {
+                let Answer { load, rates, cells, verdict } = answer;
+                let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
+                let finding = Finding::told(what, Quantity::new(tenths(100.0 * load), "%"));
+                findings.push(if is_chosen { finding.must("fits", verdict.fits()) } else { finding });
+            }
+        }
+        findings
+    }
+
     /// What a real bus would carry.
     pub(super) fn load(&self) -> Section {
         let figure = |lane: &Lane| Figure {
@@ -168,7 +194,7 @@ impl Draft<'_> {
             title: format!(
                 "{}: load of a real bus at {}, over {} s each",
                 lane.name,
-                lane.rates,
+                lane.rates.rates,
                 number(lane.load.width())
             ),
             size: Size::Wide,
@@ -177,22 +203,27 @@ impl Draft<'_> {
             series: vec![
                 Series::new("what a real bus would carry", Shape::Steps, self.percent(&lane.load)),
                 Series::new(
-                    "with stimuli and simulated wires",
+                    "with what only a bench sends",
                     Shape::Dashed,
                     stairs(&self.percent(&lane.load_of_all)),
                 ),
             ],
             marks: vec![Mark { on: On::Y, at: 100.0, label: "all that it can".to_owned() }],
         };
+        let text = "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
+                    own bits make. This run is judged by the second in which most is asked of the bus; in the worst case all cells \
+                    answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
+                    wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
+        let assumed = self.run.lanes.iter().any(|lane| !lane.rates.is_chosen);
+        let assumed = assumed.then(|| {
+            "The skin has no bit rates for every bus, so common ones are taken and not judged.".to_owned()
+        });
         Section {
             name: "load".to_owned(),
             title: "Load of the buses".to_owned(),
-            text: vec![
-                "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
-                 own bits make. Stimuli and simulated wires exist on a bench only."
-                    .to_owned(),
-            ],
+            text: [text.to_owned()].into_iter().chain(assumed).collect(),
             figures: self.run.lanes.iter().map(figure).collect(),
+            tables: self.shadows().map(|bus| carried(&bus)).collect(),
             ..Section::default()
         }
     }
@@ -239,6 +270,40 @@ impl Draft<'_> {
             ..Section::default()
         }
     }
+}
+
+/// What a bus would carry in operation and in start-up.
+fn carried(bus: &BusShadow) -> Table {
+    let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
+    let mut rows: Vec<Vec<String>> = Vec::new();
+    let mut row = |cells: [&str; 6]| rows.push(cells.map(str::to_owned).into());
+    if let Some(worst) = &bus.worst_case {
+        let (verdict, load, cells) =
+            (worst.verdict.to_string(), percent(worst.load), worst.cells.to_string());
+        row([worst.case(), &verdict, &load, "", "", &cells]);
+    }
+    if let Some(run) = &bus.this_run {
+        let mean = bus.answering.and_then(|it| it.mean).unwrap_or(0.0);
+        let cells = format!("{}, {} on average", run.cells, number(tenths(mean)));
+        let [second, short] = [run.load, bus.load.worst_16_ms.value].map(percent);
+        row([run.case(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
+    }
+    if let Some(start) = &bus.start_up {
+        let frames = format!("{} frames in {} s without joints", start.frames, number(start.duration_s));
+        let [second, short] = [start.load.worst_1_s, start.load.worst_16_ms].map(|it| percent(it.value));
+        row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
+    }
+    if bus.bench.total() > 0 {
+        row(["left out", "", "", "", "", &format!("{} frames that only a bench sends", bus.bench.total())]);
+    }
+    let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
+    let title = format!("{} at {}: does it fit", bus.bus, bus.rates);
+    Table { title, head: head.map(str::to_owned).into(), rows }
+}
+
+/// With one decimal.
+fn tenths(value: f64) -> f64 {
+    (value * 10.0).round() / 10.0
 }
 
 /// A line that holds each value until the next one.
