@@ -45,7 +45,8 @@ fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
 
 /// The traffic of a bench as a capture would have it, through the shadow.
 fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
-    let options = Options { rates, of_bus: Vec::new(), bit_errors: 0.0, seed: 0, each_frame: true };
+    // Stimuli were on this bus too.
+    let options = Options { each_frame: true, bench_traffic: true, ..Options::new(rates) };
     let mut shadow = Shadow::new(options).unwrap();
     bench.asked().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
     shadow.finish();

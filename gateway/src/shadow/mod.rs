@@ -16,6 +16,8 @@ mod phase;
 mod report;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_run;
 mod told;
 
 use std::fmt::{self, Display, Formatter};

@@ -181,7 +181,11 @@ impl Draft<'_> {
                 let Answer { load, rates, cells, verdict } = answer;
                 let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
                 let finding = Finding::told(what, Quantity::new(tenths(100.0 * load), "%"));
-                findings.push(if is_chosen { finding.must("fits", verdict.fits()) } else { finding });
+                findings.push(if is_chosen {
+                    finding.must("within all limits", verdict.fits())
+                } else {
+                    finding
+                });
             }
         }
         findings
