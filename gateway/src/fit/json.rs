@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::case::{Answers, Load};
 use super::limits::{Limit, Most, Need};
 use super::remedy::Remedy;
+use super::verdict::Verdict;
 use super::{BusFit, Judged, Row, Whole, name};
 
 #[derive(Serialize)]
@@ -25,7 +26,7 @@ struct Document<'a> {
 struct Bus<'a> {
     bus: &'a str,
     #[serde(flatten)]
-    judged: Verdict,
+    judged: Figures,
     most_cells: Most,
     buses_needed: Needed,
     other_answers: Vec<Change<'a>>,
@@ -33,8 +34,9 @@ struct Bus<'a> {
 }
 
 #[derive(Serialize)]
-struct Verdict {
+struct Figures {
     name: String,
+    verdict: Verdict,
     format: &'static str,
     nominal: u32,
     data: u32,
@@ -66,7 +68,7 @@ struct Shares {
 struct Change<'a> {
     change: &'a str,
     #[serde(flatten)]
-    after: Verdict,
+    after: Figures,
 }
 
 #[derive(Serialize)]
@@ -87,7 +89,7 @@ struct Spread {
 #[derive(Serialize)]
 struct OnBuses {
     buses: u32,
-    fullest: Verdict,
+    fullest: Figures,
 }
 
 /// What was found of single buses with their whole, or of common rates; all times in µs, loads as shares of 1, and what
@@ -109,7 +111,7 @@ pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row])
 fn bus(fit: &BusFit, need: Need) -> Bus<'_> {
     Bus {
         bus: &fit.name,
-        judged: verdict(&fit.judged),
+        judged: figures(&fit.judged),
         most_cells: fit.most,
         buses_needed: needed(need),
         other_answers: fit.answers.iter().map(change).collect(),
@@ -118,12 +120,12 @@ fn bus(fit: &BusFit, need: Need) -> Bus<'_> {
 }
 
 fn change(remedy: &Remedy) -> Change<'_> {
-    Change { change: &remedy.change, after: verdict(&remedy.after) }
+    Change { change: &remedy.change, after: figures(&remedy.after) }
 }
 
 fn spread(whole: &Whole) -> Spread {
     let spread =
-        whole.spread.iter().map(|(buses, fullest)| OnBuses { buses: *buses, fullest: verdict(fullest) });
+        whole.spread.iter().map(|(buses, fullest)| OnBuses { buses: *buses, fullest: figures(fullest) });
     Spread { cells: whole.cells, buses_needed: needed(whole.need), spread: spread.collect() }
 }
 
@@ -131,9 +133,10 @@ fn needed(by: Need) -> Needed {
     Needed { by, buses: by.buses(), binding: by.binding() }
 }
 
-fn verdict(judged: &Judged) -> Verdict {
+fn figures(judged: &Judged) -> Figures {
     let Judged { case, load, times, exceeded } = judged;
-    Verdict {
+    Figures {
+        verdict: judged.verdict(),
         name: name(case.format, case.rates),
         format: match case.format {
             Format::Fd => "fd",

@@ -340,6 +340,7 @@ impl Lane {
         });
         BusShadow {
             bus: self.name.clone(),
+            name: self.named_rates(),
             rates: self.known.rates,
             frames: self.frames,
             first_ns: first,

@@ -26,6 +26,8 @@ pub struct Report {
 pub struct BusShadow {
     /// Its name.
     pub bus: String,
+    /// Its format and bit rates, as people write them.
+    pub name: String,
     /// Its bit rates.
     #[serde(serialize_with = "as_text")]
     pub rates: BitRates,

@@ -74,7 +74,7 @@ fn decimal(line: &mut Vec<u8>, mut number: u64, digits: usize) {
 pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
-    let mut rows = Rows::new([name.to_owned(), head, beside]);
+    let mut rows = Rows::new([name.to_owned(), head, beside]).names_in_one_line();
     for bus in &report.buses {
         one(&mut rows, bus, report.bit_error_rate);
     }
@@ -87,7 +87,7 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
 fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
     let missing = if bus.missing > 0 { format!("{} more are missing", bus.missing) } else { String::new() };
-    rows.section(format!("{} at {}", bus.bus, bus.rates), count, missing);
+    rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
     fit(rows, bus);
     if bus.this_run.is_some() {
         operation(rows, bus);
@@ -120,7 +120,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
 fn fit(rows: &mut Rows, bus: &BusShadow) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
-        (None, Some(_)) => rows.row("worst case", "?", "of a skin, which --skin names"),
+        (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
         (None, None) => {}
     }
     match &bus.this_run {
@@ -138,10 +138,10 @@ fn fit(rows: &mut Rows, bus: &BusShadow) {
 }
 
 fn operation(rows: &mut Rows, bus: &BusShadow) {
-    load(rows, bus, &bus.load, ("load on average", &format!("{:.3} s in operation", bus.operation_s)));
+    load(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
     rows.row("  bus taken", share(bus.load.busy), "");
     pauses(rows, bus, &bus.stretches);
-    rows.row("delay, µs", "half / 99 % / greatest", "from wanting to send to the end");
+    rows.row("delay, µs", "half / 99 % / greatest", "until it is sent");
     rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
@@ -160,7 +160,7 @@ fn operation(rows: &mut Rows, bus: &BusShadow) {
 /// Start-up, which is judged by nobody: it takes as long as it takes.
 fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
-    load(rows, bus, &start_up.load, ("start-up: load on average", &beside));
+    load(rows, bus, &start_up.load, ("start-up: average load", &beside));
     pauses(rows, bus, &start_up.stretches);
     rows.row("  delay, µs", delays(&start_up.delay_us), "half / 99 % / greatest");
 }
@@ -178,15 +178,15 @@ fn bench(rows: &mut Rows, bus: &BusShadow) {
 
 fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
     rows.row(name, share(load.mean), beside);
-    rows.row("  within any 16 ms, at most", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
-    rows.row("  within any second, at most", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
+    rows.row("  most in any 16 ms", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
+    rows.row("  most in any second", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
 }
 
 fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
     let longest = stretches.longest_s;
     let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
     let count = format!("{} times, {:.3} s", stretches.count, stretches.total_s);
-    rows.row("  without a pause for 16 ms", count, beside);
+    rows.row("  no pause for 16 ms", count, beside);
 }
 
 fn share(share: Option<f64>) -> String {
@@ -195,11 +195,11 @@ fn share(share: Option<f64>) -> String {
 
 fn answers(rows: &mut Rows, replies: &Replies) {
     let Replies { count, late_before, late, after_joints_us } = replies;
-    rows.row("answers after their joints, µs", delays(after_joints_us), "half / 99 % / greatest");
+    rows.row("answers after joints, µs", delays(after_joints_us), "half / 99 % / greatest");
     let before = if *late_before > 0 {
         format!("{late_before} more were late in the recording already")
     } else {
-        "after the next joints were to go out".to_owned()
+        "after the next joints".to_owned()
     };
     rows.row("  late", format!("{late} of {count}"), before);
 }

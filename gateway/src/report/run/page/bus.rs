@@ -301,7 +301,7 @@ fn carried(bus: &BusShadow) -> Table {
         row(["left out", "", "", "", "", &format!("{} frames that only a bench sends", bus.bench.total())]);
     }
     let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
-    let title = format!("{} at {}: does it fit", bus.bus, bus.rates);
+    let title = format!("{} at {}: does it fit", bus.bus, bus.name);
     Table { title, head: head.map(str::to_owned).into(), rows }
 }
 
