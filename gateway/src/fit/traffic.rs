@@ -221,3 +221,87 @@ impl Traffic {
         self.owed.iter_mut().for_each(what);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::message::{Heard, Heartbeat, Refused, SkinSensors, Tree};
+
+    fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<Bench>> {
+        message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()
+    }
+
+    fn page(from: i64, page: NetworkPage) -> Message {
+        Message::Network { from: Node::Cell(CellId::new(from).unwrap()), epoch: Epoch(0), page }
+    }
+
+    fn heartbeat(from: i64, state: State) -> Message {
+        page(from, NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() }))
+    }
+
+    fn skin(from: i64) -> Message {
+        let page = SensorPage::Skin(SkinSensors::default());
+        Message::Sensors { from: CellId::new(from).unwrap(), epoch: Epoch(0), page }
+    }
+
+    #[test]
+    fn what_answers_a_sync_or_a_report_is_the_benchs_once_and_what_comes_by_itself_is_not() {
+        for format in [Format::Fd, Format::Classic] {
+            let mut traffic = Traffic::default();
+            let mut last = |message: &Message| *said(&mut traffic, format, message).last().unwrap();
+            let (alive, tree) =
+                (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(Tree::default())));
+            assert_eq!([last(&alive), last(&skin(1)), last(&tree)], [None; 3]);
+            assert_eq!(last(&Message::Sync), Some(Bench::Sync));
+            assert_eq!(last(&heartbeat(2, State::CLAIMING)), None, "it leaves sync unanswered");
+            assert_eq!([last(&alive), last(&alive)], [Some(Bench::Sync), None]);
+            assert_eq!(last(&heartbeat(2, State::CONFIGURED)), None);
+            assert_eq!(last(&Message::Report), Some(Bench::Report));
+            assert_eq!(last(&skin(1)), None, "before the answers begin");
+            for page_of_one in
+                [NetworkPage::Heard(Heard::default()), NetworkPage::Refused(Refused::default())]
+            {
+                assert_eq!(last(&page(1, page_of_one)), Some(Bench::Report));
+            }
+            assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(Bench::Report), None, None]);
+            assert_eq!([last(&tree), last(&tree)], [Some(Bench::Report), None]);
+            // A cell without ports says no tree; its next one comes by itself.
+            last(&page(1, NetworkPage::Refused(Refused::default())));
+            assert_eq!([last(&alive), last(&tree)], [None; 2]);
+        }
+    }
+
+    #[test]
+    fn a_first_half_says_nothing_and_the_second_one_all_of_it() {
+        let mut traffic = Traffic::default();
+        let stimulus = Message::Stimulus {
+            to: Node::Everyone,
+            from: protocol::message::From::Next,
+            page: SensorPage::Skin(SkinSensors::default()),
+        };
+        assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(Bench::Stimulus)]);
+        let torque = skin(9).encode();
+        let sorted: Vec<_> = torque.frames(Format::Classic).map(|frame| traffic.sort(0, &frame)).collect();
+        assert_eq!((sorted[0].from, sorted[0].ends_pair), (None, false));
+        assert_eq!((sorted[1].from, sorted[1].ends_pair), (CellId::new(9).ok(), true));
+    }
+
+    proptest! {
+        #[test]
+        fn chance_makes_no_bench(frames in proptest::collection::vec((0..0x800_u32, any::<[u8; 16]>(), any::<bool>()), 0..400)) {
+            let mut traffic = Traffic::default();
+            // Of the first frame alone it would be believed: one in 65 536.
+            let stranger = Frame::classic(0x700, &[1]).unwrap();
+            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &stranger), Sorted::OTHER));
+            for (id, data, is_fd) in frames {
+                let frame = if is_fd {
+                    Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)
+                } else {
+                    Frame::classic(id, data.get(..8).unwrap())
+                };
+                prop_assert_eq!(traffic.sort(0, &frame.unwrap()).bench, None);
+            }
+        }
+    }
+}

@@ -8,7 +8,7 @@ use protocol::packet::Epoch;
 use protocol::wire_time::{BitRates, Bits};
 
 use super::answering::Counter;
-use super::phase::{Delay, Figures, Phase, Phases};
+use super::phase::{Delay, Each, Figures, Phase, Phases};
 use super::report::{BusShadow, Replies};
 use super::told::Told;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
@@ -108,8 +108,7 @@ pub(super) struct Lane {
     has_fd: bool,
     bench: BenchFrames,
     phases: Phases,
-    /// By [`Phase`].
-    figures: [Figures; 2],
+    figures: Each<Figures>,
     answering: Counter,
     /// The newest joints, and when the joints of each epoch were to go out.
     newest: Option<Epoch>,
@@ -142,7 +141,7 @@ impl Lane {
             has_fd: false,
             bench: BenchFrames::default(),
             phases: Phases::default(),
-            figures: [Figures::new(), Figures::new()],
+            figures: Each { start_up: Figures::new(), operation: Figures::new() },
             answering: Counter::new(),
             newest: None,
             joints: vec![0; 256],
@@ -238,7 +237,7 @@ impl Lane {
         let phase = self.phases.at(at, says, self.traffic.is_ours());
         let answer = self.hear(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
-        let figures = &mut self.figures[phase as usize];
+        let figures = self.figures.of(phase);
         figures.ask(at, took);
         if self.model.waiting() >= GREATEST_QUEUE {
             self.no_room += 1;
@@ -280,14 +279,14 @@ impl Lane {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
-            self.figures[self.phases.now() as usize].busy.take(start, end, SATURATED_NS);
+            self.figures.of(self.phases.now()).busy.take(start, end, SATURATED_NS);
             if is_damaged {
                 self.damaged += 1;
                 continue;
             }
             self.sent += 1;
             let Tag { place, id, phase, answer } = Tag::unpack(tag);
-            self.figures[phase as usize].sent(id, end - at);
+            self.figures.of(phase).sent(id, end - at);
             let queued = id.and_then(|id| self.queued.get_mut(usize::from(id)));
             queued.into_iter().for_each(|queued| *queued -= 1);
             if let Some((epoch, was_late)) = answer {
@@ -326,8 +325,8 @@ impl Lane {
 
     pub(super) fn report(&self) -> BusShadow {
         let (first, last) = self.span.unwrap_or_default();
-        let [start_up, operation] = &self.figures;
-        let span = self.phases.span(Phase::Operation);
+        let Each { start_up, operation } = &self.figures;
+        let span = self.phases.spans.operation;
         let overrun = self.wire_end.saturating_sub(self.released);
         let load = operation.loads(span, overrun);
         let is_ours = self.traffic.is_ours();
@@ -349,7 +348,7 @@ impl Lane {
             worst_case: self.known.worst_case.clone(),
             this_run,
             answering: is_ours.then_some(answering),
-            start_up: start_up.start_up(self.phases.span(Phase::StartUp)),
+            start_up: start_up.start_up(self.phases.spans.start_up),
             sent: self.sent,
             bench: self.bench,
             bench_left_out: !self.known.bench_traffic,

@@ -22,6 +22,22 @@ pub(super) enum Phase {
     Operation,
 }
 
+/// Something of each phase.
+#[derive(Debug, Default)]
+pub(super) struct Each<T> {
+    pub(super) start_up: T,
+    pub(super) operation: T,
+}
+
+impl<T> Each<T> {
+    pub(super) const fn of(&mut self, phase: Phase) -> &mut T {
+        match phase {
+            Phase::StartUp => &mut self.start_up,
+            Phase::Operation => &mut self.operation,
+        }
+    }
+}
+
 /// How a capture begins: what has been seen of it before the first of its frames is looked at.
 #[derive(Debug, Default)]
 pub(super) struct Beginning {
@@ -63,7 +79,8 @@ pub(super) struct Phases {
     /// Until when time is counted, in ns.
     until: u64,
     joints: Option<u64>,
-    spans: [u64; 2],
+    /// In ns.
+    pub(super) spans: Each<u64>,
 }
 
 impl Phases {
@@ -88,17 +105,12 @@ impl Phases {
     }
 
     fn count(&mut self, phase: Phase, at: u64) {
-        self.spans[phase as usize] += at - self.until;
+        *self.spans.of(phase) += at - self.until;
         self.until = at;
     }
 
     pub(super) fn now(&self) -> Phase {
         self.now.unwrap_or(Phase::StartUp)
-    }
-
-    /// How long a phase has lasted, in ns.
-    pub(super) const fn span(&self, phase: Phase) -> u64 {
-        self.spans[phase as usize]
     }
 }
 
