@@ -13,8 +13,8 @@ use protocol::wire_time::{BitRates, bit_rate};
 
 /// Say whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
 ///
-/// All frames are taken as long as bit stuffing can make them, all cells as in contact, and the bus as free of errors.
-/// Heartbeats count; stimuli, commands and simulated wires do not. Without rates: those of the description where it has
+/// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as free
+/// of errors. Heartbeats count; commands and what only a bench sends do not. What a run asked for says `gateway shadow`. Without rates: those of the description where it has
 /// them for every bus, else a table over common ones. docs/bus.md says how it is computed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
