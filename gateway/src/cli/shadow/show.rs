@@ -5,7 +5,8 @@ use std::io::{self, Write};
 use gateway::fit::traffic::BenchFrames;
 use gateway::fit::verdict::percent;
 use gateway::shadow::{
-    BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow, StartUp, Stretches,
+    Answering, BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow, StartUp,
+    Stretches,
 };
 
 use crate::cli::print::Rows;
@@ -127,14 +128,19 @@ fn fit(rows: &mut Rows, bus: &BusShadow) {
         Some(run) => rows.row(run.case(), run.value(), run.cells),
         None => rows.row("this run", "no joints in it", ""),
     }
-    let Some(answering) = bus.answering.filter(|it| it.epochs > 0) else { return };
-    let mean = answering.mean.unwrap_or(0.0);
-    let halted = match answering.epochs_halted {
-        0 => String::new(),
-        halted => format!(", and {halted} while halted are left out"),
-    };
-    let beside = format!("{} joints{halted}", answering.epochs);
-    rows.row("  cells that answered", format!("{mean:.1} on average"), beside);
+    match bus.answering {
+        Some(Answering { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
+            rows.row("  cells that answered", format!("{mean:.1} on average"), format!("{epochs} joints"));
+        }
+        Some(Answering { epochs, epochs_halted, mean: Some(mean), .. }) => {
+            let beside = format!("{epochs} joints, and {epochs_halted} while halted are left out");
+            rows.row("  cells that answered", format!("{mean:.1} on average"), beside);
+        }
+        Some(Answering { epochs_halted: halted @ 1.., mean: None, .. }) => {
+            rows.row("  cells that answered", "halted all the time", format!("{halted} joints"));
+        }
+        _ => {}
+    }
 }
 
 fn operation(rows: &mut Rows, bus: &BusShadow) {
