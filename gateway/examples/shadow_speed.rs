@@ -33,7 +33,9 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
     let mut frames = 0;
     let mut say = |micros: u64, id: Id, word: i16| {
         let epoch = Epoch(number.to_le_bytes()[0]);
-        let packet = Packet { id, words: [word; WORDS], epoch, count: 1 };
+        // Page 0 of the network is a heartbeat.
+        let count = u8::from(id.kind != id::Kind::Network);
+        let packet = Packet { id, words: [word; WORDS], epoch, count };
         for frame in packet.frames(Format::Fd) {
             let nanos = (1_700_000_000_000_000 + number * PERIOD + micros) * 1_000;
             let time = Timestamp { nanos, nine_digits: false };

@@ -5,9 +5,7 @@ use super::line::count;
 use crate::fit::limits::NODES;
 use crate::fit::verdict::Answer;
 use crate::fit::{self, COMPUTATION_NS, Row};
-use crate::report::figure::{
-    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table, number,
-};
+use crate::report::figure::{Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table};
 
 /// Cells in the figure.
 const MOST: u32 = 300;
@@ -38,7 +36,7 @@ pub fn section() -> Section {
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
                  each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
                  100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
-                 numbers of `gateway fit`, which says more about one skin."
+                 numbers of gateway fit, which says more about one skin."
                 .to_owned(),
             format!(
                 "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
@@ -70,23 +68,29 @@ fn table(rows: &[Row], cells: usize) -> Table {
         vec![
             rates,
             format!("{:.1}", judged.case.packet_ns() as f64 / 1e3),
-            number(100.0 * (load - judged.load.heartbeats)),
-            number(100.0 * load),
+            format!("{:.1}", 100.0 * (load - judged.load.heartbeats)),
+            format!("{:.1}", 100.0 * load),
             row.fullest.most.in_time().to_string(),
             row.need.in_time().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),
             row.need.in_short(),
         ]
     };
     let head = [
-        "bit rates".to_owned(),
-        "packet, µs".to_owned(),
-        format!("load of {cells} cells without heartbeats, %"),
-        "worst case, %".to_owned(),
-        "cells a bus has time for".to_owned(),
-        format!("buses for {cells} cells: by time"),
-        "needed".to_owned(),
+        "bit rates",
+        "packet, µs",
+        "joints and replies, %",
+        "with heartbeats, %",
+        "cells a bus",
+        "buses by time",
+        "buses needed",
     ];
-    Table { title: "One bus, worst case".to_owned(), head: head.into(), rows: rows.iter().map(row).collect() }
+    Table {
+        title: format!(
+            "Worst case: load of one bus with {cells} cells, cells that a bus has time for, buses for {cells} cells"
+        ),
+        head: head.map(str::to_owned).into(),
+        rows: rows.iter().map(row).collect(),
+    }
 }
 
 #[cfg(test)]
