@@ -290,7 +290,7 @@ impl Lane {
             let queued = id.and_then(|id| self.queued.get_mut(usize::from(id)));
             queued.into_iter().for_each(|queued| *queued -= 1);
             if let Some((epoch, was_late)) = answer {
-                self.answered(epoch, was_late, end);
+                self.answered(epoch, was_late, (at, end));
             }
             if let Some(told) = &mut told {
                 told.sent(place, Some((start, end)));
@@ -298,16 +298,23 @@ impl Lane {
         }
     }
 
-    /// An answer has come to its end.
-    fn answered(&mut self, epoch: Epoch, was_late: bool, end: u64) {
+    /// An answer that was to be sent at a time has come to its end.
+    fn answered(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
         let Some(newest) = self.newest else { return };
         self.replies.count += 1;
         if was_late {
             self.replies.late_before += 1;
             return;
         }
-        self.replies.late += u64::from(newest != epoch);
-        let joints = self.joints.get(usize::from(epoch.0)).copied().unwrap_or(end);
+        let sent = |epoch: Epoch| self.joints.get(usize::from(epoch.0)).copied();
+        let joints = sent(epoch).unwrap_or(end);
+        if newest != epoch {
+            self.replies.late += 1;
+            let next = sent(epoch.next()).filter(|&next| next > joints).unwrap_or(end);
+            let period = next.saturating_sub(joints);
+            let is_slow = at.saturating_sub(joints) > period / 8 * 7;
+            self.replies.late_when_ready += u64::from(is_slow);
+        }
         self.after_joints.record(end.saturating_sub(joints));
     }
 
@@ -335,7 +342,8 @@ impl Lane {
         let (queue, queue_of_one, queue_of_one_id) = operation.queues();
         let this_run = (operation.frames() > 0).then(|| {
             let who = if is_ours { answering.cells() } else { Cells::Foreign };
-            Answer::this_run(load.worst_1_s.value, replies.late, self.named_rates(), who)
+            let late = replies.late - replies.late_when_ready;
+            Answer::this_run(load.worst_1_s.value, late, self.named_rates(), who)
         });
         BusShadow {
             bus: self.name.clone(),

@@ -162,6 +162,8 @@ pub struct Replies {
     pub late_before: u64,
     /// Those that came to their end only after the next joints were to go out, and had not been late before.
     pub late: u64,
+    /// Of those, the ones that were ready only in the last eighth of the period: no bus is to blame.
+    pub late_when_ready: u64,
     /// From when joints were to go out to the end of each answer, in µs.
     pub after_joints_us: Delays,
 }

@@ -269,6 +269,29 @@ fn beside_the_run_stands_the_worst_case_of_the_skin_at_the_same_rates() {
 }
 
 #[test]
+fn an_answer_that_was_ready_too_late_for_any_bus_is_not_held_against_this_one() {
+    let verdict = |after: u64| {
+        let mut run = Run::new(Format::Fd);
+        run.operate(20, 4);
+        // One cell answers later than the others, just before the next joints or a little earlier.
+        run.epoch(0);
+        let (next, epoch) = (run.now, Epoch(run.epoch.0 - 1));
+        run.now = next - 16 * MS + after;
+        let torque = [Q3_12::from_bits(3); WORDS];
+        for number in 1..=60 {
+            run.say(&Message::Torque { from: cell(number), epoch, torque });
+        }
+        run.now = next;
+        run.operate(20, 4);
+        let shadow = run.shadow(options());
+        let replies = shadow.replies.unwrap();
+        (replies.late > 0, replies.late == replies.late_when_ready, shadow.this_run.unwrap().verdict)
+    };
+    assert_eq!(verdict(15_900_000), (true, true, Verdict::Fits));
+    assert_eq!(verdict(13_000_000), (true, false, Verdict::Deadline));
+}
+
+#[test]
 fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
     // Identifiers of stimuli, sync and report; among many that are none, some that are sound packets.
     let mut run = Run::new(Format::Fd);

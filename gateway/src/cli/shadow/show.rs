@@ -200,14 +200,16 @@ fn share(share: Option<f64>) -> String {
 }
 
 fn answers(rows: &mut Rows, replies: &Replies) {
-    let Replies { count, late_before, late, after_joints_us } = replies;
+    let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
     rows.row("answers after joints, µs", delays(after_joints_us), "half / 99 % / greatest");
-    let before = if *late_before > 0 {
-        format!("{late_before} more were late in the recording already")
-    } else {
-        "after the next joints".to_owned()
-    };
-    rows.row("  late", format!("{late} of {count}"), before);
+    let mut beside = vec!["after the next joints".to_owned()];
+    if *late_when_ready > 0 {
+        beside.push(format!("{late_when_ready} were ready too late for any bus"));
+    }
+    if *late_before > 0 {
+        beside.push(format!("{late_before} more were late in the recording already"));
+    }
+    rows.row("  late", format!("{late} of {count}"), beside.join(", "));
 }
 
 fn delays(delays: &Delays) -> String {
