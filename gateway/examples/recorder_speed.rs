@@ -14,6 +14,7 @@ use std::error::Error;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use gateway::central::Central;
@@ -106,7 +107,7 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
     let split = Split { bytes: u64::MAX / 2, age: Duration::MAX };
     let mcap = Mcap { path: path.clone(), split, attachments: Vec::new(), command_line: Vec::new() };
     let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
-    let outputs = Outputs::claim(&options, |line| println!("{line}"))?;
+    let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
     let (mut outlet, lane) = feed::lane(true, Arc::default(), Arc::default());
     let feed = Feed { lanes: vec![lane], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 
 use hdrhistogram::Histogram;
 use protocol::id::Kind;
+use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
@@ -19,6 +20,10 @@ pub struct Summary {
     pub skin: String,
     /// Cells in it.
     pub cells: usize,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Why it failed, if it did.
+    pub failure: Option<String>,
     /// How long the loop ran, in s.
     pub duration_s: f64,
     /// Whether it was ended by a signal.
@@ -45,8 +50,79 @@ pub struct Summary {
     pub recording: Option<Recording>,
 }
 
+impl Summary {
+    /// Of a run that failed before any bus was opened.
+    #[must_use]
+    pub fn of_no_run(skin: &Skin, why: String) -> Self {
+        Self {
+            skin: skin.name.clone(),
+            cells: skin.cells.len(),
+            outcome: Outcome::Failed,
+            failure: Some(why),
+            duration_s: 0.0,
+            interrupted: false,
+            halted: None,
+            first_broadcast_s: f64::NAN,
+            control: Loop::default(),
+            accuracy: Accuracy::default().into(),
+            backlog_dropped: None,
+            buses: Vec::new(),
+            processor: Processor::default(),
+            cell_private_kib: None,
+            recording: None,
+        }
+    }
+
+    /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
+    #[must_use]
+    pub fn judged(mut self, failure: Option<String>) -> Self {
+        self.failure = failure.or_else(|| self.lost_buses()).or_else(|| self.lost_frames());
+        self.outcome = match &self.failure {
+            Some(_) => Outcome::Failed,
+            None if self.interrupted => Outcome::Interrupted,
+            None => Outcome::Done,
+        };
+        self
+    }
+
+    fn lost_buses(&self) -> Option<String> {
+        let lost: Vec<_> = self.buses.iter().filter(|bus| bus.outages.at_end).collect();
+        let names = || lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        (!lost.is_empty()).then(|| format!("lost at the end of the run: {}", names()))
+    }
+
+    fn lost_frames(&self) -> Option<String> {
+        let Recording { errors, lost_write, .. } = self.recording.as_ref()?;
+        let first = errors.first().map_or("", String::as_str);
+        (!errors.is_empty() || *lost_write > 0)
+            .then(|| format!("the recording is not whole, {lost_write} frames were not written: {first}"))
+    }
+}
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Outcome {
+    /// It came to its end.
+    Done,
+    /// A signal ended it early.
+    Interrupted,
+    /// It did not come to its end, a bus was lost at its end, or its recording is not whole.
+    Failed,
+}
+
+impl core::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Done => "done",
+            Self::Interrupted => "interrupted",
+            Self::Failed => "failed",
+        })
+    }
+}
+
 /// The control loop.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Loop {
     /// Ticks that happened.
     pub ticks: u64,

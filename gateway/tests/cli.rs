@@ -464,7 +464,7 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     let nowhere = directory.path().join("none/skin.toml");
     let nowhere = format!("-o {}", nowhere.display());
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
-    assert_eq!(refusal(&format!("{generate} {nowhere}"), 1), format!("gateway: {nowhere}: {why}"));
+    assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("gateway: {nowhere}: {why}"));
 
     let shown = output(gateway(&format!("skin check {}", file.display())));
     let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash: "));

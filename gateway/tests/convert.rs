@@ -122,7 +122,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     assert_eq!(gone, "gateway: gone.log: No such file or directory (os error 2)");
     assert_eq!(folder.refuses("convert . run.mcap", 2), "gateway: .: is a directory");
     let nowhere = "No such file or directory (os error 2); name a file in a folder that can be written";
-    let said = folder.refuses("convert words.txt none/run.mcap", 1);
+    let said = folder.refuses("convert words.txt none/run.mcap", 2);
     assert_eq!(said, format!("gateway: none/run.mcap: {nowhere}"));
 }
 
@@ -171,7 +171,7 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes()), ("run.mcap", b"precious")]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap", 2),
-        "gateway: run.mcap exists: name another file, or overwrite it with --force"
+        "gateway: run.mcap: it exists: name another file, or overwrite it with --force"
     );
     assert_eq!(
         folder.refuses("convert run.log . --force", 2),

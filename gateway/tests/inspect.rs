@@ -50,11 +50,11 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     let written = || std::fs::read_to_string(folder.join("one.dbc")).unwrap();
     assert_eq!(written(), text);
     let said = refusal(folder, "dbc classic.toml --joined -o one.dbc", 2);
-    assert_eq!(said, "gateway: one.dbc is there already; --force writes over it");
+    assert_eq!(said, "gateway: -o one.dbc: it exists: name another file, or overwrite it with --force");
     assert_eq!(written(), text);
     output(folder, "dbc classic.toml --joined -o one.dbc --force");
     assert!(written().contains("Classic: a packet travels in two frames of 8 bytes under one identifier"));
-    let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 1);
+    let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 2);
     assert!(said.starts_with("gateway: -o nowhere/one.dbc: "), "{said}");
     assert!(said.ends_with("; name a file in a folder that can be written"), "{said}");
 }

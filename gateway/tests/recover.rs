@@ -170,7 +170,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
         "whole.mcap is whole, there is nothing to recover: 100 messages"
     );
     assert!(!path("whole-recovered.mcap").exists());
-    let exists = "gateway: -o there.mcap: there.mcap exists: name another file, or overwrite it with --force";
+    let exists = "gateway: -o there.mcap: it exists: name another file, or overwrite it with --force";
     assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
     says("recover run.mcap.part -o there.mcap --force", 0);
@@ -184,7 +184,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));
     let nowhere = "gateway: -o none/new.mcap: No such file or directory (os error 2); name a file in a folder that can be \
                    written";
-    assert_eq!(says("recover run.mcap.part -o none/new.mcap", 1), nowhere);
+    assert_eq!(says("recover run.mcap.part -o none/new.mcap", 2), nowhere);
     let held = fs::File::open(path("run.mcap.part")).unwrap();
     rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).unwrap();
     let recorded = "gateway: run.mcap.part is being recorded: wait for the run's end";

@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gateway::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Loop, NetworkSummary, Processor, Quantiles, Recording,
-    RepliesSummary, Summary, SumsSummary, Written, histogram,
+    AccuracySummary, BusSummary, ErrorsSummary, Loop, NetworkSummary, Outcome, Processor, Quantiles,
+    Recording, RepliesSummary, Summary, SumsSummary, Written, histogram,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
@@ -32,6 +32,8 @@ fn summary(bus: BusSummary) -> Summary {
     Summary {
         skin: "two-cells".to_owned(),
         cells: 2,
+        outcome: Outcome::Failed,
+        failure: Some("lost at the end of the run: vcan0".to_owned()),
         duration_s: 1.0,
         interrupted: false,
         halted: Some("somebody sent a halt frame".to_owned()),

@@ -235,7 +235,11 @@ fn a_gateway_that_has_no_bus_left_ends() {
     let said = "gateway: the embedded bus vcan1 was closed: its server ended\n";
     assert!(ended.stderr.ends_with(said), "{ended:#?}");
     place.is_left_clean();
-    assert!(!place.files().contains(&"run.json".to_owned()), "no figures of a run that failed");
+    let summary = place.summary();
+    assert_eq!(
+        (&summary.0["outcome"], summary.adds_up().0["buses"].as_array().unwrap().len()),
+        (&"failed".into(), 3)
+    );
 }
 
 #[test]

@@ -139,13 +139,15 @@ fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
     place.pressed();
     let bench = place.running_bench(60.0, "");
     let second = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --summary second.json \
-                  --candump second.log --quiet";
+                  --candump second.log --force --quiet";
     for more in ["", " --no-spawn"] {
         let ended = place.start("gateway", &format!("{second}{more}")).end();
-        let said = "gateway: another gateway is on vcan0: stop one of the two, or give this one another bus";
+        let said = "gateway: another gateway is on vcan0: stop one of the two, or set SKINBUS_DIR to \
+                    another directory for this run";
         assert_eq!(ended.refusal(1), said);
     }
-    assert_eq!(place.files(), ["buses", "scenario.toml", "skin.toml"].sorted());
+    let files = ["buses", "run.log", "scenario.toml", "second.json", "second.log", "skin.toml"];
+    assert_eq!(place.files(), files.sorted());
     place.guest().waits_for("a torque", torque_of(1));
     assert_eq!(bench.cells().len(), 8);
     bench.signal(Signal::TERM);
@@ -179,7 +181,8 @@ fn cells_on_the_bus_are_not_started_twice() {
         "cell 3",
         |message| matches!(message, Message::Network { from: Node::Cell(cell), .. } if cell.get() == 3),
     );
-    let said = "gateway: cells are on the bus already: 2, 3 on vcan0; use them with --no-spawn, or stop them";
+    let said = "gateway: cells are on the bus already: 2, 3 on vcan0; use them with --no-spawn, stop them, or set \
+                SKINBUS_DIR to another directory for this run";
     assert_eq!(place.bench(1.0, "--quiet").end().refusal(1), said);
     drop((cells, server));
 }

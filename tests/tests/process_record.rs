@@ -205,7 +205,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     let said = refused("--record old.mcap");
     assert_eq!(
         said,
-        "gateway: --record old.mcap: old.mcap exists: name another file, or overwrite it with --force"
+        "gateway: --record old.mcap: it exists: name another file, or overwrite it with --force"
     );
     place.write("late-1.mcap", "somebody's");
     assert!(refused("--record late.mcap").contains("late-1.mcap exists"));
@@ -213,11 +213,11 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     let said = refused("--candump old.log");
     assert_eq!(
         said,
-        "gateway: --candump old.log: old.log exists: name another file, or overwrite it with --force"
+        "gateway: --candump old.log: it exists: name another file, or overwrite it with --force"
     );
     assert_eq!(refused("--record run.log"), "gateway: --record run.log: a recording's name ends in .mcap");
     fs::create_dir(place.path("dir.mcap")).unwrap();
-    assert!(refused("--record dir.mcap").contains("is no regular file"));
+    assert!(refused("--record dir.mcap").contains("is a directory; name a file"));
     let gone = refused("--record gone/run.mcap");
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
     assert_eq!(gone, format!("gateway: --record gone/run.mcap: {why}"));

@@ -182,7 +182,7 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
 }
 
 #[test]
-fn a_run_that_fails_to_start_leaves_old_files_as_they_were() {
+fn a_run_that_fails_to_start_leaves_old_recordings_as_they_were_and_says_so_in_its_summary() {
     let place = Place::new();
     place.pressed();
     place.write("run.log", "of yesterday\n");
@@ -192,7 +192,8 @@ fn a_run_that_fails_to_start_leaves_old_files_as_they_were() {
     place.write("run.mcap", "of yesterday\n");
     refusal(&place, "gateway", run, 1);
     assert_eq!(place.read("run.mcap"), "of yesterday\n");
-    assert_eq!((place.read("run.log"), place.read("run.json")), ("of yesterday\n".into(), "{}\n".into()));
+    assert_eq!(place.read("run.log"), "of yesterday\n");
+    assert_eq!(place.summary().0["outcome"], "failed");
 }
 
 #[test]

@@ -198,7 +198,7 @@ fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_sa
         ),
     ] {
         let refused = place.start("gateway", &format!("report run.mcap {options}")).end();
-        assert_eq!(refused.refusal(1), format!("gateway: {said}"));
+        assert_eq!(refused.refusal(2), format!("gateway: {said}"));
     }
     assert!(!place.path("more").exists() && !place.path("new.html").exists());
     let refused = place.start("gateway", "report run.mcap -o new.html --nominal 2M").end();

@@ -215,7 +215,7 @@ fn a_gateway_without_cells_says_who_is_missing() {
     let said = "gateway: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
                 or leave out --no-spawn";
     assert_eq!(ended.refusal(1), said);
-    assert_eq!(place.files(), ["buses", "scenario.toml", "skin.toml"]);
+    assert_eq!(place.files(), ["buses", "run.json", "scenario.toml", "skin.toml"]);
 
     // Those that are there are enough.
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-6 --skin skin.toml");

@@ -21,6 +21,7 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use self::work::{Bench, Done, open};
+use super::output::Force;
 use super::{input, output};
 
 /// How often it is looked how far the buses are.
@@ -58,6 +59,8 @@ pub(crate) struct Commission {
     /// Write a copy of the description with the numbers that the cells have on their buses
     #[arg(long, value_name = "FILE")]
     numbers: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
@@ -72,6 +75,8 @@ impl Commission {
         let file = self.skin.display().to_string();
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
         let wanted = self.buses(&skin)?;
+        // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
+        self.numbers.as_ref().map_or(Ok(()), |path| self.force.check("--numbers", path))?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
@@ -130,7 +135,7 @@ impl Commission {
             let copy = renumbered(&skin, &text, &numbers);
             let copy =
                 copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", path.display())))?;
-            output::write_file("--numbers", path, &copy)?;
+            self.force.write("--numbers", path, &copy)?;
         }
         whole.end()
     }

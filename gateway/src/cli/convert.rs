@@ -6,7 +6,7 @@ use std::io::{self, BufWriter, IsTerminal};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 use gateway::capture::convert::{ConvertError, Converted, Output, convert};
@@ -17,7 +17,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::Failure;
 
 use super::input::{Interruptible, stopped};
-use super::output::note;
+use super::output::{Force, note, refused};
 
 /// Lines that cannot be read and are named; further ones are counted.
 const NAMED: u64 = 100;
@@ -42,9 +42,8 @@ pub(crate) struct Convert {
     /// The new capture; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
-    /// Overwrite a file that exists
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    force: Force,
     /// End at the first line that is no frame though it begins like one, or when IN has no end; write nothing then
     #[arg(long)]
     strict: bool,
@@ -79,10 +78,8 @@ impl Convert {
             )));
         }
         let to = self.to.display();
-        if fs::symlink_metadata(&self.to).is_ok_and(|there| there.is_file()) && !self.force {
-            return Err(Failure::usage(format!(
-                "{to} exists: name another file, or overwrite it with --force"
-            )));
+        if !is_standard(&self.to) {
+            self.force.check("", &self.to)?;
         }
         let name = if is_standard(&self.from) {
             "standard input".to_owned()
@@ -107,7 +104,7 @@ impl Convert {
         let directions = !self.plain && (self.direction || reader.is_of_a_log());
         let style = Style { digits, plain: self.plain, directions };
         let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
-        let (whole, out) = create(&self.to).map_err(failed)?;
+        let (whole, out) = self.create(&stopped)?;
         let mut output = Output::new(out, format, style).map_err(failed)?;
         let mut named = 0;
         let done = convert(&mut reader, &mut output, |line, why| {
@@ -157,6 +154,18 @@ impl Convert {
         Ok(())
     }
 
+    /// The output; standard output is written to as it is.
+    fn create(&self, stopped: &AtomicBool) -> Result<(Option<WholeFile>, BufWriter<File>), Failure> {
+        let begun = if is_standard(&self.to) {
+            io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
+        } else {
+            WholeFile::create_unless(&self.to, self.force.force, stopped)
+                .map(|(whole, file)| (Some(whole), file))
+        };
+        let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;
+        Ok((whole, BufWriter::with_capacity(PIECE, file)))
+    }
+
     /// What OUT is to be, by its name.
     fn format(&self) -> Result<Format, Failure> {
         let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
@@ -187,17 +196,6 @@ fn open(path: &Path) -> io::Result<(File, Option<u64>)> {
         return Err(io::ErrorKind::IsADirectory.into());
     }
     Ok((file, about.is_file().then_some(about.len())))
-}
-
-/// The output; standard output is written to as it is.
-fn create(path: &Path) -> io::Result<(Option<WholeFile>, BufWriter<File>)> {
-    let (whole, file) = if is_standard(path) {
-        (None, io::stdout().as_fd().try_clone_to_owned()?.into())
-    } else {
-        let (whole, file) = WholeFile::create(path)?;
-        (Some(whole), file)
-    };
-    Ok((whole, BufWriter::with_capacity(PIECE, file)))
 }
 
 /// What becomes of an error of the output: who read it may have left, as `head` does.

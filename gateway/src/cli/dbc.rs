@@ -8,7 +8,7 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 
-use super::output;
+use super::output::Force;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
@@ -33,9 +33,8 @@ pub(crate) struct Dbc {
     /// The file to write, whole or not at all; else standard output
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Write over a file that is there
-    #[arg(long, requires = "output")]
-    force: bool,
+    #[command(flatten)]
+    force: Force,
 }
 
 impl Dbc {
@@ -75,10 +74,7 @@ impl Dbc {
         }
         let text = dbc(&skin, bus);
         match self.output {
-            Some(path) if !self.force && path.is_file() => {
-                Err(Failure::usage(format!("{} is there already; --force writes over it", path.display())))
-            }
-            Some(path) => output::write_file("-o", &path, &text),
+            Some(path) => self.force.write("-o", &path, &text),
             None => print(&text),
         }
     }

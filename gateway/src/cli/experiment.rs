@@ -23,7 +23,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::{Failure, print, quoted};
 
 use super::input::stopped;
-use super::output::note;
+use super::output::{Force, note};
 use super::print::Rows;
 use super::programs::Programs;
 use bench::Benches;
@@ -32,8 +32,8 @@ use folder::Folder;
 /// Do the paper's experiments, and draw and judge what comes out
 ///
 /// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
-/// its verdict, and the recordings of the benches. Files of these names are replaced, all at once when everything is
-/// done; what fails or is ended writes nothing. `gateway experiment list` tells what there is.
+/// its verdict, and the recordings of the benches, all at once when everything is done; what fails or is ended writes
+/// nothing. A folder in which there is something is taken with --force only. `gateway experiment list` tells what there is.
 ///
 /// The moving arm's benches are 253 processes on an embedded bus of their own. All of it takes about two minutes.
 /// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
@@ -49,6 +49,8 @@ pub(crate) struct Experiment {
     /// The folder for what comes out; made where there is none
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
     /// Measure little: a few cells, a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
@@ -93,7 +95,7 @@ impl Experiment {
         let named: Vec<Named> = Named::ALL.into_iter().filter(wanted).collect();
         let stop = stopped()?;
         // Before anything is measured: nobody wants to hear after minutes that there is nowhere to write.
-        let folder = Folder::create(output)?;
+        let folder = Folder::create(output, self.force)?;
         let page = self.perform(&named, &folder, stop)?;
         write(&page, &folder)?;
         folder.finish()?;

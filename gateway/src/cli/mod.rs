@@ -2,6 +2,7 @@
 //! 1 (the run failed) and 2 (wrong use or configuration).
 
 mod ack;
+mod buses;
 mod cells;
 mod commission;
 mod convert;

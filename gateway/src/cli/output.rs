@@ -1,23 +1,66 @@
 //! Where commands write beside standard output: standard error, and files that are whole or not there.
 
 use std::fmt::Display;
+use std::fs::{self, File};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use gateway::run::file::WholeFile;
+use clap::Args;
+use gateway::run::file::{self, WholeFile};
 use protocol::usage::Failure;
+
+/// Whether files that exist may be overwritten.
+#[derive(Args, Clone, Copy, Debug)]
+pub(crate) struct Force {
+    /// Overwrite files that exist
+    #[arg(long)]
+    pub(crate) force: bool,
+}
+
+impl Force {
+    /// Begins a file that an option names, so that what makes that impossible is known before there is anything to
+    /// write.
+    pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
+        WholeFile::create(path, self.force).map_err(|error| refused(option, path, &error))
+    }
+
+    /// Sees that a file may be written, long before it is.
+    pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
+        file::check(path, self.force).map_err(|error| refused(option, path, &error))
+    }
+
+    /// Writes a whole file that an option names, or leaves what was there.
+    pub(crate) fn write(self, option: &str, path: &Path, text: &str) -> Result<(), Failure> {
+        let (whole, file) = self.create(option, path)?;
+        finish(option, whole, file, text)
+    }
+}
+
+/// Writes all of a file that was begun.
+pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
+    let name = named(option, whole.path());
+    let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
+    written.map_err(|error: io::Error| Failure::run(format!("{name}: {error}")))
+}
+
+/// A name that cannot be written to is wrong use.
+pub(crate) fn refused(option: &str, path: &Path, error: &io::Error) -> Failure {
+    Failure::usage(format!("{}: {error}", named(option, path)))
+}
+
+fn named(option: &str, path: &Path) -> String {
+    format!("{option} {}", path.display()).trim_start().to_owned()
+}
+
+/// Where a name leads: two names of one file are the same, whether it is there or not.
+pub(crate) fn place(path: &Path) -> PathBuf {
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let inside = || Some(fs::canonicalize(folder).ok()?.join(path.file_name()?));
+    fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
+}
 
 /// Says something on standard error; if that is closed, nobody wants to know.
 pub(crate) fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "{text}");
-}
-
-/// Writes a whole file that an option names, or leaves what was there.
-pub(crate) fn write_file(option: &str, path: &Path, text: &str) -> Result<(), Failure> {
-    let write = || {
-        let (whole, mut file) = WholeFile::create(path)?;
-        file.write_all(text.as_bytes())?;
-        whole.finish()
-    };
-    write().map_err(|error: io::Error| Failure::run(format!("{option} {}: {error}", path.display())))
 }

@@ -52,8 +52,7 @@ impl Rows {
 }
 
 fn table(summary: &Summary) -> Table {
-    let ended = if summary.interrupted { "interrupted" } else { "done" };
-    let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
+    let cells = format!("{} cells, {:.1} s, {}", summary.cells, summary.duration_s, summary.outcome);
     let mut rows = Rows::new([summary.skin.clone(), cells, String::new()]);
     accuracy(&mut rows, summary);
     control(&mut rows, summary);

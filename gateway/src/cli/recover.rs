@@ -1,6 +1,6 @@
 //! `gateway recover`: makes a recording whole whose writer was killed.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Write;
 use std::path::PathBuf;
 
@@ -8,6 +8,8 @@ use clap::Args;
 use gateway::record::recover::RecoverError;
 use gateway::record::{names, repair};
 use protocol::usage::Failure;
+
+use super::output::{Force, place};
 
 /// Make a recording whole that ends in the middle
 ///
@@ -22,9 +24,8 @@ pub(crate) struct Recover {
     /// The new file; else FILE-recovered.mcap
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Overwrite a file that exists
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    force: Force,
 }
 
 impl Recover {
@@ -35,25 +36,18 @@ impl Recover {
             return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
         }
         let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
-        let there = fs::symlink_metadata(&output).is_ok_and(|about| about.is_file());
         let out = output.display();
-        if fs::canonicalize(&output)
-            .is_ok_and(|path| fs::canonicalize(&self.file).is_ok_and(|file| file == path))
-        {
+        if place(&output) == place(&self.file) {
             return Err(Failure::usage(format!("-o {out} is the recording itself: name another file")));
         }
-        if there && !self.force {
-            return Err(Failure::usage(format!(
-                "-o {out}: {out} exists: name another file, or overwrite it with --force"
-            )));
-        }
+        self.force.check("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {
                 return Failure::run(format!("-o {out}: {error}"));
             }
             Failure::run(format!("{name}: {error}"))
         };
-        let line = match repair::copy_unless_sound(&self.file, &output).map_err(failure)? {
+        let line = match repair::copy_unless_sound(&self.file, &output, self.force.force).map_err(failure)? {
             (recovered, None) => {
                 format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
             }

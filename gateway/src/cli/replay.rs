@@ -1,7 +1,6 @@
 //! `gateway replay`.
 
 use std::fmt::Display;
-use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -14,11 +13,12 @@ use gateway::replay::report::{Expect, Summary};
 use gateway::replay::survey::Part;
 use gateway::replay::{Options, Spawn, replay};
 use gateway::run::RunError;
-use gateway::run::file::WholeFile;
 use gateway::summary::Quantiles;
 use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};
+
+use super::output::{self, Force};
 
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 100;
@@ -110,6 +110,8 @@ pub(crate) struct Replay {
     /// Write the figures of the end as JSON; docs/replay.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
     /// Print the figures as JSON instead of the table
     #[arg(long)]
     json: bool,
@@ -155,18 +157,12 @@ impl Replay {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let options = self.options()?;
         // Before the replay: nobody wants to hear after an hour that there is nowhere to write.
-        let file = self.summary.as_ref().map(|path| {
-            WholeFile::create(path)
-                .map_err(|error| Failure::usage(format!("--summary {}: {error}", path.display())))
-        });
-        let file = file.transpose()?;
+        let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
         let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
         let json = serde_json::to_string_pretty(&summary).map_err(Failure::run)?;
-        if let Some((whole, mut file)) = file {
-            let path = whole.path().display().to_string();
-            let written = writeln!(file, "{json}").and_then(|()| whole.finish());
-            written.map_err(|error| Failure::run(format!("{path}: {error}")))?;
+        if let Some((whole, file)) = file {
+            output::finish("--summary", whole, file, &format!("{json}\n"))?;
         }
         print(&if self.json { format!("{json}\n") } else { table(&summary) })?;
         summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))

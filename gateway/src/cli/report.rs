@@ -7,11 +7,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use gateway::report::run::{self, ReportError};
 use gateway::report::{figure::Page, page, svg};
-use gateway::run::file::WholeFile;
 use protocol::usage::{Failure, print};
 use protocol::wire_time::bit_rate;
 
-use super::output::note;
+use super::output::{Force, note, place};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -37,9 +36,8 @@ pub(crate) struct Report {
     /// Bits in a second of FD frames' data: 2M, 5M; else the skin's, else 5M
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     data: Option<u32>,
-    /// Overwrite files that exist
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    force: Force,
 }
 
 impl Report {
@@ -53,12 +51,14 @@ impl Report {
         if let Some(folder) = &self.svg {
             for (name, drawing) in drawings(&report.page) {
                 let path = folder.join(name);
-                self.is_free(&path, "--svg")?;
+                if folder.is_dir() {
+                    self.is_free(&path, "--svg")?;
+                }
                 files.push(("--svg", path, drawing));
             }
         }
         let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
-        if let Err(failure) = write(&files) {
+        if let Err(failure) = write(&files, self.force) {
             if let Some(folder) = self.svg.filter(|_| made) {
                 // Only if nothing is in it.
                 let _ = fs::remove_dir(folder);
@@ -77,19 +77,12 @@ impl Report {
     /// What is there is not overwritten unless that is asked for.
     fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
         let name = path.display();
-        if let (Ok(recording), Ok(there)) = (fs::canonicalize(&self.file), fs::canonicalize(path))
-            && recording == there
-        {
+        if place(&self.file) == place(path) {
             return Err(Failure::usage(format!(
                 "{option} {name} is the recording itself: name another file"
             )));
         }
-        if !self.force && fs::symlink_metadata(path).is_ok_and(|about| about.is_file()) {
-            return Err(Failure::usage(format!(
-                "{option} {name}: it exists: name another file, or overwrite it with --force"
-            )));
-        }
-        Ok(())
+        self.force.check(option, path)
     }
 }
 
@@ -109,22 +102,20 @@ fn make(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);
     made.map_err(|error| {
-        Failure::run(format!("--svg {}: {error}; name a folder that can be written", folder.display()))
+        Failure::usage(format!("--svg {}: {error}; name a folder that can be written", folder.display()))
     })
 }
 
 /// Writes all of them, each beside the option that is for it, or none: each gets its name when all are whole.
-fn write(files: &[(&str, PathBuf, String)]) -> Result<(), Failure> {
+fn write(files: &[(&str, PathBuf, String)], force: Force) -> Result<(), Failure> {
     let failed = |option: &str, path: &Path, error: io::Error| {
         Failure::run(format!("{option} {}: {error}", path.display()))
     };
     let mut whole = Vec::with_capacity(files.len());
     for (option, path, text) in files {
-        let written = WholeFile::create(path).and_then(|(whole, mut file)| {
-            file.write_all(text.as_bytes())?;
-            Ok(whole)
-        });
-        whole.push((option, path, written.map_err(|error| failed(option, path, error))?));
+        let (begun, mut file) = force.create(option, path)?;
+        file.write_all(text.as_bytes()).map_err(|error| failed(option, path, error))?;
+        whole.push((option, path, begun));
     }
     whole
         .into_iter()

@@ -3,15 +3,15 @@
 use std::fs::File;
 use std::io::Write;
 use std::os::fd::AsRawFd;
+use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
 use gateway::dbc;
 use gateway::record::series::{Attached, Split};
-use gateway::record::{self, account::Recording as Recorded};
-use gateway::run::file::WholeFile;
-use gateway::run::{self, Options, RunError};
+use gateway::record::{self, Candump};
+use gateway::run::{self, Options};
 use gateway::scenario::Scenario;
 use gateway::summary::Summary;
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
@@ -20,6 +20,8 @@ use protocol::time::Span;
 use protocol::usage::Failure;
 use rustix::fs::{MemfdFlags, memfd_create};
 
+use super::buses::Buses;
+use super::output::{self, Force, note, place};
 use super::print;
 use super::programs::Programs;
 
@@ -60,9 +62,8 @@ struct Recording {
     /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
     #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
     record_split: Vec<Limit>,
-    /// Overwrite recordings and logs that exist
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    force: Force,
 }
 
 /// When another file of a recording is begun.
@@ -94,20 +95,20 @@ fn limit(text: &str) -> Result<Limit, String> {
 impl Recording {
     /// What is recorded where; the files go with it as they are.
     fn options(
-        self,
-        candump: Option<PathBuf>,
+        &self,
+        candump: Option<Candump>,
         skin: &Skin,
         skin_file: impl FnOnce() -> Result<Vec<u8>, Failure>,
         scenario_file: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
     ) -> Result<record::Options, Failure> {
         let mut split = Split::default();
-        for limit in self.record_split {
+        for &limit in &self.record_split {
             match limit {
                 Limit::Bytes(bytes) => split.bytes = bytes,
                 Limit::Age(age) => split.age = age,
             }
         }
-        let mcap = self.record.map(|path| {
+        let mcap = self.record.clone().map(|path| {
             let toml =
                 |name: &str, bytes| Attached { name: name.to_owned(), media_type: "application/toml", bytes };
             let mut attachments = vec![toml("skin.toml", skin_file()?)];
@@ -124,22 +125,23 @@ impl Recording {
             let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
             Ok::<_, Failure>(record::Mcap { path, split, attachments, command_line })
         });
-        Ok(record::Options { candump, mcap: mcap.transpose()?, force: self.force })
+        Ok(record::Options { candump, mcap: mcap.transpose()?, force: self.force.force })
     }
 }
 
 /// Show everything at once: 253 cells on an arm, touched here and there
 ///
-/// Needs nothing: the cells are processes on an embedded bus, private to you. Frames are recorded as
-/// candump text; the end's table says where.
+/// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
+/// directory, so any number of demonstrations and runs go on side by side. It says which command shows the frames on
+/// its bus, and where it records them as candump text.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  gateway demo --duration 5")]
 pub(crate) struct Demo {
     #[command(flatten)]
     common: Common,
-    /// Where the frames are recorded
-    #[arg(long, value_name = "FILE", default_value = DEMO_LOG)]
-    candump: PathBuf,
+    /// Where the frames are recorded; else skinbus-demo.log, or skinbus-demo-1.log, ... where that exists
+    #[arg(long, value_name = "FILE")]
+    candump: Option<PathBuf>,
     /// embedded, socketcan, or auto for SocketCAN where the kernel has it
     #[arg(long, value_name = "KIND", default_value_t = Choice::Only(BusKind::Embedded))]
     bus_kind: Choice,
@@ -204,12 +206,23 @@ impl Demo {
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         let mut options = self.common.options(skin_file, skin, scenario);
         options.kinds = Kinds::all(self.bus_kind);
-        let Common { mut recording, summary, .. } = self.common;
-        // Who shows it again wants no other name for it.
-        recording.force |= self.candump == Path::new(DEMO_LOG);
+        let embedded = self.bus_kind.resolve() == BusKind::Embedded;
+        let buses = (embedded && std::env::var_os("SKINBUS_DIR").is_none_or(|set| set.is_empty()))
+            .then(|| Buses::create("demo"))
+            .transpose()?;
+        options.directory = buses.as_ref().map(|buses| buses.0.clone());
+        if !options.quiet {
+            let place = options.directory.as_ref().map(|path| format!("SKINBUS_DIR={} ", path.display()));
+            let (place, kind) = (place.unwrap_or_default(), self.bus_kind.resolve());
+            note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
+        }
+        let Common { recording, summary, .. } = self.common;
+        let numbered = self.candump.is_none();
+        let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
+        let candump = Some(Candump { path, numbered });
         let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
-        options.record = recording.options(Some(self.candump), &options.skin, texts.0, texts.1)?;
-        bench(&options, summary.as_deref())
+        options.record = recording.options(candump, &options.skin, texts.0, texts.1)?;
+        bench(&options, summary.as_deref(), recording.force)
     }
 }
 
@@ -230,7 +243,7 @@ impl Run {
             .and_then(|kinds| kinds.only(options.skin.buses.iter().map(|bus| bus.name.as_str())));
         options.kinds = kinds.map_err(Failure::usage)?;
         options.record = recording.options(
-            self.candump,
+            self.candump.map(|path| Candump { path, numbered: false }),
             &options.skin,
             || read(&skin_file),
             || scenario_file.as_deref().map(read).transpose(),
@@ -238,7 +251,7 @@ impl Run {
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;
-        bench(&options, summary.as_deref())
+        bench(&options, summary.as_deref(), recording.force)
     }
 }
 
@@ -253,6 +266,7 @@ impl Common {
             skin,
             scenario,
             kinds: Kinds::default(),
+            directory: None,
             spawn: true,
             cells_per_process: self.programs.cells_per_process.into(),
             flash: None,
@@ -265,45 +279,33 @@ impl Common {
     }
 }
 
-fn bench(options: &Options, summary_file: Option<&Path>) -> Result<(), Failure> {
-    let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
+fn bench(options: &Options, summary_file: Option<&Path>, force: Force) -> Result<(), Failure> {
     let recorded = [
-        ("--candump", options.record.candump.as_deref()),
+        ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
         ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
     ];
-    if let Some((option, _)) = recorded.iter().find(|(_, path)| path.is_some() && *path == summary_file) {
+    let same =
+        |path: Option<&Path>| path.zip(summary_file).is_some_and(|(one, other)| place(one) == place(other));
+    if let Some((option, _)) = recorded.iter().find(|(_, path)| same(*path)) {
         return Err(Failure::usage(format!("--summary and {option} name the same file: name two")));
     }
     // Before the run: nobody wants to hear after an hour that there is nowhere to write.
-    let json = summary_file.map(|path| {
-        WholeFile::create(path)
-            .map_err(|error| Failure::usage(format!("--summary {}: {error}", path.display())))
-    });
-    let json = json.transpose()?;
-    let summary = run::run(options).map_err(failure)?;
+    let json = summary_file.map(|path| force.create("--summary", path)).transpose()?;
+    // What it says of its own end is not lost with the program.
+    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
+    let (ended, panicked) = match ended {
+        Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
+        Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),
+    };
     if let Some((whole, file)) = json {
-        write_json(whole, file, &summary)?;
+        let text = serde_json::to_string_pretty(&ended).map_err(Failure::run)?;
+        output::finish("--summary", whole, file, &format!("{text}\n"))?;
     }
-    print::summary(&summary)?;
-    let lost: Vec<_> = summary.buses.iter().filter(|bus| bus.outages.at_end).collect();
-    if !lost.is_empty() {
-        let names = lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        return Err(Failure::run(format!("lost at the end of the run: {names}")));
+    if let Some(panic) = panicked {
+        panic::resume_unwind(panic);
     }
-    match &summary.recording {
-        Some(Recorded { errors, lost_write, .. }) if !errors.is_empty() || *lost_write > 0 => {
-            let first = errors.first().map_or("", String::as_str);
-            Err(Failure::run(format!(
-                "the recording is not whole, {lost_write} frames were not written: {first}"
-            )))
-        }
-        _ => Ok(()),
+    if ended.control.ticks > 0 {
+        print::summary(&ended)?;
     }
-}
-
-fn write_json(whole: WholeFile, mut file: File, summary: &Summary) -> Result<(), Failure> {
-    let path = whole.path().display().to_string();
-    let failure = |error: &dyn core::fmt::Display| Failure::run(format!("{path}: {error}"));
-    let text = serde_json::to_string_pretty(summary).map_err(|error| failure(&error))?;
-    writeln!(file, "{text}").and_then(|()| whole.finish()).map_err(|error| failure(&error))
+    ended.failure.map_or(Ok(()), |why| Err(Failure::run(why)))
 }

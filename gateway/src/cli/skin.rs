@@ -11,7 +11,7 @@ use protocol::packet::crc16;
 use protocol::skin::{ControllerKind, Reply, Skin as Description};
 use protocol::usage::{Failure, print};
 
-use super::output;
+use super::output::Force;
 
 /// Make and check the descriptions of skins
 #[derive(Args, Debug)]
@@ -39,6 +39,8 @@ struct Generate {
     /// The file to write, whole or not at all; else standard output
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
 }
 
 /// Check a skin's description, and say in a few lines what it describes
@@ -69,7 +71,7 @@ impl Generate {
     fn run(self) -> Result<(), Failure> {
         let text = generate::generate(&self.wanted).map_err(Failure::usage)?;
         match self.output {
-            Some(path) => output::write_file("-o", &path, &text),
+            Some(path) => self.force.write("-o", &path, &text),
             None => print(&text),
         }
     }

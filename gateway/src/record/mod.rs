@@ -25,7 +25,7 @@ mod thread;
 pub mod topics;
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
@@ -36,6 +36,8 @@ use layout::Layout;
 use series::{Attached, Head, Series, Split};
 use text::Text;
 use topics::Topics;
+
+use crate::run::file::check_regular;
 
 /// What topics of frames begin with; the bus' name follows.
 pub const TOPIC_OF_BUS: &str = "/can/";
@@ -48,11 +50,20 @@ pub const NOTES: &str = "/can/notes";
 #[derive(Clone, Debug, Default)]
 pub struct Options {
     /// Frames as candump text.
-    pub candump: Option<PathBuf>,
+    pub candump: Option<Candump>,
     /// Everything as MCAP.
     pub mcap: Option<Mcap>,
     /// Whether a file that exists is overwritten.
     pub force: bool,
+}
+
+/// Frames as candump text.
+#[derive(Clone, Debug)]
+pub struct Candump {
+    /// The file.
+    pub path: PathBuf,
+    /// Whether it gets a number when one of its name exists.
+    pub numbered: bool,
 }
 
 /// Everything as MCAP.
@@ -77,20 +88,15 @@ pub struct Outputs {
 
 impl Outputs {
     /// Opens what will be written, so that what makes that impossible is known before there is anything to write.
-    /// Repairs what runs that were killed left beside it, each of which is said.
+    /// Repairs what runs that were killed left beside it, each of which is said. A FIFO is waited for until somebody
+    /// reads it, or until `stopped`.
     ///
     /// # Errors
     /// What cannot be written, and what to do.
-    pub fn claim(options: &Options, say: impl FnMut(&str)) -> Result<Self, String> {
-        let text = options.candump.as_deref().map(|path| {
-            let there = path.symlink_metadata().is_ok_and(|about| about.is_file());
-            if there && !options.force {
-                let path = path.display();
-                return Err(format!(
-                    "--candump {path}: {path} exists: name another file, or overwrite it with --force"
-                ));
-            }
-            Text::create(path).map_err(|error| format!("--candump {}: {error}", path.display()))
+    pub fn claim(options: &Options, stopped: &AtomicBool, say: impl FnMut(&str)) -> Result<Self, String> {
+        let text = options.candump.as_ref().map(|candump| {
+            let failed = |error| format!("--candump {}: {error}", candump.path.display());
+            Text::create(candump, options.force, stopped).map_err(failed)
         });
         let text = text.transpose()?;
         let series = options.mcap.as_ref().map(|mcap| {
@@ -98,9 +104,7 @@ impl Outputs {
             if mcap.path.extension().is_none_or(|extension| extension != "mcap") {
                 return Err(format!("--record {name}: a recording's name ends in .mcap"));
             }
-            if mcap.path.symlink_metadata().is_ok_and(|about| !about.is_file()) {
-                return Err(format!("--record {name}: it exists and is no regular file; name another one"));
-            }
+            check_regular(&mcap.path, options.force).map_err(|error| format!("--record {name}: {error}"))?;
             repair::orphans(&mcap.path, say);
             Series::claim(&mcap.path, options.force, mcap.split)
                 .map_err(|error| format!("--record {name}: {error}"))
@@ -112,6 +116,12 @@ impl Outputs {
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.text.is_none() && self.series.is_none()
+    }
+
+    /// The candump log, if there is one.
+    #[must_use]
+    pub fn log(&self) -> Option<&Path> {
+        self.text.as_ref().map(Text::path)
     }
 
     /// Whether more than frames is wanted.
@@ -139,7 +149,7 @@ impl Outputs {
 struct Stop {
     /// Now.
     now: AtomicBool,
-    /// As if it had never been.
+    /// As if there had been no run.
     discard: AtomicBool,
 }
 
@@ -157,12 +167,13 @@ impl Recorder {
         self.said.try_iter()
     }
 
-    /// Ends a recording of a run that never began, and leaves nothing of it.
-    pub fn discard(self) {
+    /// Ends a recording of a run that never began, and leaves nothing of it but a log of what was heard.
+    #[must_use]
+    pub fn discard(self) -> Recording {
         self.stop.discard.store(true, Ordering::Relaxed);
         self.stop.now.store(true, Ordering::Release);
         // It can leave no more than a file that the next run takes away.
-        let _ = self.thread.join();
+        self.thread.join().unwrap_or_default()
     }
 
     /// Records what has been handed over, when nobody hands over more, and ends the files. `unrecorded` is what

@@ -12,10 +12,10 @@ use std::fs::{self, File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
+use rustix::fs::{FlockOperation, flock};
 
 use super::sink::folder_of;
-use crate::run::file::with_remedy;
+use crate::run::file::{rename, with_remedy};
 
 /// What a file is called in addition until it is whole.
 const PART: &str = "part";
@@ -99,16 +99,7 @@ impl Part {
     /// # Errors
     /// When it cannot have it.
     pub fn finish(&self, force: bool) -> io::Result<()> {
-        if force {
-            return fs::rename(&self.path, &self.goal);
-        }
-        match renameat_with(CWD, &self.path, CWD, &self.goal, RenameFlags::NOREPLACE) {
-            // A file system that cannot promise it.
-            Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if !exists(&self.goal) => {
-                fs::rename(&self.path, &self.goal)
-            }
-            renamed => Ok(renamed?),
-        }
+        rename(&self.path, &self.goal, force)
     }
 }
 

@@ -8,32 +8,38 @@ use super::names;
 use super::recover::{RecoverError, Recovered, recover};
 use crate::run::file::WholeFile;
 
-/// Makes a whole file of one that broke off, and takes the latter away. What it came to, and the new one's bytes.
+/// Makes a whole file of one that broke off, and takes the latter away; one of that name is overwritten with `force`.
+/// What it came to, and the new one's bytes.
 ///
 /// # Errors
 /// When nothing can be recovered or written; the file stays as it is.
-pub fn repair(part: &Path, goal: &Path) -> Result<(Recovered, u64), RecoverError> {
-    let (recovered, bytes) = copy(part, goal, |_| true)?;
+pub fn repair(part: &Path, goal: &Path, force: bool) -> Result<(Recovered, u64), RecoverError> {
+    let (recovered, bytes) = copy(part, goal, force, |_| true)?;
     fs::remove_file(part).map_err(RecoverError::Write)?;
     Ok((recovered, bytes.unwrap_or(0)))
 }
 
-/// Makes a whole file of another one, unless that is whole itself. What it came to, and the new one's bytes if
+/// Makes a whole file of another one, unless that is whole itself; one that exists is overwritten with `force`. What it came to, and the new one's bytes if
 /// there is a new one.
 ///
 /// # Errors
 /// When nothing can be recovered or written.
-pub fn copy_unless_sound(from: &Path, to: &Path) -> Result<(Recovered, Option<u64>), RecoverError> {
-    copy(from, to, |recovered| !recovered.is_sound())
+pub fn copy_unless_sound(
+    from: &Path,
+    to: &Path,
+    force: bool,
+) -> Result<(Recovered, Option<u64>), RecoverError> {
+    copy(from, to, force, |recovered| !recovered.is_sound())
 }
 
 fn copy(
     from: &Path,
     to: &Path,
+    force: bool,
     wanted: impl FnOnce(&Recovered) -> bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
     let from = BufReader::with_capacity(1 << 20, File::open(from).map_err(RecoverError::Read)?);
-    let (whole, file) = WholeFile::create(to).map_err(RecoverError::Write)?;
+    let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     let about = file.try_clone().map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let recovered = recover(from, &mut out)?;
@@ -55,7 +61,7 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
     for (part, _held) in names::orphans(path).unwrap_or_default() {
         let goal = names::recovered(&names::goal_of(&part));
         let name = part.display();
-        match repair(&part, &goal) {
+        match repair(&part, &goal, false) {
             Ok((recovered, _)) => {
                 say(&format!(
                     "{name} was left by a run that was killed; repaired, it is {}: {recovered}",

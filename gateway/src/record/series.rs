@@ -400,7 +400,7 @@ impl<T> Series<T> {
     pub fn finish(&mut self) -> (Vec<Written>, Count) {
         self.end();
         for Broken { part, file, kept } in std::mem::take(&mut self.broken) {
-            match repair::repair(&part.path, &part.goal) {
+            match repair::repair(&part.path, &part.goal, self.force) {
                 Ok((recovered, bytes)) => {
                     // More may have come to the disk than is known of, or less.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);

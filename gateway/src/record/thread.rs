@@ -115,13 +115,10 @@ impl Work {
         let (mut flush, mut ask, mut diagnose) = (Every::new(FLUSH), Every::new(ASK), Every::new(DIAGNOSE));
         loop {
             let ended = stop.now.load(Ordering::Acquire);
-            if ended && stop.discard.load(Ordering::Relaxed) {
-                if let Some(series) = &mut self.series {
-                    series.discard();
-                }
-                return Recording::default();
-            }
             let taken = self.take();
+            if ended && stop.discard.load(Ordering::Relaxed) {
+                return self.discard();
+            }
             if ask.is_due() || ended {
                 self.ask_kernel();
             }
@@ -276,6 +273,11 @@ impl Work {
     }
 
     fn flush(&mut self) {
+        if let Some(text) = &mut self.text
+            && let Err(error) = text.flush()
+        {
+            self.errors.push(failed(text, &error));
+        }
         let Some(series) = &mut self.series else { return };
         if !series.flush() || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
@@ -309,6 +311,15 @@ impl Work {
             let _ = self.tell.send(line.to_string());
         }
         self.told = self.errors.len();
+    }
+
+    /// Leaves a log of what was heard, and else nothing.
+    fn discard(mut self) -> Recording {
+        if let Some(series) = &mut self.series {
+            series.discard();
+        }
+        let files: Vec<_> = self.text.and_then(Text::discard).into_iter().collect();
+        Recording { frames: files.iter().map(|file| file.frames).sum(), files, ..Recording::default() }
     }
 
     fn finish(mut self) -> Recording {

@@ -274,6 +274,7 @@ impl Buses {
         }
         let kinds = Kinds::exactly(self.lanes.iter().map(|lane| (lane.bus.name(), lane.bus.kind())));
         self.processes = Processes::start(&Plan {
+            directory: None,
             program: &program("cell-node", spawn.cell_node.as_deref())?,
             skin_file: &wearing.file,
             skin: &wearing.skin,

@@ -80,14 +80,14 @@ pub struct ServedBus {
 }
 
 impl ServedBus {
-    /// Serves a bus and waits until clients can connect.
+    /// Serves a bus and waits until clients can connect; in a directory, if not in the usual one.
     ///
     /// # Errors
     /// When the program does not start or does not say that it serves.
-    pub fn start(program: &Path, bus: &str) -> Result<Self, LaunchError> {
+    pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
-        apart(&mut command);
+        apart(&mut command, directory);
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
         let mut served = Self { bus: bus.to_owned(), child: command.spawn().map_err(start)? };
         let mut line = String::new();
@@ -131,7 +131,8 @@ pub fn open_or_serve(
 ) -> Result<(Bus, Option<ServedBus>), RunError> {
     match Bus::open(name, kind, wanted) {
         Err(BusError::NotServed { .. }) => {
-            let served = ServedBus::start(&program("vcan-setup", vcan_setup)?, name)?;
+            let served =
+                ServedBus::start(&program("vcan-setup", vcan_setup)?, name, wanted.directory.as_deref())?;
             Ok((Bus::open(name, kind, wanted)?, Some(served)))
         }
         opened => Ok((opened?, None)),
@@ -151,6 +152,7 @@ impl Drop for ServedBus {
 struct Start {
     program: PathBuf,
     arguments: Vec<String>,
+    directory: Option<PathBuf>,
 }
 
 /// The process of one cell or of several.
@@ -193,6 +195,8 @@ pub struct Plan<'a> {
     pub skin: &'a Skin,
     /// Which kind each bus is.
     pub kinds: &'a Kinds,
+    /// Where embedded buses are, if not where they usually are.
+    pub directory: Option<&'a Path>,
     /// At most so many cells in a process.
     pub per_process: usize,
     /// Where cells keep their parameters, if they do.
@@ -300,7 +304,8 @@ impl Plan<'_> {
         if let Some(flash) = self.flash {
             arguments.extend(["--flash".to_owned(), flash.display().to_string()]);
         }
-        Start { program: self.program.to_owned(), arguments }
+        let directory = self.directory.map(Path::to_owned);
+        Start { program: self.program.to_owned(), arguments, directory }
     }
 }
 
@@ -308,15 +313,18 @@ impl Start {
     fn spawn(&self) -> Result<Child, LaunchError> {
         let mut command = Command::new(&self.program);
         command.args(&self.arguments).stdin(Stdio::null()).stdout(Stdio::null());
-        apart(&mut command);
+        apart(&mut command, self.directory.as_deref());
         command.spawn().map_err(|source| LaunchError::Start { path: self.program.clone(), source })
     }
 }
 
 /// Ctrl-C on a terminal goes to everyone in its process group, and is meant for the gateway alone: cells and
-/// buses have to outlive it until the last words are said.
-fn apart(command: &mut Command) {
+/// buses have to outlive it until the last words are said. They find embedded buses where it does.
+fn apart(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
+    if let Some(directory) = directory {
+        command.env("SKINBUS_DIR", directory);
+    }
 }
 
 /// Runs of consecutive numbers, at most `size` long.

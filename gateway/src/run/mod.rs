@@ -51,6 +51,8 @@ pub struct Options {
     pub scenario: Scenario,
     /// Which kind each bus is.
     pub kinds: Kinds,
+    /// Where embedded buses are, if not where they usually are.
+    pub directory: Option<PathBuf>,
     /// Whether cells are started; else they are on the bus already.
     pub spawn: bool,
     /// At most so many cells in a process.
@@ -109,13 +111,20 @@ impl RunError {
     }
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM.
+/// Runs a bench to its end, or until SIGINT or SIGTERM. Of a run that fails there is a summary too, which says why.
 ///
 /// # Errors
-/// When it cannot begin, or does not come to its end; cells and buses that were started are ended again.
+/// When it cannot begin because of wrong use or configuration; cells and buses that were started are ended again.
 pub fn run(options: &Options) -> Result<Summary, RunError> {
-    // A bus that was there and is gone is no wrong use.
-    let failed =
-        |error| if let RunError::Bus(bus) = error { RunError::Failed(bus.to_string()) } else { error };
-    start::start(options)?.watch().map_err(failed)
+    let mut bench = match start::start(options) {
+        Ok(bench) => bench,
+        Err(error) if error.exit_code() == 1 => {
+            return Ok(Summary::of_no_run(&options.skin, error.to_string()));
+        }
+        Err(error) => return Err(error),
+    };
+    match bench.begin() {
+        Ok(()) => Ok(bench.watch()),
+        Err(error) => bench.give_up(error),
+    }
 }

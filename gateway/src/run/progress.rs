@@ -52,7 +52,7 @@ impl Progress {
     }
 
     /// Writes something above the line.
-    pub fn note(&self, text: &str) {
+    pub fn note(&mut self, text: &str) {
         if self.quiet {
             return;
         }

@@ -43,6 +43,8 @@ const GATHER: Duration = Duration::from_millis(10);
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 /// Cells that were there before are given so long to show up.
 pub(super) const SHOWING: Duration = Duration::from_secs(2);
+/// How benches on embedded buses keep out of each other's way.
+const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
 /// Wake-ups of the idle machine that are measured, at the loop's period.
 const IDLE_WAKEUPS: u32 = 100;
 /// Records that wait for the main thread: more than a second of ticks.
@@ -84,7 +86,7 @@ pub(super) struct Bench<'a> {
     pub(super) served: Vec<ServedBus>,
 }
 
-/// Gets everything ready.
+/// Claims files and opens buses; [`Bench::begin`] starts the cells.
 pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     refuse(options)?;
@@ -96,7 +98,13 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     // A file that may have no more bytes is an error like others, and no end.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|error| RunError::Failed(format!("cannot catch signal {SIGXFSZ}: {error}")))?;
-    let outputs = Outputs::claim(&options.record, say).map_err(RunError::Usage)?;
+    let outputs = Outputs::claim(&options.record, &signalled, say).map_err(|refused| {
+        if signalled.load(Ordering::Relaxed) { interrupted() } else { RunError::Usage(refused) }
+    })?;
+    let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
+    if let Some(log) = outputs.log().filter(|_| numbered && !options.quiet) {
+        say(&format!("frames are recorded in {}", log.display()));
+    }
     // An external controller can find its socket from now on, so that it is there when the loop begins.
     let cycle = Some(cycle(options)?);
     let idle = idle_lateness(options.skin.timing.tick_nanos());
@@ -131,7 +139,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let (recorder, recorded) = record(options, outputs, feeds, &lanes, &idle)?;
     let processes = Processes::default();
     let first_epoch = Epoch(0);
-    let mut bench = Bench {
+    Ok(Bench {
         options,
         began,
         idle,
@@ -148,15 +156,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         recorded,
         processes,
         served,
-    };
-    if let Err(error) = bench.begin() {
-        bench.stop_receivers();
-        if let Some(recorder) = bench.recorder.take() {
-            recorder.discard();
-        }
-        return Err(error);
-    }
-    Ok(bench)
+    })
 }
 
 /// The loop's state, by the scenario's motion.
@@ -212,7 +212,7 @@ fn open(
         error_mask: u32::MAX,
         receive_buffer: options.receive_buffer,
         send_patience: SEND_PATIENCE,
-        ..BusOptions::default()
+        directory: options.directory.clone(),
     };
     let (bus, own) = open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?;
     served.extend(own);
@@ -327,7 +327,7 @@ fn listen(
 
 impl Bench<'_> {
     /// Starts the cells, listens for another gateway, and waits until all cells are ready.
-    fn begin(&mut self) -> Result<(), RunError> {
+    pub(super) fn begin(&mut self) -> Result<(), RunError> {
         let options = self.options;
         let listened = Instant::now() + LISTEN;
         if options.spawn {
@@ -340,6 +340,7 @@ impl Bench<'_> {
                 skin_file: &options.skin_file,
                 skin: &options.skin,
                 kinds: &Kinds::exactly(self.lanes.iter().map(|lane| (lane.link.name(), lane.link.kind()))),
+                directory: options.directory.as_deref(),
                 per_process: options.cells_per_process,
                 flash: options.flash.as_deref(),
             })?;
@@ -398,8 +399,10 @@ impl Bench<'_> {
         if there.is_empty() {
             return Ok(());
         }
+        let embedded = self.lanes.iter().any(|lane| lane.link.kind() == BusKind::Embedded);
+        let remedy = if embedded { format!("stop them, or {ELSEWHERE}") } else { "or stop them".to_owned() };
         Err(RunError::Failed(format!(
-            "cells are on the bus already: {there}; use them with --no-spawn, or stop them"
+            "cells are on the bus already: {there}; use them with --no-spawn, {remedy}"
         )))
     }
 
@@ -458,12 +461,11 @@ impl Bench<'_> {
     /// Another gateway, a process that ends or a bus that is gone end the start.
     pub(super) fn hear_while_starting(&mut self) -> Result<(), RunError> {
         if self.signalled.load(Ordering::Relaxed) {
-            return Err(RunError::Failed("interrupted while starting".to_owned()));
+            return Err(interrupted());
         }
         for (bus, news) in self.news.try_iter() {
-            let name = self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
             match news {
-                News::Notice(Notice::Rival) => return Err(rival(name)),
+                News::Notice(Notice::Rival) => return Err(self.rival(bus)),
                 News::Down(why) | News::Lost(why) | News::Refused(why) => return Err(RunError::Failed(why)),
                 News::Notice(_) | News::Up => {}
             }
@@ -474,6 +476,18 @@ impl Bench<'_> {
             return Err(RunError::Failed(why));
         }
         Ok(())
+    }
+
+    /// Another gateway is on a bus.
+    pub(super) fn rival(&self, bus: usize) -> RunError {
+        let Some(link) = self.lanes.get(bus).map(|lane| &lane.link) else {
+            return RunError::Failed("another gateway is on the bus".to_owned());
+        };
+        let remedy = match link.kind() {
+            BusKind::SocketCan => "give this one another bus",
+            BusKind::Embedded => ELSEWHERE,
+        };
+        RunError::Failed(format!("another gateway is on {}: stop one of the two, or {remedy}", link.name()))
     }
 
     /// The cells of a process that has ended, for people.
@@ -544,29 +558,14 @@ impl Bench<'_> {
         self.recorder.take().map(|recorder| recorder.finish(unrecorded, ticks))
     }
 
-    /// Ends everything after a failure; what led to it is what people want to see.
-    pub(super) fn stop_after_failure(&mut self) {
-        let received = self.stop_receivers();
-        let Some(recording) = self.finish_recording(&received) else { return };
-        if self.options.quiet {
-            return;
-        }
-        for file in recording.files {
-            say(&format!("{} frames until then are in {}", file.frames, file.path));
-        }
-    }
-
     /// The queue through which the loop's records come, both ends.
     pub(super) fn records() -> (rtrb::Producer<Timed>, rtrb::Consumer<Timed>) {
         rtrb::RingBuffer::new(RECORDS)
     }
 }
 
-/// Another gateway is on a bus.
-pub(super) fn rival(bus: &str) -> RunError {
-    RunError::Failed(format!(
-        "another gateway is on {bus}: stop one of the two, or give this one another bus"
-    ))
+fn interrupted() -> RunError {
+    RunError::Failed("interrupted while starting".to_owned())
 }
 
 /// The epoch after which to begin on cells that have taken these last, the first cell's if that can be: joints of the

@@ -18,17 +18,18 @@ use super::launch::{ServedBus, program};
 use super::link::{Slot, may_return};
 use super::measured::Measured;
 use super::organise::lines;
-use super::progress::Progress;
+use super::progress::{Progress, say};
 use super::realtime::{self, Granted};
 use super::receiver::{Left, News, View};
-use super::start::{Bench, Lane, rival};
+use super::start::{Bench, Lane};
 use super::switching::Told;
 use super::turn::{Timed, Turn};
 use super::{RunError, backlog, usage};
 use crate::record::Recorder;
+use crate::record::account::Recording;
 use crate::scenario::{FaultKind, Stimulus, Touches};
 use crate::summary::{
-    AccuracySummary, BusSummary, Loop, NetworkSummary, OutagesSummary, Processor, Quantiles, Summary,
+    AccuracySummary, BusSummary, Loop, NetworkSummary, OutagesSummary, Outcome, Processor, Quantiles, Summary,
 };
 use crate::table::{Accuracy, Notice, Said};
 
@@ -53,17 +54,66 @@ struct Script {
     told: Told,
 }
 
-impl Bench<'_> {
-    /// Runs the loop to its end.
-    pub(super) fn watch(mut self) -> Result<Summary, RunError> {
-        let outcome = self.drive();
-        if outcome.is_err() {
-            self.stop_after_failure();
+/// What a loop came to.
+struct Driven {
+    measured: Measured,
+    seconds: f64,
+    interrupted: bool,
+    granted: Granted,
+    controller: Counts,
+    processor: Processor,
+    cell_private_kib: Option<u64>,
+}
+
+impl Driven {
+    fn new() -> Self {
+        Self {
+            measured: Measured::new(),
+            seconds: 0.0,
+            interrupted: false,
+            granted: Granted::default(),
+            controller: Counts::new(),
+            processor: Processor::default(),
+            cell_private_kib: None,
         }
-        outcome
+    }
+}
+
+impl Bench<'_> {
+    /// Runs the loop to its end, or as far as it comes.
+    pub(super) fn watch(mut self) -> Summary {
+        let mut driven = Driven::new();
+        let failure = self.drive(&mut driven).err().map(|error| error.to_string());
+        let received = self.stop_receivers();
+        let recording = self.finish_recording(&received);
+        if failure.is_some() {
+            self.say_what_is_kept(recording.as_ref());
+        }
+        self.summary(driven, &received, recording).judged(failure)
     }
 
-    fn drive(&mut self) -> Result<Summary, RunError> {
+    /// Ends a bench whose loop never began.
+    pub(super) fn give_up(mut self, error: RunError) -> Result<Summary, RunError> {
+        let received = self.stop_receivers();
+        let recording = self.recorder.take().map(Recorder::discard);
+        self.say_what_is_kept(recording.as_ref());
+        if error.exit_code() != 1 {
+            return Err(error);
+        }
+        Ok(self.summary(Driven::new(), &received, recording).judged(Some(error.to_string())))
+    }
+
+    /// Where the frames are that were heard before a failure.
+    fn say_what_is_kept(&self, recording: Option<&Recording>) {
+        if self.options.quiet {
+            return;
+        }
+        for file in recording.into_iter().flat_map(|recording| &recording.files) {
+            say(&format!("{} frames until then are in {}", file.frames, file.path));
+        }
+    }
+
+    fn drive(&mut self, driven: &mut Driven) -> Result<(), RunError> {
         let options = self.options;
         let (records, mut inlet) = Self::records();
         let turn = Turn::new(
@@ -82,53 +132,58 @@ impl Bench<'_> {
         let started = Instant::now();
         let control = self.start_loop(turn)?;
         let mut progress = Progress::new(options.quiet);
-        let mut measured = Measured::new();
         let mut failure = None;
-        let mut interrupted = false;
         while !control.is_finished() {
             thread::sleep(LOOK);
-            interrupted = self.signalled.load(Ordering::Relaxed);
-            let step = self.step(&mut script, &mut progress, &mut measured, &mut inlet, started);
+            driven.interrupted = self.signalled.load(Ordering::Relaxed);
+            let step = self.step(&mut script, &mut progress, &mut driven.measured, &mut inlet, started);
             failure = step.err();
-            if failure.is_some() || interrupted {
+            if failure.is_some() || driven.interrupted {
                 self.shared.stop_loop.store(true, Ordering::Relaxed);
             }
             if failure.is_some() {
                 break;
             }
         }
-        let panicked = |_| RunError::Failed("the control loop panicked".to_owned());
-        let (granted, controller) = control.join().map_err(panicked)?;
-        let duration_s = started.elapsed().as_secs_f64();
+        let ended = control.join();
+        driven.seconds = started.elapsed().as_secs_f64();
         progress.clear();
-        if let Some(failure) = failure {
+        driven.measured.take(&mut inlet, self.began);
+        driven.processor = self.spent().since(&before, driven.seconds);
+        driven.cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
+        if failure.is_some() || ended.is_err() {
             // Nobody commands the cells any more.
             let _ = self.say(&Message::Halt);
-            return Err(failure);
         }
-        measured.take(&mut inlet, self.began);
-        let processor = self.spent().since(&before, duration_s);
-        let cell_private_kib = self.processes.pids().filter_map(usage::private_kib).max();
-        self.last_words(interrupted)?;
-        let received = self.stop_receivers();
+        let panicked = |_| RunError::Failed("the control loop panicked".to_owned());
+        (driven.granted, driven.controller) = ended.map_err(panicked)?;
+        match failure {
+            Some(failure) => Err(failure),
+            None => self.last_words(driven.interrupted),
+        }
+    }
+
+    fn summary(&self, driven: Driven, received: &[Option<Left>], recording: Option<Recording>) -> Summary {
+        let Driven { measured, controller, granted, .. } = driven;
         let backlog_dropped =
             backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
-        let recording = self.finish_recording(&received);
-        Ok(Summary {
-            skin: options.skin.name.clone(),
-            cells: options.skin.cells.len(),
-            duration_s,
-            interrupted,
+        Summary {
+            skin: self.options.skin.name.clone(),
+            cells: self.options.skin.cells.len(),
+            outcome: Outcome::Done,
+            failure: None,
+            duration_s: driven.seconds,
+            interrupted: driven.interrupted,
             halted: measured.halted(),
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
             control: self.loop_summary(&measured, granted, controller),
-            accuracy: accuracy(&received),
+            accuracy: accuracy(received),
             backlog_dropped,
-            buses: self.bus_summaries(&received, backlog_dropped, &measured),
-            processor,
-            cell_private_kib,
+            buses: self.bus_summaries(received, backlog_dropped, &measured),
+            processor: driven.processor,
+            cell_private_kib: driven.cell_private_kib,
             recording,
-        })
+        }
     }
 
     /// The loop's thread, which leaves what the machine granted and what the controller counted.
@@ -306,7 +361,7 @@ impl Bench<'_> {
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
         for (bus, news) in news {
             match news {
-                News::Notice(Notice::Rival) => return Err(rival(name(bus))),
+                News::Notice(Notice::Rival) => return Err(self.rival(bus)),
                 News::Notice(Notice::Dead(cell)) => {
                     changed.entry((bus, "fallen silent")).or_default().push(cell)
                 }
@@ -407,7 +462,7 @@ impl Bench<'_> {
             }
             let Some(status) = served.ended() else { continue };
             let again = program("vcan-setup", self.options.vcan_setup.as_deref())
-                .and_then(|program| ServedBus::start(&program, &name));
+                .and_then(|program| ServedBus::start(&program, &name, self.options.directory.as_deref()));
             progress.note(&match again {
                 Ok(again) => {
                     *served = again;

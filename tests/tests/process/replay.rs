@@ -116,7 +116,10 @@ impl Place {
     /// A replay of a capture, with `replay.json`.
     pub(crate) fn replay(&self, file: &str, more: &str) -> Running {
         let kind = self.kind();
-        self.start("gateway", &format!("replay {file} --bus-kind {kind} --summary replay.json {more}"))
+        self.start(
+            "gateway",
+            &format!("replay {file} --bus-kind {kind} --summary replay.json --force {more}"),
+        )
     }
 
     /// The same to its end, which may take so long, with its summary.

@@ -66,7 +66,8 @@ pub(crate) fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8
 /// A bench that records nothing.
 pub(crate) fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
     let words = format!(
-        "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json {more}",
+        "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json \
+         --force {more}",
         place.kind()
     );
     place.start("gateway", &words)

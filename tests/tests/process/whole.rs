@@ -53,7 +53,8 @@ pub(crate) fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summar
         Running::start(place.command_of(&place.path(name), "--version")).end().well();
     }
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    let run = "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json";
+    let run =
+        "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json --force";
     let bench = Running::start(place.command_of(&place.path("gateway"), run));
     let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
     eprintln!("{}", ended.stdout);

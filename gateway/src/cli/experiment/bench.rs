@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
@@ -16,6 +15,7 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::cli::buses::Buses;
 use crate::cli::programs::Programs;
 
 /// Where benches are run, and with what.
@@ -46,7 +46,7 @@ impl Benches {
             fs::write(path, text).map_err(|error| failed(path, &error))?;
         }
         let own = std::env::current_exe().map_err(|error| failed(Path::new("gateway"), &error))?;
-        let buses = Buses::create()?;
+        let buses = Buses::create("experiment")?;
         let mut command = Command::new(&own);
         command.arg("run").arg(&skin).arg("--scenario").arg(&scenario).arg("--record").arg(&recording);
         command.arg("--summary").arg(&summary).args(["--bus-kind", "embedded", "--quiet"]);
@@ -98,32 +98,5 @@ impl Benches {
             std::thread::sleep(LOOK);
         }
         child.wait_with_output()
-    }
-}
-
-/// A place of its own for a bench's bus: nobody else's bench meets it.
-struct Buses(PathBuf);
-
-impl Buses {
-    fn create() -> Result<Self, Failure> {
-        // A socket's path has at most 107 bytes, so it cannot be in the folder of the results.
-        let path = std::env::temp_dir().join(format!("skinbus-experiment-{}", std::process::id()));
-        let make = || match fs::DirBuilder::new().mode(0o700).create(&path) {
-            // Of a program of this number that was killed.
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-                fs::remove_dir_all(&path)?;
-                fs::DirBuilder::new().mode(0o700).create(&path)
-            }
-            made => made,
-        };
-        make().map_err(|error| Failure::run(format!("{}: {error}", path.display())))?;
-        Ok(Self(path))
-    }
-}
-
-impl Drop for Buses {
-    fn drop(&mut self) {
-        // Nothing more can be done.
-        let _ = fs::remove_dir_all(&self.0);
     }
 }

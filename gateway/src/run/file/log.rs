@@ -1,0 +1,176 @@
+//! Logs: files that are there, and can be followed, while they grow.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+
+use super::target::{Target, exists, open_stream, part_of, sync_folder, with_remedy};
+
+/// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
+/// takes another file's place does so with its first line.
+#[derive(Debug)]
+pub struct LogFile {
+    path: PathBuf,
+    state: State,
+    /// Bytes in it that are ours.
+    bytes: u64,
+    ended: bool,
+}
+
+#[derive(Debug)]
+enum State {
+    /// A regular file of ours.
+    Ours(File),
+    /// Another file, which is overwritten with the first line; held until then, and afterwards.
+    Old(File),
+    /// What is no regular file has no length and no lock.
+    Stream(File),
+}
+
+impl LogFile {
+    /// Begins a log. A FIFO is waited for until somebody reads it, or until `stopped`.
+    ///
+    /// # Errors
+    /// When it cannot be written, and what to do.
+    pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
+        let state = match Target::of(path, force) {
+            Ok(Target::Stream) => State::Stream(open_stream(path, stopped)?),
+            Ok(Target::New) => State::Ours(begin(path)?),
+            Ok(Target::Old) => {
+                // A link that took its place meanwhile is not followed.
+                let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed();
+                let old = OpenOptions::new().read(true).custom_flags(flags).open(path);
+                let old = old.map_err(with_remedy)?;
+                hold(&old)?;
+                State::Old(old)
+            }
+            Err(error) => {
+                // That somebody writes it says more than that it is there.
+                let about = fs::symlink_metadata(path);
+                if about.is_ok_and(|about| about.is_file()) {
+                    File::open(path).map_or(Ok(()), |old| hold(&old))?;
+                }
+                return Err(error);
+            }
+        };
+        Ok(Self { path: path.to_owned(), state, bytes: 0, ended: false })
+    }
+
+    /// Begins a log under the first of the names `run.log`, `run-1.log`, `run-2.log`, ... that is free.
+    ///
+    /// # Errors
+    /// When none can be written, and what to do.
+    pub fn create_numbered(path: &Path, stopped: &AtomicBool) -> io::Result<Self> {
+        let (stem, end) = (path.file_stem().unwrap_or_default(), path.extension().unwrap_or_default());
+        let name = |number: u32| {
+            let mut name = stem.to_owned();
+            name.push(format!("-{number}"));
+            path.with_file_name(name).with_extension(end)
+        };
+        let mut created = Self::create(path, false, stopped);
+        for number in 1.. {
+            match created {
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                    created = Self::create(&name(number), false, stopped);
+                }
+                _ => break,
+            }
+        }
+        created
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bytes written.
+    #[must_use]
+    pub const fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Appends whole lines, all of them or none.
+    ///
+    /// # Errors
+    /// When the file does not take them; then it ends with the lines before.
+    pub fn append(&mut self, lines: &str) -> io::Result<()> {
+        if lines.is_empty() {
+            return Ok(());
+        }
+        if let State::Old(_) = &self.state {
+            self.state = State::Ours(self.take_place()?);
+        }
+        let (State::Ours(file) | State::Old(file) | State::Stream(file)) = &mut self.state;
+        let written = file.write_all(lines.as_bytes());
+        match &self.state {
+            _ if written.is_ok() => self.bytes += lines.len() as u64,
+            // A part of a line would be no line. If that fails too, nothing more can be done.
+            State::Ours(file) => drop(file.set_len(self.bytes)),
+            State::Old(_) | State::Stream(_) => {}
+        }
+        written
+    }
+
+    /// A new file takes the place of the old one, whose other names, and readers, keep it.
+    fn take_place(&self) -> io::Result<File> {
+        let part = part_of(&self.path);
+        let file = begin(&part)?;
+        fs::rename(&part, &self.path).inspect_err(|_| {
+            let _ = fs::remove_file(&part);
+        })?;
+        Ok(file)
+    }
+
+    /// Ends the log: what it holds outlives a loss of power from now on.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn finish(mut self) -> io::Result<()> {
+        if let State::Old(_) = &self.state {
+            // Nothing was said, and that is what stands in it.
+            self.state = State::Ours(self.take_place()?);
+        }
+        self.ended = true;
+        let State::Ours(file) = &self.state else { return Ok(()) };
+        file.sync_data()?;
+        sync_folder(&self.path);
+        Ok(())
+    }
+}
+
+impl Drop for LogFile {
+    /// A log that was never ended, and in which nothing stands, is taken away.
+    fn drop(&mut self) {
+        let State::Ours(file) = &self.state else { return };
+        let inode = |about: fs::Metadata| (about.dev(), about.ino());
+        let [own, there] = [file.metadata(), fs::symlink_metadata(&self.path)].map(|it| it.map(inode).ok());
+        if !self.ended && self.bytes == 0 && own == there {
+            // Nothing more can be done.
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Makes a file that nobody else has, and holds it.
+fn begin(path: &Path) -> io::Result<File> {
+    let file = OpenOptions::new().append(true).create_new(true).open(path).map_err(|error| {
+        if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { with_remedy(error) }
+    })?;
+    hold(&file)?;
+    Ok(file)
+}
+
+/// Holds a file against other writers, as long as it is open; where the file system has no locks it is not held.
+fn hold(file: &File) -> io::Result<()> {
+    if flock(file, FlockOperation::NonBlockingLockExclusive) == Err(rustix::io::Errno::WOULDBLOCK) {
+        let why = "another run is writing it: name another file, or wait for that run's end";
+        return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
+    }
+    Ok(())
+}

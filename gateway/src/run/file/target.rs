@@ -1,0 +1,185 @@
+//! What stands under the name of a file that is to be written, and whether it may be.
+
+use std::ffi::OsString;
+use std::fs::{self, File, FileType, OpenOptions};
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use rustix::fs::{CWD, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, renameat_with};
+use rustix::io::Errno;
+
+/// Between two looks whether somebody reads a FIFO.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// What stands under a name.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Target {
+    /// Nothing.
+    New,
+    /// A regular file, which is to be overwritten.
+    Old,
+    /// A FIFO, a terminal, `/dev/stdout`: written to as it is.
+    Stream,
+}
+
+impl Target {
+    /// Looks at a name. A regular file is overwritten only with `force`; a symlink to one, or to nothing, is never
+    /// followed.
+    pub(super) fn of(path: &Path, force: bool) -> io::Result<Self> {
+        let kind = match fs::symlink_metadata(path) {
+            Ok(about) => about.file_type(),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                return fs::metadata(folder_of(path)).map(|_| Self::New).map_err(with_remedy);
+            }
+            Err(error) => return Err(with_remedy(error)),
+        };
+        if kind.is_symlink() {
+            let streams = fs::metadata(path).is_ok_and(|about| is_stream(about.file_type()));
+            return if streams || own_descriptor(path).is_some() {
+                Ok(Self::Stream)
+            } else {
+                let why = "it is a symlink, which is not followed: name the file itself, or another one";
+                Err(io::Error::new(io::ErrorKind::AlreadyExists, why))
+            };
+        }
+        match kind {
+            _ if is_stream(kind) => Ok(Self::Stream),
+            _ if kind.is_dir() => Err(with_remedy(io::ErrorKind::IsADirectory.into())),
+            _ if !kind.is_file() => Err(no_regular_file()),
+            _ if force => Ok(Self::Old),
+            _ => Err(exists()),
+        }
+    }
+}
+
+/// Whether a file may be written under a name, before there is anything to write.
+///
+/// # Errors
+/// Why not, and what to do.
+pub fn check(path: &Path, force: bool) -> io::Result<()> {
+    Target::of(path, force).map(|_| ())
+}
+
+/// The same of a file that has to be a regular one.
+///
+/// # Errors
+/// Why not, and what to do.
+pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
+    match Target::of(path, force)? {
+        Target::New | Target::Old => Ok(()),
+        Target::Stream => Err(no_regular_file()),
+    }
+}
+
+fn no_regular_file() -> io::Error {
+    io::Error::new(io::ErrorKind::AlreadyExists, "it is no regular file: name another one")
+}
+
+/// The refusal of a name that is taken.
+pub(super) fn exists() -> io::Error {
+    let why = "it exists: name another file, or overwrite it with --force";
+    io::Error::new(io::ErrorKind::AlreadyExists, why)
+}
+
+fn is_stream(kind: FileType) -> bool {
+    kind.is_fifo() || kind.is_char_device()
+}
+
+/// Which of this program's own descriptors a name such as `/dev/stdout` stands for.
+fn own_descriptor(path: &Path) -> Option<u32> {
+    let own = fs::canonicalize("/proc/self/fd").ok()?;
+    let mut path = path.to_owned();
+    // More links than this lead nowhere.
+    for _ in 0..40 {
+        let folder = fs::canonicalize(folder_of(&path)).ok()?;
+        if folder == own {
+            return path.file_name()?.to_str()?.parse().ok();
+        }
+        path = folder.join(fs::read_link(&path).ok()?);
+    }
+    None
+}
+
+/// Opens what is written to as it is. A FIFO is waited for until somebody reads it, or until `stopped`.
+pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
+    let own: Option<OwnedFd> = match own_descriptor(path) {
+        Some(1) => Some(io::stdout().as_fd().try_clone_to_owned()?),
+        Some(2) => Some(io::stderr().as_fd().try_clone_to_owned()?),
+        _ => None,
+    };
+    if let Some(own) = own {
+        return Ok(own.into());
+    }
+    let nonblocking = OFlags::NONBLOCK.bits().cast_signed();
+    let file = loop {
+        match OpenOptions::new().append(true).custom_flags(nonblocking).open(path) {
+            Err(error) if Errno::from_io_error(&error) == Some(Errno::NXIO) => {
+                if stopped.load(Ordering::Relaxed) {
+                    return Err(io::Error::new(io::ErrorKind::Interrupted, "interrupted: nobody read it"));
+                }
+                std::thread::sleep(LOOK);
+            }
+            opened => break opened?,
+        }
+    };
+    if !is_stream(file.metadata()?.file_type()) && own_descriptor(path).is_none() {
+        return Err(exists());
+    }
+    fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
+    Ok(file)
+}
+
+/// The folder of a file.
+pub(super) fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
+}
+
+/// Beside a file, a name that no other program gives.
+pub(super) fn part_of(path: &Path) -> PathBuf {
+    let mut name = OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(format!(".{}.part", std::process::id()));
+    path.with_file_name(name)
+}
+
+/// Gives a file another name; takes another file's place only with `force`.
+///
+/// # Errors
+/// When it cannot have it.
+pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
+    if force {
+        return fs::rename(from, to);
+    }
+    match renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE) {
+        // A file system that cannot promise it.
+        Err(Errno::INVAL | Errno::NOSYS) if fs::symlink_metadata(to).is_err() => fs::rename(from, to),
+        Err(Errno::EXIST | Errno::INVAL | Errno::NOSYS) => Err(exists()),
+        renamed => Ok(renamed?),
+    }
+}
+
+/// Makes the names in a file's folder durable. A file system that cannot does what it can.
+pub(super) fn sync_folder(path: &Path) {
+    let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
+}
+
+/// Why a file cannot be begun, and what to do when it is because of where it is to be.
+#[must_use]
+pub fn with_remedy(error: io::Error) -> io::Error {
+    let place = matches!(
+        error.kind(),
+        io::ErrorKind::NotFound
+            | io::ErrorKind::NotADirectory
+            | io::ErrorKind::IsADirectory
+            | io::ErrorKind::PermissionDenied
+            | io::ErrorKind::ReadOnlyFilesystem
+    );
+    if !place {
+        return error;
+    }
+    io::Error::new(error.kind(), format!("{error}; name a file in a folder that can be written"))
+}
