@@ -395,9 +395,11 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
 fn a_gateway_and_a_replay_notice_each_other() {
     let place = Place::new();
     place.records(8);
+    // The next run overwrites its log.
+    fs::rename(place.path("run.log"), place.path("old.log")).unwrap();
     let bench = place.running_bench(30.0, "");
     for way in ["", "--expect"] {
-        let ended = place.replay("run.log", &format!("--quiet {way}")).end();
+        let ended = place.replay("old.log", &format!("--quiet {way}")).end();
         let said =
             "gateway: another gateway is on vcan0: stop it, or send the capture to another bus with --map";
         assert_eq!(ended.refusal(1), said);
@@ -405,7 +407,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
     bench.signal(Signal::TERM);
     bench.end().well();
     // One that comes while the replay lasts.
-    let replay = place.replay("run.log", FRESH);
+    let replay = place.replay("old.log", FRESH);
     waits_for_joints(&place, 10);
     let joints = protocol::message::Joints { in_use: 6, ..Default::default() };
     place.guest().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });

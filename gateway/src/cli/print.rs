@@ -7,12 +7,14 @@ use gateway::paper;
 use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
 use protocol::usage::{Failure, print};
 
+/// A space before a name that stays when the name takes two lines.
+const INDENT: &str = "\u{a0}";
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 110;
 
 /// Prints the whole run on standard output.
 pub(crate) fn summary(summary: &Summary) -> Result<(), Failure> {
-    print(&format!("{}\n", table(summary)))
+    print(&format!("{}\n", rows(summary).table()))
 }
 
 /// What is printed: a name, a value, and what it is to be compared with.
@@ -38,8 +40,9 @@ impl Rows {
         self
     }
 
-    pub(super) const fn table(&self) -> &Table {
-        &self.0
+    /// The table as it is printed.
+    pub(super) fn table(&self) -> String {
+        self.0.to_string().replace(INDENT, " ")
     }
 
     pub(super) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
@@ -47,11 +50,14 @@ impl Rows {
     }
 
     pub(super) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.0.add_row([format!("  {name}"), value.to_string(), beside.to_string()]);
+        let name = format!("  {name}");
+        let text = name.trim_start_matches(' ');
+        let indented = INDENT.repeat(name.len() - text.len()) + text;
+        self.0.add_row([indented, value.to_string(), beside.to_string()]);
     }
 }
 
-fn table(summary: &Summary) -> Table {
+fn rows(summary: &Summary) -> Rows {
     let cells = format!("{} cells, {:.1} s, {}", summary.cells, summary.duration_s, summary.outcome);
     let mut rows = Rows::new([summary.skin.clone(), cells, String::new()]);
     accuracy(&mut rows, summary);
@@ -61,7 +67,7 @@ fn table(summary: &Summary) -> Table {
         frames(&mut rows, bus);
     }
     costs(&mut rows, summary);
-    rows.0
+    rows
 }
 
 fn accuracy(rows: &mut Rows, summary: &Summary) {

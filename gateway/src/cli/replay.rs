@@ -1,11 +1,9 @@
 //! `gateway replay`.
 
-use std::fmt::Display;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use comfy_table::{ContentArrangement, Table, presets};
 use gateway::decode::pick::{self, Pick, Wanted};
 use gateway::replay::player::Pace;
 use gateway::replay::reel::Only as What;
@@ -19,9 +17,8 @@ use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
 use super::output::{self, Force};
+use super::print::Rows;
 
-/// Columns of a table that is not on a narrower terminal.
-const WIDTH: u16 = 100;
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
 
@@ -210,29 +207,11 @@ impl Replay {
     }
 }
 
-/// What is printed: a name, a value, and what it is to be compared with.
-struct Rows(Table);
-
-impl Rows {
-    fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.0.add_row([name.to_string(), value.to_string(), beside.to_string()]);
-    }
-
-    fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.0.add_row([format!("  {name}"), value.to_string(), beside.to_string()]);
-    }
-}
-
 /// The whole replay, for people.
 fn table(summary: &Summary) -> String {
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    if table.width().is_none_or(|width| width > WIDTH) {
-        table.set_width(WIDTH);
-    }
     let ended = if summary.interrupted { "interrupted" } else { "done" };
-    table.set_header([summary.file.clone(), format!("{:.1} s, {ended}", summary.duration_s), String::new()]);
-    let mut rows = Rows(table);
+    let head = [summary.file.clone(), format!("{:.1} s, {ended}", summary.duration_s), String::new()];
+    let mut rows = Rows::new(head);
     rows.section("frames", "", "");
     rows.row("sent", summary.sent, "");
     rows.row("refused", summary.refused, "a bus stayed full");
@@ -263,7 +242,7 @@ fn table(summary: &Summary) -> String {
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
     let first = first.map(|first| format!("{}\n", first.text)).unwrap_or_default();
-    format!("{}\n{first}", rows.0)
+    format!("{}\n{first}", rows.table())
 }
 
 fn expectation(rows: &mut Rows, expect: &Expect) {

@@ -71,6 +71,7 @@ impl Measured {
         })
     }
 
+    /// How it goes: what matters most first, for a narrow terminal shows no more.
     pub(super) fn line(
         &self,
         started: Instant,
@@ -87,13 +88,13 @@ impl Measured {
         let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
         let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
         format!(
-            "{seconds:5.1} of {of:.1} s  {mode:11}  {:3} of {cells} in contact, {} stale, {} dead  torque {} Nm  \
-             late p99 {:.0} us{lost}{halted}",
+            "{seconds:5.1} of {of:.1} s{lost}{halted}  {:3} of {cells} in contact, {} stale, {} dead  \
+             late p99 {:.0} us  {mode:11}  torque {} Nm",
             record.contributing,
             record.stale,
             record.dead,
-            torque.join(" "),
             Quantiles::of(&self.late, 1e-3).p99,
+            torque.join(" "),
         )
     }
 }
