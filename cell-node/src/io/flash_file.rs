@@ -2,7 +2,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use protocol::id::CellId;
 
@@ -19,7 +19,7 @@ pub struct FlashFile {
 impl FlashFile {
     /// The file `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` of a cell that came without a number.
     #[must_use]
-    pub fn new(directory: Option<&std::path::Path>, bus: &str, identity: Identity) -> Self {
+    pub fn new(directory: Option<&Path>, bus: &str, identity: Identity) -> Self {
         let name = identity.cell.map_or_else(|| format!("s{}", identity.serial), |cell| cell.to_string());
         let path = directory.map(|directory| directory.join(format!("{bus}-{name}.flash")));
         Self { identity, path }
@@ -64,7 +64,11 @@ impl FlashFile {
             let mut file = File::create(&part)?;
             file.write_all(&flash::encode(self.identity.serial, kept))?;
             file.sync_all()?;
-            fs::rename(&part, path)
+            fs::rename(&part, path)?;
+            // Its name outlives a loss of power too, where the file system can promise that.
+            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+            let _ = File::open(folder.unwrap_or_else(|| Path::new("."))).and_then(|folder| folder.sync_all());
+            Ok(())
         };
         let stored = store();
         if stored.is_err() {

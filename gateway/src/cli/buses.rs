@@ -15,10 +15,12 @@ impl Buses {
     /// Makes one in the folder for temporary files, `skinbus-WHAT-PID`.
     pub(super) fn create(what: &str) -> Result<Self, Failure> {
         let pid = std::process::id();
+        // A socket's path has at most 107 bytes; a folder for temporary files may have more.
+        let fits = |folder: &PathBuf| folder.as_os_str().len() <= 50;
+        let folder = Some(std::env::temp_dir()).filter(fits).unwrap_or_else(|| PathBuf::from("/tmp"));
         for number in 0.. {
             let end = if number == 0 { String::new() } else { format!("-{number}") };
-            // A socket's path has at most 107 bytes, so it cannot be in the folder of the results.
-            let path = std::env::temp_dir().join(format!("skinbus-{what}-{pid}{end}"));
+            let path = folder.join(format!("skinbus-{what}-{pid}{end}"));
             match fs::DirBuilder::new().mode(0o700).create(&path) {
                 // Of a program of this number that was killed, or of somebody else.
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}

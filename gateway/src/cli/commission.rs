@@ -76,7 +76,7 @@ impl Commission {
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
         let wanted = self.buses(&skin)?;
         // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
-        self.numbers.as_ref().map_or(Ok(()), |path| self.force.check("--numbers", path))?;
+        let begun = self.numbers.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
@@ -126,7 +126,7 @@ impl Commission {
             whole.notes(self.numbers.is_some()).iter().for_each(output::note);
         }
         whole.print(self.json)?;
-        if let Some(path) = &self.numbers {
+        if let Some((file, out)) = begun {
             let numbers: Numbers = done
                 .iter()
                 .flat_map(|done| &done.report.cells)
@@ -134,8 +134,8 @@ impl Commission {
                 .collect();
             let copy = renumbered(&skin, &text, &numbers);
             let copy =
-                copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", path.display())))?;
-            self.force.write("--numbers", path, &copy)?;
+                copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", file.path().display())))?;
+            output::finish("--numbers", file, out, &copy)?;
         }
         whole.end()
     }

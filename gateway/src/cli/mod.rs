@@ -32,7 +32,10 @@ use protocol::usage::{Failure, end, one_line};
 
 /// Bridges a robot skin's bus to a control loop.
 #[derive(Debug, Parser)]
-#[command(version, after_help = "Example:\n  gateway demo")]
+#[command(
+    version,
+    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.\n\nExample:\n  gateway demo"
+)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,

@@ -17,7 +17,7 @@ use gateway::summary::Summary;
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
 use protocol::skin::Skin;
 use protocol::time::Span;
-use protocol::usage::Failure;
+use protocol::usage::{Failure, quoted};
 use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::buses::Buses;
@@ -41,7 +41,7 @@ struct Common {
     /// End after so many seconds; else after the scenario's duration
     #[arg(long, value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// Write the figures of the end as JSON; docs/summary.md explains its keys
+    /// Write the figures of the end as JSON, also when the run fails; docs/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
@@ -151,7 +151,8 @@ pub(crate) struct Demo {
 ///
 /// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
-/// table. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2: wrong use or
+/// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
+/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2: wrong use or
 /// configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -165,7 +166,7 @@ pub(crate) struct Run {
     scenario: Option<PathBuf>,
     #[command(flatten)]
     common: Common,
-    /// Write all frames as candump text
+    /// Write all frames as candump text: a log that can be followed while it grows
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
     /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
@@ -206,14 +207,17 @@ impl Demo {
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         let mut options = self.common.options(skin_file, skin, scenario);
         options.kinds = Kinds::all(self.bus_kind);
-        let embedded = self.bus_kind.resolve() == BusKind::Embedded;
-        let buses = (embedded && std::env::var_os("SKINBUS_DIR").is_none_or(|set| set.is_empty()))
-            .then(|| Buses::create("demo"))
-            .transpose()?;
-        options.directory = buses.as_ref().map(|buses| buses.0.clone());
+        let kind = self.bus_kind.resolve();
+        let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
+        let own = given.is_none() && kind == BusKind::Embedded;
+        let buses = own.then(|| Buses::create("demo")).transpose()?;
+        options.directory = buses.as_ref().map(|buses| buses.0.clone()).or(given);
         if !options.quiet {
-            let place = options.directory.as_ref().map(|path| format!("SKINBUS_DIR={} ", path.display()));
-            let (place, kind) = (place.unwrap_or_default(), self.bus_kind.resolve());
+            let place = options.directory.as_ref().map(|path| {
+                let path = path.to_string_lossy();
+                format!("SKINBUS_DIR={} ", quoted(&path))
+            });
+            let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
             note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
         }
         let Common { recording, summary, .. } = self.common;

@@ -1,6 +1,7 @@
 //! The recorder's thread: takes what has come, writes it, flushes, looks around.
 
 use std::mem;
+use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::thread;
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::parameters::MAX_JOINTS;
 use rustix::time::{ClockId, clock_gettime};
 
-use super::account::Recording;
+use super::account::{Recording, Written};
 use super::facts::realtime_minus_monotonic;
 use super::feed::{Captured, FRAMES, Feed, Lane};
 use super::force::InForce;
@@ -22,6 +23,7 @@ use crate::capture::{Note, NoteKind};
 use crate::ros2::skin::Felt;
 use crate::ros2::standard::{Diagnosis, Level, Point};
 use crate::run::backlog;
+use crate::run::file::sync;
 
 /// The thread's rhythm.
 const LOOK: Duration = Duration::from_millis(10);
@@ -327,6 +329,12 @@ impl Work {
         let mut lost = 0;
         if let Some(mut series) = self.series.take() {
             let (files, unwritten) = series.finish();
+            for Written { path, .. } in &files {
+                // While the run lasted the recorder waited for no disk; now nobody waits for the recorder.
+                if let Err(error) = sync(Path::new(path)) {
+                    self.errors.push(Said::Else(format!("{path}: {error}")));
+                }
+            }
             recording.files = files;
             lost = unwritten.frames;
             if unwritten.others > 0 {

@@ -6,9 +6,9 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::fs::{Access, FlockOperation, OFlags, access, flock};
 
-use super::target::{Target, exists, open_stream, part_of, sync_folder, with_remedy};
+use super::target::{Target, exists, folder_of, open_stream, part_of, sync_folder, with_remedy};
 
 /// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
 /// takes another file's place does so with its first line.
@@ -46,6 +46,9 @@ impl LogFile {
                 let old = OpenOptions::new().read(true).custom_flags(flags).open(path);
                 let old = old.map_err(with_remedy)?;
                 hold(&old)?;
+                // That nothing can take its place is known before the first line.
+                let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
+                writes.map_err(|errno| with_remedy(errno.into()))?;
                 State::Old(old)
             }
             Err(error) => {

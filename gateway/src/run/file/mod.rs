@@ -16,7 +16,7 @@ use rustix::fs::{AtFlags, CWD, Mode, OFlags, linkat, open};
 
 pub use log::LogFile;
 use target::{Target, exists, folder_of, open_stream, part_of, sync_folder};
-pub use target::{check, check_regular, rename, with_remedy};
+pub use target::{check, check_regular, rename, sync, with_remedy};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
 /// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run
