@@ -18,7 +18,9 @@ use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Examples:
+    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+
+Examples:
   cell-node --bus vcan0 --node 12 --skin gateway/examples/ur5-253.toml
   cell-node --bus vcan0 --nodes 1-64 --skin gateway/examples/ur5-253.toml --flash /tmp/flash
   cell-node --bus vcan0 --node 12 --skin skin.toml --fresh --flash /tmp/flash"
