@@ -4,6 +4,7 @@ pub mod bus_model;
 pub mod capture;
 pub mod central;
 pub mod commission;
+pub mod container;
 pub mod controller;
 pub mod cycle;
 pub mod dbc;

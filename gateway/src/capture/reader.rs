@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, Read};
+use std::io::{self, Read, Seek};
 use std::path::Path;
 
 use protocol::can::Frame;
@@ -140,8 +140,7 @@ impl Reader {
         if path.as_os_str() == "-" {
             return Self::from_read("standard input", io::stdin());
         }
-        let (name, file) = file(path)?;
-        Self::from_read(name, file)
+        Self::begin_file(path, false)
     }
 
     /// Reads from anything; the name is for errors. What it is, is told by its first bytes, which are waited
@@ -154,6 +153,28 @@ impl Reader {
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
         Self::begin(name.into(), input, false)
+    }
+
+    /// Of a recording that is a regular file, attachments and metadata are known from the beginning.
+    fn begin_file(path: &Path, others: bool) -> Result<Self, CaptureError> {
+        let name = path.display().to_string();
+        let failed = |source| CaptureError::Io { name: name.clone(), source };
+        let mut file = File::open(path).map_err(failed)?;
+        let about = file.metadata().map_err(failed)?;
+        if about.is_dir() {
+            return Err(failed(io::ErrorKind::IsADirectory.into()));
+        }
+        if !about.is_file() {
+            return Self::begin(name, file, others);
+        }
+        let looked = magic::look(&mut file).and_then(|looked| file.rewind().map(|()| looked));
+        match looked.map_err(failed)? {
+            (Kind::Mcap, _) => {
+                let mcap = McapReader::with_files(file, others).map_err(failed)?;
+                Ok(Self { source: Source::Mcap(Box::new(mcap)), name, entries: 0 })
+            }
+            _ => Self::begin(name, file, others),
+        }
     }
 
     fn begin(name: String, input: impl Read + Send + 'static, others: bool) -> Result<Self, CaptureError> {
@@ -247,8 +268,8 @@ impl Reader {
         }
     }
 
-    /// What it has beside frames and notes, as far as it has been read; what stands before the first of them, from
-    /// the beginning. A log has nothing.
+    /// What it has beside frames and notes, as far as it has been read; from the beginning what stands before the first
+    /// of them, and the attachments and metadata of a regular file wherever they stand. A log has nothing.
     #[must_use]
     pub fn extras(&self) -> &Extras {
         static NONE: Extras = Extras {
@@ -275,8 +296,7 @@ impl Items {
     /// # Errors
     /// When it cannot be opened or is no capture.
     pub fn open(path: &Path) -> Result<Self, CaptureError> {
-        let (name, file) = file(path)?;
-        Reader::begin(name, file, true).map(Self)
+        Reader::begin_file(path, true).map(Self)
     }
 
     /// What it is written in.
@@ -302,15 +322,4 @@ impl Items {
     pub fn extras(&self) -> &Extras {
         self.0.extras()
     }
-}
-
-/// A file and its name for errors.
-fn file(path: &Path) -> Result<(String, File), CaptureError> {
-    let name = path.display().to_string();
-    let failed = |source| CaptureError::Io { name: name.clone(), source };
-    let file = File::open(path).map_err(failed)?;
-    if file.metadata().map_err(failed)?.is_dir() {
-        return Err(failed(io::ErrorKind::IsADirectory.into()));
-    }
-    Ok((name, file))
 }

@@ -4,5 +4,6 @@ mod read;
 mod write;
 
 pub use read::LONGEST;
-pub(super) use read::{LogReader, read_some};
+pub(super) use read::LogReader;
+pub(crate) use read::read_some;
 pub use write::{Digits, LogWriter, Style, Wrote};

@@ -1,28 +1,33 @@
 //! The entries of an MCAP recording, and what else it has.
 
 use std::collections::HashMap;
-use std::io::{self, Read};
+use std::io::{self, BufReader, Chain, Cursor, Read, Seek};
 
-use ::mcap::McapError;
-use ::mcap::records::{Channel, Record as Raw, op};
-use ::mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use ::mcap::records::op;
 use protocol::candump::Timestamp;
 
 use super::foreign::Foreign;
-use crate::capture::log::read_some;
+use crate::capture::log::LONGEST as LONGEST_LINE;
 use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
+use crate::container::{Chunk, Damage, Facts, Framed, MAGIC, Record as Raw, Source, find, parse};
 use crate::record::TOPIC_OF_STATE;
 use crate::ros2::Message;
 use crate::ros2::messages::{CanFrame, CaptureNote};
 
-/// The greatest record or chunk that is taken into memory; ours have 256 KiB, and those of other writers a few MiB.
-const LIMIT: usize = 128 << 20;
 /// Bytes that are read at once.
 const PIECE: usize = 1 << 18;
-/// Bytes of attachments and metadata that are kept.
+/// Bytes of attachments, metadata and frames in force that are kept.
 const KEPT: usize = 16 << 20;
-/// Bytes of a message before its data: channel, sequence, two times.
-const HEAD: usize = 22;
+/// Bytes of names of topics and types.
+const NAMES: usize = 32 << 20;
+/// Bytes that a name, a fact or a frame costs beside its own.
+const ENTRY: usize = 128;
+/// The longest message that is a frame.
+const LONGEST_FRAME: usize = 4 << 10;
+/// The longest message that is a note: a line and its place.
+const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
+/// Letters of a topic's name that stand for a bus without a name.
+const LONGEST_BUS: usize = 255;
 
 /// Why nothing more comes.
 #[derive(Debug)]
@@ -31,25 +36,63 @@ pub(crate) enum Fault {
     Damaged(String),
 }
 
+impl From<io::Error> for Fault {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+impl From<Damage> for Fault {
+    fn from(damage: Damage) -> Self {
+        Self::Damaged(damage.to_string())
+    }
+}
+
+type Input = BufReader<Chain<Cursor<Vec<u8>>, Box<dyn Read + Send>>>;
+
 /// Reads the entries of a recording.
 pub(crate) struct McapReader {
-    input: Box<dyn Read + Send>,
-    linear: LinearReader,
+    source: Source<Input>,
+    chunk: Chunk,
+    state: State,
+    /// What was read when it was opened: the first message that is wanted, or why there is none.
+    first: Option<Result<Wanted, Fault>>,
+}
+
+/// Where a reader is in its file.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Place {
+    Magic,
+    Records,
+    InChunk,
+    Over,
+}
+
+/// What is known of a recording.
+struct State {
+    place: Place,
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Lane>,
+    /// The places of topics that are only counted, by name and type.
+    counted: HashMap<(String, String), usize>,
+    /// Bytes of names so far.
+    names: usize,
     extras: Extras,
     /// Bytes of attachments and metadata so far.
     kept: usize,
-    /// The message that was read last.
-    message: Vec<u8>,
-    /// Bytes that came in.
-    bytes: u64,
+    /// Whether attachments and metadata are known already.
+    knows_files: bool,
     any_frame: bool,
     /// Whether messages that are only counted are wanted too.
     others: bool,
-    /// What was read when it was opened: the channel and time of the first message, or why there is none.
-    first: Option<Result<(u16, u64), Fault>>,
-    over: bool,
+}
+
+/// A message that is wanted. What it says is the record that was read last.
+#[derive(Clone, Copy)]
+struct Wanted {
+    channel: u16,
+    log_time: u64,
+    in_chunk: bool,
 }
 
 /// A channel: its topic, and what is done with its messages.
@@ -74,69 +117,50 @@ enum What {
 impl McapReader {
     /// Goes on behind `head`, which has been read already; `others` if messages of other topics are wanted too.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, others: bool) -> Self {
-        // A chunk is checked before anything of it is believed.
-        let options = LinearReaderOptions::default()
-            .with_prevalidate_chunk_crcs(true)
-            .with_validate_data_section_crc(true)
-            .with_record_length_limit(LIMIT);
-        let mut linear = LinearReader::new_with_options(options);
-        for (to, from) in linear.insert(head.len()).iter_mut().zip(head) {
-            *to = *from;
-        }
-        linear.notify_read(head.len());
-        let mut reader = Self {
-            input,
-            linear,
-            schemas: HashMap::new(),
-            channels: HashMap::new(),
-            extras: Extras::default(),
-            kept: 0,
-            message: Vec::new(),
-            bytes: u64::try_from(head.len()).unwrap_or(0),
-            any_frame: false,
-            others,
-            first: None,
-            over: false,
-        };
+        Self::begin(head, input, State::new(others))
+    }
+
+    /// Reads a file from its beginning. Its attachments and metadata are known from then on, wherever they stand.
+    pub(crate) fn with_files(mut file: impl Read + Seek + Send + 'static, others: bool) -> io::Result<Self> {
+        let mut state = State::new(others);
+        state.find_files(&mut file)?;
+        file.rewind()?;
+        Ok(Self::begin(&[], Box::new(file), state))
+    }
+
+    fn begin(head: &[u8], input: Box<dyn Read + Send>, state: State) -> Self {
+        let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
+        let source = Source::new(input, KEPT as u64);
+        let mut reader = Self { source, chunk: Chunk::new(), state, first: None };
         // What stands before the first message is known from the beginning.
         reader.first = reader.advance().transpose();
         reader
     }
 
     pub(crate) const fn extras(&self) -> &Extras {
-        &self.extras
+        &self.state.extras
     }
 
     /// The next entry, or message of another topic where these are wanted. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
-        let message = match self.first.take() {
+        let wanted = match self.first.take() {
             Some(first) => Some(first?),
             None => self.advance()?,
         };
-        Ok(message.map(|(channel, log_time)| self.item(channel, log_time)))
+        let Some(Wanted { channel, log_time, in_chunk }) = wanted else { return Ok(None) };
+        let body = if in_chunk { self.chunk.body() } else { self.source.body() };
+        let Ok(Raw::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
+        Ok(Some(self.state.item(channel, log_time, data)))
     }
 
-    fn item(&mut self, channel: u16, log_time: u64) -> Item<'_> {
-        let topic = match self.channels.get(&channel) {
-            Some(Lane { what: What::Counted(topic), .. }) => *topic,
-            _ => return Item::Entry(self.entry(channel, log_time)),
-        };
-        let (topic, schema) = self
-            .extras
-            .topics
-            .get(topic)
-            .map_or(("", ""), |topic| (topic.name.as_str(), topic.schema.as_str()));
-        Item::Other(Other { topic, schema, nanos: log_time, message: &self.message })
-    }
-
-    /// Reads up to the next message that is wanted; its channel and its time.
-    fn advance(&mut self) -> Result<Option<(u16, u64)>, Fault> {
-        while !self.over {
+    /// Reads up to the next message that is wanted.
+    fn advance(&mut self) -> Result<Option<Wanted>, Fault> {
+        while self.state.place != Place::Over {
             match self.step() {
                 Ok(None) => {}
-                Ok(message) => return Ok(message),
+                Ok(wanted) => return Ok(wanted),
                 Err(fault) => {
-                    self.over = true;
+                    self.state.place = Place::Over;
                     return Err(fault);
                 }
             }
@@ -144,178 +168,300 @@ impl McapReader {
         Ok(None)
     }
 
-    /// Reads on; a message that is wanted is in `message` then: its channel and its time.
-    fn step(&mut self) -> Result<Option<(u16, u64)>, Fault> {
-        match self.linear.next_event() {
-            None => self.over = true,
-            Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
-                // A damaged length asks for anything: what is there comes piece by piece.
-                let room = self.linear.insert(wanted.clamp(PIECE, 4 * PIECE));
-                let got = read_some(&mut self.input, room).map_err(Fault::Io)?;
-                self.linear.notify_read(got);
-                self.bytes += u64::try_from(got).unwrap_or(0);
-            }
-            Some(Ok(LinearReadEvent::Record { opcode: op::MESSAGE, data })) => {
-                let (head, data) =
-                    data.split_at_checked(HEAD).ok_or_else(|| damaged("a message is too short"))?;
-                let (channel, log_time) = match head {
-                    &[a, b, _, _, _, _, c, d, e, f, g, h, i, j, ..] => {
-                        (u16::from_le_bytes([a, b]), u64::from_le_bytes([c, d, e, f, g, h, i, j]))
-                    }
-                    _ => return Err(damaged("a message is too short")),
-                };
-                let lane = self.channels.get(&channel);
-                let lane = lane.ok_or_else(|| {
-                    damaged(format!("a message belongs to channel {channel}, which it has not"))
-                })?;
-                match lane.what {
-                    What::Counted(topic) => {
-                        if let Some(topic) = self.extras.topics.get_mut(topic) {
-                            topic.messages += 1;
-                        }
-                        if !self.others {
-                            return Ok(None);
-                        }
-                    }
-                    What::InForce => {
-                        let time = Timestamp { nanos: log_time, nine_digits: true };
-                        let frame = CanFrame::decode(data, time);
-                        let frame = frame
-                            .map_err(|error| damaged(format!("a message of {}: {error}", lane.topic)))?;
-                        let CanFrame(record) = frame;
-                        let (bus, frame) = (record.interface.to_owned(), record.frame);
-                        self.keep(size_of::<InForce>(), |extras| {
-                            extras.in_force.push(InForce { bus, frame, nanos: log_time })
-                        });
-                        return Ok(None);
-                    }
-                    What::Frames { .. } | What::Notes | What::Foreign(_) => {}
-                }
-                self.message.clear();
-                self.message.extend_from_slice(data);
-                return Ok(Some((channel, log_time)));
-            }
-            Some(Ok(LinearReadEvent::Record { opcode, data })) => {
-                if matches!(opcode, op::SCHEMA | op::CHANNEL | op::ATTACHMENT | op::METADATA) {
-                    match ::mcap::parse_record(opcode, data).map_err(|error| damaged(error.to_string()))? {
-                        Raw::Schema { header, .. } => {
-                            self.schemas.insert(header.id, header.name);
-                        }
-                        Raw::Channel(channel) => self.channel(channel),
-                        Raw::Attachment { header, data, .. } => {
-                            let name = header.name;
-                            self.kept += name.len();
-                            let bytes =
-                                if self.kept + data.len() <= KEPT { data.into_owned() } else { Vec::new() };
-                            self.keep(bytes.len(), |extras| extras.attachments.push((name, bytes)));
-                        }
-                        Raw::Metadata(metadata) => {
-                            let facts: Vec<_> = metadata.metadata.into_iter().collect();
-                            let size = facts.iter().map(|(key, value)| key.len() + value.len()).sum();
-                            self.keep(size, |extras| extras.metadata.push((metadata.name, facts)));
-                        }
-                        Raw::Header(_)
-                        | Raw::Footer(_)
-                        | Raw::Message { .. }
-                        | Raw::Chunk { .. }
-                        | Raw::MessageIndex(_)
-                        | Raw::ChunkIndex(_)
-                        | Raw::AttachmentIndex(_)
-                        | Raw::Statistics(_)
-                        | Raw::MetadataIndex(_)
-                        | Raw::SummaryOffset(_)
-                        | Raw::DataEnd(_)
-                        | Raw::Unknown { .. } => {}
-                    }
+    /// Reads on by a record.
+    fn step(&mut self) -> Result<Option<Wanted>, Fault> {
+        let Self { source, chunk, state, .. } = self;
+        match state.place {
+            Place::Over => {}
+            Place::Magic => {
+                let there = source.magic()?;
+                state.place = Place::Records;
+                if !there {
+                    state.no_magic(source.body(), source.read())?;
                 }
             }
-            Some(Err(McapError::UnexpectedEof)) => {
-                self.over = true;
-                let bytes = self.bytes;
-                self.extras.unfinished =
-                    Some(format!("it has no end: after {bytes} bytes it was cut off, or never finished"));
+            Place::InChunk => match chunk.next() {
+                Some((opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), body)) => {
+                    return state.take(opcode, body, true);
+                }
+                Some(_) => {}
+                None => state.place = Place::Records,
+            },
+            Place::Records => match source.next()? {
+                Framed::Record(op::CHUNK) => {
+                    chunk.unpack(source.body(), source.read())?;
+                    state.place = Place::InChunk;
+                }
+                Framed::Record(op::DATA_END) => {
+                    let found = source.data_checksum();
+                    if let (Raw::DataEnd { crc: saved @ 1.. }, Some(found)) =
+                        (parse(op::DATA_END, source.body())?, found)
+                        && saved != found
+                    {
+                        return Err(Damage::Checksum { what: "the data section", saved, found }.into());
+                    }
+                }
+                Framed::Record(op::FOOTER) => {
+                    let there = source.magic()?;
+                    state.place = Place::Over;
+                    if !there {
+                        state.no_magic(source.body(), source.read())?;
+                    }
+                }
+                Framed::Record(opcode) => return state.take(opcode, source.body(), false),
+                Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
+                Framed::Long(_, bytes) => {
+                    let limit = crate::container::LONGEST;
+                    return Err(Damage::Long { what: "record", bytes, limit }.into());
+                }
+                Framed::End(_) => state.cut_off(source.read()),
+            },
+        }
+        Ok(None)
+    }
+}
+
+impl State {
+    fn new(others: bool) -> Self {
+        Self {
+            place: Place::Magic,
+            schemas: HashMap::new(),
+            channels: HashMap::new(),
+            counted: HashMap::new(),
+            names: 0,
+            extras: Extras::default(),
+            kept: 0,
+            knows_files: false,
+            any_frame: false,
+            others,
+        }
+    }
+
+    /// There are no magic bytes where they have to be.
+    fn no_magic(&mut self, found: &[u8], read: u64) -> Result<(), Fault> {
+        if !MAGIC.starts_with(found) {
+            return Err(damaged("it does not begin and end with the magic bytes of an MCAP file"));
+        }
+        self.cut_off(read);
+        Ok(())
+    }
+
+    fn cut_off(&mut self, read: u64) {
+        self.place = Place::Over;
+        self.extras.unfinished =
+            Some(format!("it has no end: after {read} bytes it was cut off, or never finished"));
+    }
+
+    /// Takes the attachments and metadata of a file that can be gone through without reading all of it.
+    fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
+        // Most of what is passed over is longer than this.
+        let mut from = BufReader::with_capacity(4 << 10, file);
+        from.seek_relative(MAGIC.len() as i64)?;
+        let mut body = Vec::new();
+        while let Some((opcode, length)) = find(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])? {
+            if opcode == op::FOOTER {
+                break;
             }
-            Some(Err(McapError::Io(error))) => {
-                return Err(damaged(format!("a chunk cannot be unpacked: {error}")));
+            body.clear();
+            let came = (&mut from).take(length.min(KEPT as u64)).read_to_end(&mut body)? as u64;
+            if came < length {
+                let rest = i64::try_from(length - came);
+                if rest.is_err() || rest.is_ok_and(|rest| from.seek_relative(rest).is_err()) {
+                    break;
+                }
             }
-            Some(Err(error)) => return Err(damaged(error.to_string())),
+            match parse(opcode, &body) {
+                Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
+                Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
+                // What is wrong with it is said when it is come to.
+                _ => {}
+            }
+        }
+        self.knows_files = true;
+        Ok(())
+    }
+
+    /// Takes a record.
+    fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Wanted>, Fault> {
+        match parse(opcode, body)? {
+            Raw::Schema { id, name, .. } => {
+                if self.schemas.get(&id).is_none_or(|known| known != name) {
+                    self.name(name.len())?;
+                    self.schemas.insert(id, name.to_owned());
+                }
+            }
+            // Said again in the summary, or in every chunk.
+            Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
+            Raw::Channel { id, schema, topic, encoding, facts } => {
+                self.channel(id, schema, topic, encoding, &facts)?;
+            }
+            Raw::Message { channel, log_time, data, .. } => {
+                let wanted = self.is_wanted(channel, log_time, data)?;
+                return Ok(wanted.then_some(Wanted { channel, log_time, in_chunk }));
+            }
+            Raw::Attachment { name, data, .. } => {
+                if !self.knows_files {
+                    self.attachment(name, data);
+                }
+            }
+            Raw::Metadata { name, facts } => {
+                if !self.knows_files {
+                    self.metadata(name, &facts);
+                }
+            }
+            Raw::Header { .. } | Raw::DataEnd { .. } | Raw::Other => {}
         }
         Ok(None)
     }
 
+    /// Takes a message, if nobody else wants it.
+    fn is_wanted(&mut self, channel: u16, log_time: u64, data: &[u8]) -> Result<bool, Fault> {
+        let lane = self.channels.get(&channel);
+        let lane =
+            lane.ok_or_else(|| damaged(format!("a message belongs to channel {channel}, which it has not")))?;
+        match lane.what {
+            What::Counted(topic) => {
+                if let Some(topic) = self.extras.topics.get_mut(topic) {
+                    topic.messages += 1;
+                }
+                Ok(self.others)
+            }
+            What::InForce => {
+                let time = Timestamp { nanos: log_time, nine_digits: true };
+                let CanFrame(record) = within(data, LONGEST_FRAME)
+                    .and_then(|data| CanFrame::decode(data, time).map_err(|error| error.to_string()))
+                    .map_err(|why| damaged(format!("a message of {}: {why}", lane.topic)))?;
+                let (bus, frame) = (record.interface, record.frame);
+                self.keep(bus.len() + ENTRY, |extras| {
+                    extras.in_force.push(InForce { bus: bus.to_owned(), frame, nanos: log_time });
+                });
+                Ok(false)
+            }
+            What::Frames { .. } | What::Notes | What::Foreign(_) => Ok(true),
+        }
+    }
+
+    /// Makes sure that there is room for a name.
+    fn name(&mut self, bytes: usize) -> Result<(), Fault> {
+        self.names += bytes + ENTRY;
+        if self.names > NAMES {
+            return Err(damaged(format!(
+                "the names of its topics and types are too long: at most {NAMES} bytes are read"
+            )));
+        }
+        Ok(())
+    }
+
     /// Keeps something of so many bytes, while there is room.
     fn keep(&mut self, size: usize, keep: impl FnOnce(&mut Extras)) {
-        self.kept += size;
+        self.kept = self.kept.saturating_add(size);
         if self.kept <= KEPT {
             keep(&mut self.extras);
         }
     }
 
-    fn channel(&mut self, channel: Channel) {
-        if self.channels.contains_key(&channel.id) {
-            // Said again in the summary.
-            return;
-        }
-        let schema = self.schemas.get(&channel.schema_id).map_or("", String::as_str);
-        let nine_digits = channel.metadata.get("time_digits").is_none_or(|digits| digits != "6");
-        let what = if channel.message_encoding != "cdr" {
+    fn attachment(&mut self, name: &str, data: &[u8]) {
+        let fits = self.kept.saturating_add(name.len() + ENTRY + data.len()) <= KEPT;
+        let data = if fits { data } else { &[] };
+        self.keep(name.len() + ENTRY + data.len(), |extras| {
+            extras.attachments.push((name.to_owned(), data.to_vec()));
+        });
+    }
+
+    fn metadata(&mut self, name: &str, facts: &Facts<'_>) {
+        let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY).sum::<usize>();
+        self.keep(name.len() + ENTRY + size, |extras| {
+            let facts = facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned()));
+            extras.metadata.push((name.to_owned(), facts.collect()));
+        });
+    }
+
+    fn channel(
+        &mut self,
+        id: u16,
+        schema: u16,
+        topic: &str,
+        encoding: &str,
+        facts: &Facts<'_>,
+    ) -> Result<(), Fault> {
+        let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
+        // Each of them may be kept twice.
+        self.name(2 * (topic.len() + schema.len()))?;
+        let nine_digits = facts.get("time_digits").is_none_or(|digits| digits != "6");
+        let what = if encoding != "cdr" {
             None
-        } else if schema == CanFrame::TYPE && channel.topic.starts_with(TOPIC_OF_STATE) {
+        } else if schema == CanFrame::TYPE && topic.starts_with(TOPIC_OF_STATE) {
             Some(What::InForce)
         } else if schema == CanFrame::TYPE {
             Some(What::Frames { nine_digits })
         } else if schema == CaptureNote::TYPE {
             Some(What::Notes)
         } else {
-            Foreign::of(schema).map(What::Foreign)
+            Foreign::of(&schema).map(What::Foreign)
         };
         let what = what.unwrap_or_else(|| {
             let topics = &mut self.extras.topics;
-            let known = topics.iter().position(|topic| topic.name == channel.topic && topic.schema == schema);
-            What::Counted(known.unwrap_or_else(|| {
-                topics.push(Topic { name: channel.topic.clone(), schema: schema.to_owned(), messages: 0 });
-                topics.len() - 1
-            }))
+            let place =
+                self.counted.entry((topic.to_owned(), schema)).or_insert_with_key(|(name, schema)| {
+                    topics.push(Topic { name: name.clone(), schema: schema.clone(), messages: 0 });
+                    topics.len() - 1
+                });
+            What::Counted(*place)
         });
-        self.channels.insert(channel.id, Lane { topic: channel.topic, what });
+        self.channels.insert(id, Lane { topic: topic.to_owned(), what });
+        Ok(())
     }
 
-    /// What the message says.
-    fn entry(&mut self, channel: u16, log_time: u64) -> Entry<'_> {
-        let message = &self.message;
-        let Some(lane) = self.channels.get(&channel) else {
-            return unreadable("", log_time, message, "no channel");
+    fn item<'a>(&'a mut self, channel: u16, log_time: u64, message: &'a [u8]) -> Item<'a> {
+        let Some(Lane { topic, what }) = self.channels.get(&channel) else {
+            return Item::Entry(unreadable("", log_time, message, "no channel"));
         };
-        let decoded = match lane.what {
-            What::Frames { nine_digits } => {
-                let time = Timestamp { nanos: log_time, nine_digits };
-                CanFrame::decode(message, time).map(|frame| Entry::Frame(frame.0))
+        let unreadable = |why: &str| unreadable(topic, log_time, message, why);
+        let decoded = match *what {
+            What::Counted(place) => {
+                let topic = self.extras.topics.get(place);
+                let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
+                return Item::Other(Other { topic, schema, nanos: log_time, message });
             }
-            What::Foreign(foreign) => foreign.decode(message, log_time, &lane.topic).map(Entry::Frame),
-            What::Notes => CaptureNote::decode(message, log_time).map(|note| {
+            What::InForce => Err("it is not looked at".to_owned()),
+            What::Frames { nine_digits } => within(message, LONGEST_FRAME).and_then(|message| {
+                let time = Timestamp { nanos: log_time, nine_digits };
+                let frame = CanFrame::decode(message, time);
+                frame.map(|frame| Entry::Frame(frame.0)).map_err(|error| error.to_string())
+            }),
+            What::Foreign(foreign) => within(message, LONGEST_FRAME).and_then(|message| {
+                let bus = topic.get(..topic.floor_char_boundary(LONGEST_BUS)).unwrap_or_default();
+                let frame = foreign.decode(message, log_time, bus);
+                frame.map(Entry::Frame).map_err(|error| error.to_string())
+            }),
+            What::Notes => within(message, LONGEST_NOTE).and_then(|message| {
+                let note = CaptureNote::decode(message, log_time).map_err(|error| error.to_string())?;
                 let mut note = note.0.into_owned();
                 if note.line > 0 && !self.any_frame {
                     note.nanos = 0;
                 }
-                Entry::Note(note)
+                Ok(Entry::Note(note))
             }),
-            What::Counted(_) | What::InForce => {
-                return unreadable("", log_time, message, "it is not looked at");
-            }
         };
-        match decoded {
-            Ok(entry) => {
-                self.any_frame |= matches!(entry, Entry::Frame(_));
-                entry
-            }
-            Err(error) => unreadable(&lane.topic, log_time, message, &error.to_string()),
-        }
+        let entry = decoded.unwrap_or_else(|why| unreadable(&why));
+        self.any_frame |= matches!(entry, Entry::Frame(_));
+        Item::Entry(entry)
     }
+}
+
+/// A message, unless it is too long for what it is to be.
+fn within(message: &[u8], longest: usize) -> Result<&[u8], String> {
+    if message.len() > longest {
+        return Err(format!("it has {} bytes, and may have {longest}", message.len()));
+    }
+    Ok(message)
 }
 
 /// A message that is not what its channel says.
 fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &str) -> Entry<'a> {
+    let topic = topic.get(..topic.floor_char_boundary(LONGEST_BUS)).unwrap_or_default();
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));
+    let message = message.get(..LONGEST_LINE).unwrap_or(message);
     Entry::Note(Note { kind, nanos, interface: "", line: 0, text: message })
 }
 

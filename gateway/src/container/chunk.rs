@@ -1,0 +1,191 @@
+//! A chunk: unpacked, checked, and then its records.
+
+use std::fmt;
+use std::io::Read;
+
+use zstd::zstd_safe::{self, DCtx, ErrorCode, get_error_name};
+
+use super::field::Fields;
+use super::{Damage, LONGEST};
+
+/// What may come out of a file's chunks in all, whatever its length.
+const FREE_BYTES: u64 = 256 << 20;
+/// What may come out of a byte of the file, besides.
+const BYTES_A_BYTE: u64 = 1_000;
+/// Records that may come out of a file's chunks in all, whatever its length.
+const FREE_RECORDS: u64 = 1 << 20;
+/// Records that may come out of a byte of the file, besides; each should cost its entry in an index, 16 bytes.
+const RECORDS_A_BYTE: u64 = 2;
+/// Bytes of a record in a chunk beside its own.
+const HEAD: usize = 9;
+
+/// The chunk that was unpacked last. Nothing of it is handed out before all of it was checked: its length, its
+/// checksum, and that its records end where it does.
+pub struct Chunk {
+    bytes: Vec<u8>,
+    /// Where its next record begins.
+    at: usize,
+    /// How long the one before it is.
+    body: usize,
+    /// Of all chunks so far.
+    total_bytes: u64,
+    total_records: u64,
+    zstd: Option<DCtx<'static>>,
+}
+
+impl fmt::Debug for Chunk {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Chunk")
+            .field("bytes", &self.bytes.len())
+            .field("at", &self.at)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Default for Chunk {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Chunk {
+    /// None yet.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { bytes: Vec::new(), at: 0, body: 0, total_bytes: 0, total_records: 0, zstd: None }
+    }
+
+    /// Unpacks a chunk record; `read` is how many bytes of its file were read so far.
+    ///
+    /// # Errors
+    /// When anything is wrong with it: then it has no records.
+    pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), Damage> {
+        self.rewind();
+        let unpacked = self.open(record, read);
+        if unpacked.is_err() {
+            self.bytes.clear();
+        }
+        unpacked
+    }
+
+    /// The next record: its operation code, and its bytes.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "a record borrows from the chunk; an iterator's cannot"
+    )]
+    pub fn next(&mut self) -> Option<(u8, &[u8])> {
+        let (opcode, body, rest) = split(self.bytes.get(self.at..)?)?.ok()?;
+        (self.at, self.body) = (self.bytes.len() - rest, body.len());
+        Some((opcode, body))
+    }
+
+    /// The bytes of the record that was the last one.
+    #[must_use]
+    pub fn body(&self) -> &[u8] {
+        self.bytes.get(self.at - self.body..self.at).unwrap_or_default()
+    }
+
+    /// Goes back to the first record.
+    pub const fn rewind(&mut self) {
+        (self.at, self.body) = (0, 0);
+    }
+
+    fn open(&mut self, record: &[u8], read: u64) -> Result<(), Damage> {
+        let mut from = Fields::new("chunk", record);
+        from.u64("start time")?;
+        from.u64("end time")?;
+        let claimed = from.u64("uncompressed size")?;
+        let saved = from.u32("checksum")?;
+        let compression = from.text("compression")?;
+        let packed = from.u64("compressed size")?;
+        let packed = from.bytes(packed, "records")?;
+        if claimed > LONGEST {
+            return Err(Damage::Long { what: "chunk, unpacked,", bytes: claimed, limit: LONGEST });
+        }
+        let limit = FREE_BYTES.saturating_add(read.saturating_mul(BYTES_A_BYTE));
+        self.total_bytes = self.total_bytes.saturating_add(claimed);
+        if self.total_bytes > limit {
+            return Err(Damage::Bomb { read, limit, what: "bytes" });
+        }
+        self.bytes.clear();
+        match compression {
+            "" => self.bytes.extend_from_slice(packed),
+            "zstd" => self.unpack_zstd(packed, claimed)?,
+            "lz4" => self.unpack_lz4(packed, claimed)?,
+            other => return Err(Damage::Compression(other.chars().take(20).collect())),
+        }
+        let found = self.bytes.len() as u64;
+        if found != claimed {
+            return Err(Damage::Unpacked { claimed, found });
+        }
+        if saved != 0 {
+            let found = crc32fast::hash(&self.bytes);
+            if found != saved {
+                return Err(Damage::Checksum { what: "a chunk", saved, found });
+            }
+        }
+        let mut rest = self.bytes.as_slice();
+        while let Some(record) = split(rest) {
+            let (_, _, left) = record?;
+            rest = rest.get(rest.len() - left..).unwrap_or_default();
+            self.total_records += 1;
+        }
+        let limit = FREE_RECORDS.saturating_add(read.saturating_mul(RECORDS_A_BYTE));
+        if self.total_records > limit {
+            return Err(Damage::Bomb { read, limit, what: "records" });
+        }
+        Ok(())
+    }
+
+    /// Frame by frame into one buffer, so that no window of a frame's own choice is needed.
+    fn unpack_zstd(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
+        let wrong = |code: ErrorCode| Damage::Unpack(get_error_name(code).to_owned());
+        let context = self.zstd.get_or_insert_with(DCtx::create);
+        while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
+            let frame = zstd_safe::find_frame_compressed_size(packed).map_err(wrong)?;
+            let (frame, rest) = packed.split_at_checked(frame).unwrap_or((packed, &[]));
+            packed = rest;
+            let room = usize::try_from(claimed).unwrap_or(0) - self.bytes.len();
+            // Memory that is not written to is none: what a small chunk claims costs nothing.
+            if self.bytes.is_empty() {
+                self.bytes.reserve_exact(room);
+                context.decompress(&mut self.bytes, frame).map_err(wrong)?;
+            } else {
+                let mut more = Vec::with_capacity(room);
+                context.decompress(&mut more, frame).map_err(wrong)?;
+                self.bytes.append(&mut more);
+            }
+        }
+        Ok(())
+    }
+
+    fn unpack_lz4(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
+        let wrong = |error: std::io::Error| Damage::Unpack(error.to_string());
+        while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
+            let before = (packed.len(), self.bytes.len());
+            let mut decoder = lz4::Decoder::new(packed).map_err(wrong)?;
+            let left = claimed - self.bytes.len() as u64;
+            (&mut decoder).take(left).read_to_end(&mut self.bytes).map_err(wrong)?;
+            packed = decoder.finish().0;
+            if before == (packed.len(), self.bytes.len()) {
+                break;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The first of some records: its operation code, its bytes, and how many are left behind it.
+fn split(records: &[u8]) -> Option<Result<(u8, &[u8], usize), Damage>> {
+    if records.is_empty() {
+        return None;
+    }
+    let left = records.len() as u64;
+    let Some((&[opcode, ref length @ ..], rest)) = records.split_first_chunk::<HEAD>() else {
+        return Some(Err(Damage::Overrun { bytes: HEAD as u64, left }));
+    };
+    let bytes = u64::from_le_bytes(*length);
+    let whole = usize::try_from(bytes).ok().and_then(|bytes| rest.split_at_checked(bytes));
+    let whole = whole.ok_or(Damage::Overrun { bytes, left: rest.len() as u64 });
+    Some(whole.map(|(body, rest)| (opcode, body, rest.len())))
+}

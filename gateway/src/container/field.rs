@@ -1,0 +1,227 @@
+//! What a record says.
+
+use mcap::records::op;
+
+use super::{Damage, LONGEST_DESCRIPTION};
+
+/// A record, as far as readers of recordings want to know it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Record<'a> {
+    /// How a file begins.
+    Header {
+        /// What conventions it follows.
+        profile: &'a str,
+        /// Who wrote it.
+        library: &'a str,
+    },
+    /// A type of messages.
+    Schema {
+        /// Its number.
+        id: u16,
+        /// Its name.
+        name: &'a str,
+        /// The language of its definition.
+        encoding: &'a str,
+        /// Its definition.
+        data: &'a [u8],
+    },
+    /// A topic.
+    Channel {
+        /// Its number.
+        id: u16,
+        /// The number of its messages' type; 0 when they have none.
+        schema: u16,
+        /// Its name.
+        topic: &'a str,
+        /// How its messages are encoded.
+        encoding: &'a str,
+        /// What else is said of it.
+        facts: Facts<'a>,
+    },
+    /// A message.
+    Message {
+        /// The number of its channel.
+        channel: u16,
+        /// Its number there.
+        sequence: u32,
+        /// When it was recorded, in ns.
+        log_time: u64,
+        /// When it was sent, in ns.
+        publish_time: u64,
+        /// What it says.
+        data: &'a [u8],
+    },
+    /// A file in the file.
+    Attachment {
+        /// When it was recorded, in ns.
+        log_time: u64,
+        /// When it was made, in ns.
+        create_time: u64,
+        /// Its name.
+        name: &'a str,
+        /// Its media type.
+        media_type: &'a str,
+        /// Its bytes.
+        data: &'a [u8],
+    },
+    /// Facts under a name.
+    Metadata {
+        /// The name.
+        name: &'a str,
+        /// The facts.
+        facts: Facts<'a>,
+    },
+    /// The end of what was recorded.
+    DataEnd {
+        /// The checksum of everything before it; 0 when there is none.
+        crc: u32,
+    },
+    /// Anything else: indexes, statistics, chunks, what is not known.
+    Other,
+}
+
+/// Keys and values, as they stand in the file: whole, and UTF-8.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Facts<'a>(&'a [u8]);
+
+impl<'a> Facts<'a> {
+    /// One after the other.
+    pub fn iter(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
+        let mut rest = Fields { record: "", bytes: 0, rest: self.0 };
+        std::iter::from_fn(move || Some((rest.text("").ok()?, rest.text("").ok()?)))
+    }
+
+    /// The value of a key.
+    #[must_use]
+    pub fn get(&self, key: &str) -> Option<&'a str> {
+        self.iter().find(|(name, _)| *name == key).map(|(_, value)| value)
+    }
+}
+
+/// A record's fields, one after the other.
+#[derive(Clone, Copy)]
+pub(super) struct Fields<'a> {
+    record: &'static str,
+    bytes: usize,
+    pub(super) rest: &'a [u8],
+}
+
+impl<'a> Fields<'a> {
+    pub(super) const fn new(record: &'static str, body: &'a [u8]) -> Self {
+        Self { record, bytes: body.len(), rest: body }
+    }
+
+    fn short(&self, field: &'static str) -> Damage {
+        Damage::Short { record: self.record, bytes: self.bytes, field }
+    }
+
+    fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], Damage> {
+        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.short(field))?;
+        self.rest = rest;
+        Ok(*head)
+    }
+
+    fn u16(&mut self, field: &'static str) -> Result<u16, Damage> {
+        self.array(field).map(u16::from_le_bytes)
+    }
+
+    pub(super) fn u32(&mut self, field: &'static str) -> Result<u32, Damage> {
+        self.array(field).map(u32::from_le_bytes)
+    }
+
+    pub(super) fn u64(&mut self, field: &'static str) -> Result<u64, Damage> {
+        self.array(field).map(u64::from_le_bytes)
+    }
+
+    /// So many bytes, which it must have.
+    pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], Damage> {
+        let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
+        let (bytes, rest) = split.ok_or_else(|| self.short(field))?;
+        self.rest = rest;
+        Ok(bytes)
+    }
+
+    pub(super) fn text(&mut self, field: &'static str) -> Result<&'a str, Damage> {
+        let bytes = self.u32(field)?;
+        let bytes = self.bytes(bytes.into(), field)?;
+        std::str::from_utf8(bytes).map_err(|_| Damage::Text { record: self.record, field })
+    }
+
+    fn facts(&mut self, field: &'static str) -> Result<Facts<'a>, Damage> {
+        let bytes = self.u32(field)?;
+        let facts = self.bytes(bytes.into(), field)?;
+        let mut all = Self { rest: facts, ..*self };
+        while !all.rest.is_empty() {
+            all.text(field)?;
+            all.text(field)?;
+        }
+        Ok(Facts(facts))
+    }
+}
+
+/// What a record says. Of a chunk, an index and the like nothing: [`Record::Other`].
+///
+/// # Errors
+/// When it is shorter than it says, longer than a description may be, or a name in it is not UTF-8.
+pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
+    let record = match opcode {
+        op::HEADER => "header",
+        op::SCHEMA => "schema",
+        op::CHANNEL => "channel",
+        op::MESSAGE => "message",
+        op::ATTACHMENT => "attachment",
+        op::METADATA => "metadata",
+        op::DATA_END => "data end",
+        _ => return Ok(Record::Other),
+    };
+    let describes = matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::METADATA);
+    if describes && body.len() > LONGEST_DESCRIPTION {
+        let (bytes, limit) = (body.len() as u64, LONGEST_DESCRIPTION as u64);
+        return Err(Damage::Long { what: record, bytes, limit });
+    }
+    let mut from = Fields::new(record, body);
+    Ok(match opcode {
+        op::HEADER => Record::Header { profile: from.text("profile")?, library: from.text("library")? },
+        op::SCHEMA => {
+            let (id, name, encoding) = (from.u16("id")?, from.text("name")?, from.text("encoding")?);
+            let bytes = from.u32("definition")?;
+            Record::Schema { id, name, encoding, data: from.bytes(bytes.into(), "definition")? }
+        }
+        op::CHANNEL => Record::Channel {
+            id: from.u16("id")?,
+            schema: from.u16("schema id")?,
+            topic: from.text("topic")?,
+            encoding: from.text("message encoding")?,
+            facts: from.facts("metadata")?,
+        },
+        op::MESSAGE => Record::Message {
+            channel: from.u16("channel id")?,
+            sequence: from.u32("sequence")?,
+            log_time: from.u64("log time")?,
+            publish_time: from.u64("publish time")?,
+            data: from.rest,
+        },
+        op::ATTACHMENT => {
+            let (log_time, create_time) = (from.u64("log time")?, from.u64("create time")?);
+            let (name, media_type) = (from.text("name")?, from.text("media type")?);
+            let bytes = from.u64("data")?;
+            let data = from.bytes(bytes, "data")?;
+            let checked = body.get(..body.len() - from.rest.len()).unwrap_or_default();
+            let saved = from.u32("checksum")?;
+            let found = if saved == 0 { 0 } else { crc32fast::hash(checked) };
+            if saved != found {
+                return Err(Damage::Checksum { what: "an attachment", saved, found });
+            }
+            Record::Attachment { log_time, create_time, name, media_type, data }
+        }
+        op::METADATA => Record::Metadata { name: from.text("name")?, facts: from.facts("facts")? },
+        _ => Record::DataEnd { crc: from.u32("checksum")? },
+    })
+}
+
+/// The name of an attachment of which only the beginning is there; empty when not even that is.
+#[must_use]
+pub(super) fn attachment_name(beginning: &[u8]) -> &str {
+    let mut from = Fields::new("attachment", beginning);
+    from.u64("").and_then(|_| from.u64("")).and_then(|_| from.text("")).unwrap_or_default()
+}

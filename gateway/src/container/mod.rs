@@ -1,0 +1,103 @@
+//! The MCAP container as it is read: every byte of a file that somebody else may have written goes through here.
+//!
+//! ```text
+//!   input ─> Source: records, framed ─┬─> parse: what a record says
+//!                                     └─> Chunk: unpacked, checked ─> records, framed ─> parse
+//! ```
+//!
+//! A length that a file claims is compared with what is there before anything is done with it, and nothing is allocated
+//! by a claim alone. The crate `mcap` writes files; it reads none here.
+
+mod chunk;
+mod field;
+mod source;
+
+pub use chunk::Chunk;
+pub use field::{Facts, Record, parse};
+pub use source::{Framed, Source, find};
+
+use thiserror::Error;
+
+/// The first and the last bytes of a file.
+pub const MAGIC: &[u8] = mcap::MAGIC;
+/// The longest record that is taken into memory, and the most that a chunk may unpack to; ours have 256 KiB, and those
+/// of other writers a few MiB.
+pub const LONGEST: u64 = 128 << 20;
+/// The longest record that describes something: a schema, a channel, metadata.
+pub const LONGEST_DESCRIPTION: usize = 4 << 20;
+
+/// What is wrong with a record or a chunk.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum Damage {
+    /// A length in it leads beyond its end.
+    #[error("a {record} record of {bytes} bytes ends within its {field}")]
+    Short {
+        /// The kind of record.
+        record: &'static str,
+        /// Its length.
+        bytes: usize,
+        /// The field.
+        field: &'static str,
+    },
+    /// A name is not UTF-8.
+    #[error("the {field} of a {record} record is not UTF-8")]
+    Text {
+        /// The kind of record.
+        record: &'static str,
+        /// The field.
+        field: &'static str,
+    },
+    /// It is longer than anything that is read.
+    #[error("a {what} of {bytes} bytes is too long: at most {limit} are read")]
+    Long {
+        /// What it is.
+        what: &'static str,
+        /// Its length.
+        bytes: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// A checksum is wrong.
+    #[error("the checksum of {what} is {saved:08x} in the file, and {found:08x} by its bytes")]
+    Checksum {
+        /// What was checked.
+        what: &'static str,
+        /// As the file has it.
+        saved: u32,
+        /// As it should be.
+        found: u32,
+    },
+    /// A compression that nobody here knows.
+    #[error("a chunk is compressed by {0:?}: zstd, lz4 and none are read")]
+    Compression(String),
+    /// The compressed bytes make no sense.
+    #[error("a chunk cannot be unpacked: {0}")]
+    Unpack(String),
+    /// A chunk unpacks to another length than it says.
+    #[error("a chunk unpacks to {found} bytes, not to the {claimed} that it claims")]
+    Unpacked {
+        /// By its header.
+        claimed: u64,
+        /// In truth.
+        found: u64,
+    },
+    /// A record reaches beyond its chunk.
+    #[error("a record of {bytes} bytes in a chunk has {left} bytes left there")]
+    Overrun {
+        /// Its length.
+        bytes: u64,
+        /// What is left of the chunk.
+        left: u64,
+    },
+    /// Far more comes out than went in.
+    #[error("{read} bytes unpack to more than {limit} {what}")]
+    Bomb {
+        /// Bytes that were read.
+        read: u64,
+        /// The limit.
+        limit: u64,
+        /// Bytes or records.
+        what: &'static str,
+    },
+}

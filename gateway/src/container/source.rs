@@ -1,0 +1,184 @@
+//! Records of a file, one after the other.
+
+use std::io::{self, BufReader, Read, Seek};
+
+use mcap::records::op;
+
+use super::field::attachment_name;
+use super::{LONGEST, MAGIC};
+use crate::capture::log::read_some;
+
+/// Bytes that are kept of a record that is longer than anything that is taken into memory.
+const BEGINNING: u64 = 64 << 10;
+
+/// What comes next in a file.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Framed {
+    /// A record of this operation code, in [`Source::body`].
+    Record(u8),
+    /// A record of this operation code and length that is too long for memory; its beginning is in [`Source::body`].
+    Long(u8, u64),
+    /// So many bytes of a record that is not whole, and nothing behind them. 0 when the file ends between two records.
+    End(u64),
+}
+
+/// The records of an input, framed. Only what is looked at by anybody is taken into memory: indexes, statistics and
+/// records that are not known are passed over.
+#[derive(Debug)]
+pub struct Source<R> {
+    input: R,
+    body: Vec<u8>,
+    /// Bytes that came.
+    read: u64,
+    /// The longest attachment that is taken into memory.
+    attachments: u64,
+    /// Of everything before the end of the data section.
+    checksum: Option<crc32fast::Hasher>,
+}
+
+impl<R: Read> Source<R> {
+    /// Reads from an input, attachments of so many bytes at most.
+    pub fn new(input: R, attachments: u64) -> Self {
+        let checksum = Some(crc32fast::Hasher::new());
+        Self { input, body: Vec::new(), read: 0, attachments, checksum }
+    }
+
+    /// Takes the magic bytes of the beginning or the end into [`Source::body`]; whether they are there.
+    ///
+    /// # Errors
+    /// When the input fails.
+    pub fn magic(&mut self) -> io::Result<bool> {
+        self.body.clear();
+        self.take(MAGIC.len() as u64)?;
+        self.update();
+        Ok(self.body == MAGIC)
+    }
+
+    /// The record that was read last, without its operation code and length.
+    #[must_use]
+    pub fn body(&self) -> &[u8] {
+        &self.body
+    }
+
+    /// Bytes so far.
+    #[must_use]
+    pub const fn read(&self) -> u64 {
+        self.read
+    }
+
+    /// The name of an attachment that is too long.
+    #[must_use]
+    pub fn attachment_name(&self) -> &str {
+        attachment_name(&self.body)
+    }
+
+    /// The checksum of all before the end of the data section, when that has come; once.
+    pub fn data_checksum(&mut self) -> Option<u32> {
+        self.checksum.take().map(crc32fast::Hasher::finalize)
+    }
+
+    /// The next record that anybody looks at.
+    ///
+    /// # Errors
+    /// When the input fails.
+    pub fn next(&mut self) -> io::Result<Framed> {
+        loop {
+            let began = self.read;
+            self.body.clear();
+            self.take(9)?;
+            let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
+                return Ok(Framed::End(self.read - began));
+            };
+            let length = u64::from_le_bytes(*length);
+            if opcode != op::DATA_END {
+                self.update();
+            }
+            self.body.clear();
+            let limit = match opcode {
+                op::ATTACHMENT => self.attachments,
+                op::HEADER
+                | op::FOOTER
+                | op::SCHEMA
+                | op::CHANNEL
+                | op::MESSAGE
+                | op::CHUNK
+                | op::METADATA
+                | op::DATA_END => LONGEST,
+                _ => 0,
+            };
+            let is_long = length > limit;
+            let kept = if is_long { limit.min(BEGINNING) } else { length };
+            let mut there = self.take(kept)? == kept;
+            if opcode != op::DATA_END {
+                self.update();
+            }
+            if is_long && there {
+                there = self.pass_over(length - kept)?;
+            }
+            if !there {
+                return Ok(Framed::End(self.read - began));
+            }
+            match (is_long, limit) {
+                (false, _) => return Ok(Framed::Record(opcode)),
+                (true, 1..) => return Ok(Framed::Long(opcode, length)),
+                (true, 0) => {}
+            }
+        }
+    }
+
+    /// Reads so many bytes behind those that are there, or what there is; it grows with that, not with what was asked
+    /// for.
+    fn take(&mut self, bytes: u64) -> io::Result<u64> {
+        let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)? as u64;
+        self.read += came;
+        Ok(came)
+    }
+
+    fn update(&mut self) {
+        if let Some(checksum) = &mut self.checksum {
+            checksum.update(&self.body);
+        }
+    }
+
+    /// Reads so many bytes without keeping them; whether they were there.
+    fn pass_over(&mut self, bytes: u64) -> io::Result<bool> {
+        let mut left = bytes;
+        let mut piece = [0; 8 << 10];
+        while left > 0 {
+            let most = usize::try_from(left).map_or(piece.len(), |left| left.min(piece.len()));
+            let room = piece.get_mut(..most).unwrap_or_default();
+            let came = read_some(&mut self.input, room)?;
+            let Some(came @ [_, ..]) = room.get(..came) else { return Ok(false) };
+            if let Some(checksum) = &mut self.checksum {
+                checksum.update(came);
+            }
+            self.read += came.len() as u64;
+            left -= came.len() as u64;
+        }
+        Ok(true)
+    }
+}
+
+/// Goes to the next record of one of these kinds, without reading what is before it; its operation code and length.
+///
+/// # Errors
+/// When the input fails.
+pub fn find<R: Read + Seek>(input: &mut BufReader<R>, wanted: &[u8]) -> io::Result<Option<(u8, u64)>> {
+    loop {
+        let mut head = [0; 9];
+        match input.read_exact(&mut head) {
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => return Ok(None),
+            done => done?,
+        }
+        let [opcode, length @ ..] = head;
+        let length = u64::from_le_bytes(length);
+        if wanted.contains(&opcode) {
+            return Ok(Some((opcode, length)));
+        }
+        // A length that leads beyond everything.
+        let Ok(length) = i64::try_from(length) else { return Ok(None) };
+        if input.seek_relative(length).is_err() {
+            return Ok(None);
+        }
+    }
+}
