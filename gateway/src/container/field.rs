@@ -1,5 +1,7 @@
 //! What a record says.
 
+use std::collections::BTreeMap;
+
 use mcap::records::op;
 
 use super::{Damage, LONGEST_DESCRIPTION};
@@ -95,6 +97,32 @@ impl<'a> Facts<'a> {
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&'a str> {
         self.iter().find(|(name, _)| *name == key).map(|(_, value)| value)
+    }
+}
+
+impl From<Facts<'_>> for BTreeMap<String, String> {
+    fn from(facts: Facts<'_>) -> Self {
+        facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned())).collect()
+    }
+}
+
+/// What is kept of the names in a file, which whoever wrote it may have made as long and as many as they liked.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Names(usize);
+
+impl Names {
+    /// What keeping a name costs beside its bytes.
+    pub const ENTRY: usize = 128;
+    /// All of them together.
+    const LIMIT: usize = 32 << 20;
+
+    /// Makes sure that there is room for another one, of so many bytes.
+    ///
+    /// # Errors
+    /// When there is not.
+    pub fn add(&mut self, bytes: usize) -> Result<(), Damage> {
+        self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY);
+        if self.0 > Self::LIMIT { Err(Damage::Names { limit: Self::LIMIT }) } else { Ok(()) }
     }
 }
 

@@ -13,7 +13,7 @@ mod field;
 mod source;
 
 pub use chunk::Chunk;
-pub use field::{Facts, Record, parse};
+pub use field::{Facts, Names, Record, parse};
 pub use source::{Framed, Source, find};
 
 use thiserror::Error;
@@ -89,6 +89,12 @@ pub enum Damage {
         bytes: u64,
         /// What is left of the chunk.
         left: u64,
+    },
+    /// Names of topics and types.
+    #[error("the names of its topics and types are too long: at most {limit} bytes are read")]
+    Names {
+        /// The limit.
+        limit: usize,
     },
     /// Far more comes out than went in.
     #[error("{read} bytes unpack to more than {limit} {what}")]

@@ -9,23 +9,23 @@
 //! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and said; what
 //! follows it is kept.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io::{self, Read, Write};
 
-use mcap::records::{AttachmentHeader, Channel, Record, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::write::NoSeek;
-use mcap::{Attachment, MAGIC, McapError, Writer, parse_record};
+use mcap::records::{MessageHeader, op};
+use mcap::write::{Metadata, NoSeek};
+use mcap::{Attachment, McapError, Writer};
 use thiserror::Error;
 
 use super::TOPIC_OF_BUS;
 use super::file::{io_error, options};
+use crate::container::{Chunk, Damage, Framed, MAGIC, Names, Record, Source, parse};
 use crate::ros2::Message;
 use crate::ros2::messages::CanFrame;
 
-/// No record is longer: it would be a length that is no length.
-const LONGEST: u64 = 1 << 30;
+/// The longest attachment that is copied.
+const LONGEST_ATTACHMENT: u64 = 1 << 30;
 
 /// What a recovery came to.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -102,89 +102,59 @@ fn hex(bytes: &[u8]) -> String {
     if digits.is_empty() { "nothing".to_owned() } else { digits.join(" ") }
 }
 
-/// A file's records, one after the other, with what is left of it when they end.
-struct Records<R> {
-    from: R,
-    body: Vec<u8>,
-    unfinished: u64,
-}
-
-impl<R: Read> Records<R> {
-    /// The next whole record, into `body`; its operation code.
-    fn next(&mut self) -> io::Result<Option<u8>> {
-        let mut head = [0; 9];
-        let came = read_up_to(&mut self.from, &mut head)?;
-        let ([code, len @ ..], true) = (head, came == head.len()) else {
-            self.unfinished = came as u64;
-            return Ok(None);
-        };
-        let len = u64::from_le_bytes(len);
-        self.body.clear();
-        // Grows with what is there, not with what a damaged length says.
-        let came = (&mut self.from).take(len.min(LONGEST)).read_to_end(&mut self.body)? as u64;
-        if came < len {
-            self.unfinished = head.len() as u64 + came + io::copy(&mut self.from, &mut io::sink())?;
-            return Ok(None);
-        }
-        Ok(Some(code))
-    }
-}
-
-fn read_up_to(from: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
-    let mut count = 0;
-    while let Some(rest) = buffer.get_mut(count..).filter(|rest| !rest.is_empty()) {
-        match from.read(rest) {
-            Ok(0) => break,
-            Ok(read) => count += read,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            Err(error) => return Err(error),
-        }
-    }
-    Ok(count)
-}
-
 /// Copies everything whole into a new file, and ends it.
 ///
 /// # Errors
 /// When there is nothing to keep, or a file fails.
 pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverError> {
-    let mut records = Records { from, body: Vec::new(), unfinished: 0 };
-    let mut magic = [0; MAGIC.len()];
-    let came = read_up_to(&mut records.from, &mut magic).map_err(RecoverError::Read)?;
-    let began = magic.get(..came).unwrap_or_default();
-    if !MAGIC.starts_with(began) {
-        return Err(RecoverError::NoMcap { got: began.to_vec() });
+    let mut source = Source::new(from, LONGEST_ATTACHMENT);
+    if !source.magic().map_err(RecoverError::Read)? && !MAGIC.starts_with(source.body()) {
+        return Err(RecoverError::NoMcap { got: source.body().to_vec() });
     }
+    let mut chunk = Chunk::new();
     let mut copy = None;
     let mut out = Some(out);
     let mut recovered = Recovered::default();
-    while let Some(code) = records.next().map_err(RecoverError::Read)? {
-        if code == op::HEADER
+    loop {
+        let framed = source.next().map_err(RecoverError::Read)?;
+        if framed == Framed::Record(op::HEADER)
             && let Some(out) = out.take()
         {
-            copy = Some(Copy::new(&records.body, out).map_err(RecoverError::Write)?);
+            copy = Some(Copy::new(source.body(), out).map_err(RecoverError::Write)?);
+            continue;
         }
-        let Some(copy) = &mut copy else { continue };
-        match code {
-            op::CHUNK => match copy.chunk(&records.body) {
-                Ok(()) => {}
-                Err(Failed::Damaged) => {
-                    recovered.damaged.0 += 1;
-                    recovered.damaged.1 += records.body.len() as u64;
-                }
-                Err(Failed::Write(error)) => return Err(RecoverError::Write(error)),
-            },
-            op::DATA_END => {
-                // What follows is made anew.
-                recovered.whole = ends_well(&mut records).map_err(RecoverError::Read)?;
+        let kept = match (framed, &mut copy) {
+            (Framed::End(bytes), _) => {
+                recovered.unfinished = bytes;
                 break;
             }
-            _ => copy.record(code, &records.body).map_err(RecoverError::Write)?,
+            (Framed::Record(op::DATA_END), Some(_)) => {
+                // What follows is made anew.
+                recovered.whole = ends_well(&mut source).map_err(RecoverError::Read)?;
+                break;
+            }
+            (_, None) => continue,
+            (Framed::Record(op::CHUNK), Some(copy)) => chunk
+                .unpack(source.body(), source.read())
+                .map_err(Failed::from)
+                .and_then(|()| copy.chunk(&mut chunk)),
+            (Framed::Record(code), Some(copy)) => copy.record(code, source.body()),
+            (Framed::Long(..), Some(_)) => Err(Failed::Damaged),
+        };
+        match kept {
+            Ok(()) => {}
+            Err(Failed::Damaged) => {
+                recovered.damaged.0 += 1;
+                recovered.damaged.1 += match framed {
+                    Framed::Long(_, bytes) => bytes,
+                    _ => source.body().len() as u64,
+                };
+            }
+            Err(Failed::Write(error)) => return Err(RecoverError::Write(error)),
         }
     }
-    let Some(mut copy) = copy else { return Err(RecoverError::Empty(came as u64 + records.unfinished)) };
+    let Some(mut copy) = copy else { return Err(RecoverError::Empty(source.read())) };
     copy.writer.finish().map_err(|error| RecoverError::Write(io_error(error)))?;
-    recovered.unfinished = records.unfinished;
     recovered.homeless = copy.homeless;
     recovered.messages = copy.messages;
     recovered.frames = copy.frames;
@@ -192,34 +162,37 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
     Ok(recovered)
 }
 
-/// Whether summary, footer and magic follow.
-fn ends_well(records: &mut Records<impl Read>) -> io::Result<bool> {
-    while let Some(code) = records.next()? {
-        if code == op::FOOTER {
-            let mut magic = [0; MAGIC.len()];
-            return Ok(read_up_to(&mut records.from, &mut magic)? == magic.len() && magic == MAGIC);
+/// Whether summary, footer and magic follow. An index that breaks off is no loss: the new file has its own.
+fn ends_well(source: &mut Source<impl Read>) -> io::Result<bool> {
+    loop {
+        match source.next()? {
+            Framed::Record(op::FOOTER) => return source.magic(),
+            Framed::End(_) => return Ok(false),
+            Framed::Record(_) | Framed::Long(..) => {}
         }
     }
-    // The index that breaks off is no loss: the new file has its own.
-    records.unfinished = 0;
-    Ok(false)
 }
 
-/// Why a chunk is not in the new file.
+/// Why a record or a chunk is not in the new file.
 enum Failed {
     Damaged,
     Write(io::Error),
 }
 
+impl From<Damage> for Failed {
+    fn from(_: Damage) -> Self {
+        Self::Damaged
+    }
+}
+
 struct Copy<W: Write> {
     writer: Writer<NoSeek<W>>,
-    /// Schemas of frames.
-    frame_schemas: BTreeSet<u16>,
-    /// Channels whose messages are frames.
-    can: BTreeSet<u16>,
+    /// Schemas, and which of them are those of frames.
+    schemas: BTreeMap<u16, bool>,
+    /// Channels, and whether their messages are frames.
+    channels: BTreeMap<u16, bool>,
+    names: Names,
     homeless: u64,
-    /// A chunk's records, held until all of them are known to be right.
-    held: Vec<Record<'static>>,
     messages: u64,
     frames: u64,
     last_nanos: u64,
@@ -227,102 +200,39 @@ struct Copy<W: Write> {
 
 impl<W: Write> Copy<W> {
     fn new(header: &[u8], out: W) -> io::Result<Self> {
-        let profile = match parse_record(op::HEADER, header) {
-            Ok(Record::Header(header)) => header.profile,
-            _ => String::new(),
+        let profile = match parse(op::HEADER, header) {
+            Ok(Record::Header { profile, .. }) => profile,
+            _ => "",
         };
         let writer = options().profile(profile).create(NoSeek::new(out)).map_err(io_error)?;
-        let (frame_schemas, can, held) = (BTreeSet::new(), BTreeSet::new(), Vec::new());
-        Ok(Self { writer, frame_schemas, can, homeless: 0, held, messages: 0, frames: 0, last_nanos: 0 })
+        Ok(Self {
+            writer,
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            names: Names::default(),
+            homeless: 0,
+            messages: 0,
+            frames: 0,
+            last_nanos: 0,
+        })
     }
 
     /// A chunk's records, if all of them are right.
-    fn chunk(&mut self, body: &[u8]) -> Result<(), Failed> {
-        self.held.clear();
-        let options = LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_skip_end_magic(true)
-            .with_prevalidate_chunk_crcs(true);
-        let mut reader = LinearReader::new_with_options(options);
-        let head = [&[op::CHUNK][..], &(body.len() as u64).to_le_bytes()].concat();
-        let mut rest = head.chain(body);
-        while let Some(event) = reader.next_event() {
-            match event.map_err(|_| Failed::Damaged)? {
-                LinearReadEvent::ReadRequest(need) => {
-                    let came = rest.read(reader.insert(need)).map_err(|_| Failed::Damaged)?;
-                    reader.notify_read(came);
-                    if came == 0 {
-                        break;
-                    }
-                }
-                LinearReadEvent::Record { data, opcode } => {
-                    let record = parse_record(opcode, data).map_err(|_| Failed::Damaged)?;
-                    self.held.push(record.into_owned());
-                }
-            }
+    fn chunk(&mut self, chunk: &mut Chunk) -> Result<(), Failed> {
+        while let Some((code, body)) = chunk.next() {
+            parse(code, body)?;
         }
-        for record in std::mem::take(&mut self.held) {
-            self.keep(record).map_err(Failed::Write)?;
+        chunk.rewind();
+        while let Some((code, body)) = chunk.next() {
+            self.record(code, body)?;
         }
         Ok(())
     }
 
-    /// A record outside of chunks.
-    fn record(&mut self, code: u8, body: &[u8]) -> io::Result<()> {
-        match parse_record(code, body) {
-            Ok(record) => self.keep(record.into_owned()),
-            // Nothing that a reader could use; what follows it may be.
-            Err(_) => Ok(()),
-        }
-    }
-
-    fn keep(&mut self, record: Record<'_>) -> io::Result<()> {
-        let writer = &mut self.writer;
-        let kept = match record {
-            Record::Schema { header, data } => {
-                if header.name == CanFrame::TYPE {
-                    self.frame_schemas.insert(header.id);
-                }
-                writer.add_schema_with_id(header.id, &header.name, &header.encoding, &data).map(|_| ())
-            }
-            Record::Channel(channel) => {
-                if self.frame_schemas.contains(&channel.schema_id) && channel.topic.starts_with(TOPIC_OF_BUS)
-                {
-                    self.can.insert(channel.id);
-                }
-                let Channel { id, schema_id, topic, message_encoding, metadata } = channel;
-                writer.add_channel_with_id(id, schema_id, &topic, &message_encoding, &metadata).map(|_| ())
-            }
-            Record::Message { header, data } => {
-                let written = writer.write_to_known_channel(&header, &data);
-                if written.is_ok() {
-                    self.messages += 1;
-                    self.frames += u64::from(self.can.contains(&header.channel_id));
-                    self.last_nanos = self.last_nanos.max(header.log_time);
-                }
-                written
-            }
-            Record::Attachment {
-                header: AttachmentHeader { log_time, create_time, name, media_type },
-                data,
-                ..
-            } => writer.attach(&Attachment { log_time, create_time, name, media_type, data }),
-            Record::Metadata(metadata) => writer.write_metadata(&metadata),
-            // Made anew, or of no file of ours.
-            Record::Header(_)
-            | Record::Footer(_)
-            | Record::Chunk { .. }
-            | Record::MessageIndex(_)
-            | Record::ChunkIndex(_)
-            | Record::AttachmentIndex(_)
-            | Record::Statistics(_)
-            | Record::MetadataIndex(_)
-            | Record::SummaryOffset(_)
-            | Record::DataEnd(_)
-            | Record::Unknown { .. } => Ok(()),
-        };
-        match kept {
-            Err(McapError::Io(error)) => Err(error),
+    fn record(&mut self, code: u8, body: &[u8]) -> Result<(), Failed> {
+        let record = parse(code, body)?;
+        match self.keep(&record)? {
+            Err(McapError::Io(error)) => Err(Failed::Write(error)),
             // Its channel or its schema stood in what is lost.
             Err(_) => {
                 self.homeless += 1;
@@ -330,5 +240,46 @@ impl<W: Write> Copy<W> {
             }
             Ok(()) => Ok(()),
         }
+    }
+
+    fn keep(&mut self, record: &Record<'_>) -> Result<Result<(), McapError>, Damage> {
+        let writer = &mut self.writer;
+        Ok(match *record {
+            Record::Schema { id, name, encoding, data } => {
+                if !self.schemas.contains_key(&id) {
+                    self.names.add(name.len() + encoding.len() + data.len())?;
+                    self.schemas.insert(id, name == CanFrame::TYPE);
+                }
+                writer.add_schema_with_id(id, name, encoding, data).map(|_| ())
+            }
+            Record::Channel { id, schema, topic, encoding, facts } => {
+                if !self.channels.contains_key(&id) {
+                    self.names.add(topic.len() + encoding.len())?;
+                    facts.iter().try_for_each(|(key, value)| self.names.add(key.len() + value.len()))?;
+                    let frames = self.schemas.get(&schema).is_some_and(|frames| *frames);
+                    self.channels.insert(id, frames && topic.starts_with(TOPIC_OF_BUS));
+                }
+                writer.add_channel_with_id(id, schema, topic, encoding, &facts.into()).map(|_| ())
+            }
+            Record::Message { channel, sequence, log_time, publish_time, data } => {
+                let header = MessageHeader { channel_id: channel, sequence, log_time, publish_time };
+                let written = writer.write_to_known_channel(&header, data);
+                if written.is_ok() {
+                    self.messages += 1;
+                    self.frames += u64::from(self.channels.get(&channel).is_some_and(|frames| *frames));
+                    self.last_nanos = self.last_nanos.max(log_time);
+                }
+                written
+            }
+            Record::Attachment { log_time, create_time, name, media_type, data } => {
+                let (name, media_type) = (name.to_owned(), media_type.to_owned());
+                writer.attach(&Attachment { log_time, create_time, name, media_type, data: data.into() })
+            }
+            Record::Metadata { name, facts } => {
+                writer.write_metadata(&Metadata { name: name.to_owned(), metadata: facts.into() })
+            }
+            // Made anew, or of no file of ours.
+            Record::Header { .. } | Record::DataEnd { .. } | Record::Other => Ok(()),
+        })
     }
 }

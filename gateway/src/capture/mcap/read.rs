@@ -9,7 +9,7 @@ use protocol::candump::Timestamp;
 use super::foreign::Foreign;
 use crate::capture::log::LONGEST as LONGEST_LINE;
 use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
-use crate::container::{Chunk, Damage, Facts, Framed, MAGIC, Record as Raw, Source, find, parse};
+use crate::container::{Chunk, Damage, Facts, Framed, MAGIC, Names, Record as Raw, Source, find, parse};
 use crate::record::TOPIC_OF_STATE;
 use crate::ros2::Message;
 use crate::ros2::messages::{CanFrame, CaptureNote};
@@ -18,10 +18,8 @@ use crate::ros2::messages::{CanFrame, CaptureNote};
 const PIECE: usize = 1 << 18;
 /// Bytes of attachments, metadata and frames in force that are kept.
 const KEPT: usize = 16 << 20;
-/// Bytes of names of topics and types.
-const NAMES: usize = 32 << 20;
-/// Bytes that a name, a fact or a frame costs beside its own.
-const ENTRY: usize = 128;
+/// Bytes that a file, a fact or a frame costs beside its own.
+const ENTRY: usize = Names::ENTRY;
 /// The longest message that is a frame.
 const LONGEST_FRAME: usize = 4 << 10;
 /// The longest message that is a note: a line and its place.
@@ -75,8 +73,7 @@ struct State {
     channels: HashMap<u16, Lane>,
     /// The places of topics that are only counted, by name and type.
     counted: HashMap<(String, String), usize>,
-    /// Bytes of names so far.
-    names: usize,
+    names: Names,
     extras: Extras,
     /// Bytes of attachments and metadata so far.
     kept: usize,
@@ -228,7 +225,7 @@ impl State {
             schemas: HashMap::new(),
             channels: HashMap::new(),
             counted: HashMap::new(),
-            names: 0,
+            names: Names::default(),
             extras: Extras::default(),
             kept: 0,
             knows_files: false,
@@ -286,7 +283,7 @@ impl State {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
                 if self.schemas.get(&id).is_none_or(|known| known != name) {
-                    self.name(name.len())?;
+                    self.names.add(name.len())?;
                     self.schemas.insert(id, name.to_owned());
                 }
             }
@@ -341,17 +338,6 @@ impl State {
         }
     }
 
-    /// Makes sure that there is room for a name.
-    fn name(&mut self, bytes: usize) -> Result<(), Fault> {
-        self.names += bytes + ENTRY;
-        if self.names > NAMES {
-            return Err(damaged(format!(
-                "the names of its topics and types are too long: at most {NAMES} bytes are read"
-            )));
-        }
-        Ok(())
-    }
-
     /// Keeps something of so many bytes, while there is room.
     fn keep(&mut self, size: usize, keep: impl FnOnce(&mut Extras)) {
         self.kept = self.kept.saturating_add(size);
@@ -386,7 +372,7 @@ impl State {
     ) -> Result<(), Fault> {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
         // Each of them may be kept twice.
-        self.name(2 * (topic.len() + schema.len()))?;
+        self.names.add(2 * (topic.len() + schema.len()))?;
         let nine_digits = facts.get("time_digits").is_none_or(|digits| digits != "6");
         let what = if encoding != "cdr" {
             None
