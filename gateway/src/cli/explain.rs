@@ -180,7 +180,7 @@ fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<(Found, u64), 
                 }
             }
             Entry::Note(note) => match note.kind {
-                NoteKind::Dropped(frames) => dropped += frames,
+                NoteKind::Dropped(frames) => dropped = frames.saturating_add(dropped),
                 NoteKind::Unreadable(_) => unreadable += 1,
                 NoteKind::Text | NoteKind::CanXl => {}
             },

@@ -341,7 +341,7 @@ fn captured(
             NoteKind::Text => {}
             NoteKind::CanXl => xl += 1,
             NoteKind::Dropped(lost) => {
-                taken.missing += lost;
+                taken.missing = taken.missing.saturating_add(lost);
                 if !note.interface.is_empty() {
                     shadow.missing(note.interface, lost);
                 }

@@ -295,8 +295,8 @@ impl Stats {
     pub fn dropped(&mut self, bus: &str, frames: u64) {
         let lane = if bus.is_empty() { None } else { self.lane(bus) };
         match lane {
-            Some(lane) => lane.dropped += frames,
-            None => self.dropped += frames,
+            Some(lane) => lane.dropped = lane.dropped.saturating_add(frames),
+            None => self.dropped = self.dropped.saturating_add(frames),
         }
     }
 

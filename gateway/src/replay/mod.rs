@@ -185,7 +185,7 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
                 survey.take(&record);
             }
             Entry::Note(note) => match note.kind {
-                NoteKind::Dropped(frames) => survey.dropped += frames,
+                NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
                     if options.strict {

@@ -94,6 +94,9 @@ impl Options {
     }
 }
 
+/// The latest time of a frame, in ns since 1970.
+const LATEST: u64 = u64::MAX / 2;
+
 /// Traffic on its way through the model.
 #[derive(Debug)]
 pub struct Shadow {
@@ -115,8 +118,10 @@ impl Shadow {
         Ok(Self { options, lanes: Vec::new(), told, frames: 0, further: 0 })
     }
 
-    /// Takes the next frame of a bus, with its time in ns.
+    /// Takes the next frame of a bus, with its time in ns. A time after the year 2262 counts as its end: what a bus makes
+    /// of a frame comes later still, and has to be a time as well.
     pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let nanos = nanos.min(LATEST);
         let place = self.frames;
         self.frames += 1;
         let lane = self.lane(bus);
@@ -148,7 +153,7 @@ impl Shadow {
     /// Frames that whoever took the capture lost.
     pub fn missing(&mut self, bus: &str, frames: u64) {
         if let Some(lane) = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane)) {
-            lane.missing += frames;
+            lane.missing = lane.missing.saturating_add(frames);
         }
     }
 

@@ -231,8 +231,8 @@ impl Run {
         match note.kind {
             NoteKind::Dropped(frames) => {
                 match self.skin.bus_named(note.interface).and_then(|bus| self.lanes.get_mut(bus)) {
-                    Some(lane) => lane.dropped += frames,
-                    None => self.backlog += frames,
+                    Some(lane) => lane.dropped = lane.dropped.saturating_add(frames),
+                    None => self.backlog = self.backlog.saturating_add(frames),
                 }
             }
             NoteKind::Unreadable(_) => self.unreadable += 1,

@@ -115,9 +115,10 @@ impl Motion {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
         self.ticks += 1;
-        self.skipped += timing.skipped;
+        self.skipped = self.skipped.saturating_add(timing.skipped);
         if let Some(before) = self.number.replace(timing.tick) {
-            self.unrecorded += timing.tick.saturating_sub(before + 1 + timing.skipped);
+            let expected = before.saturating_add(1).saturating_add(timing.skipped);
+            self.unrecorded = self.unrecorded.saturating_add(timing.tick.saturating_sub(expected));
         }
         self.bad += u64::from(timing.bad != 0);
         self.halted += u64::from(timing.halted != 0);

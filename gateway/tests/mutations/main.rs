@@ -1,0 +1,120 @@
+//! Recordings that are damaged in every way, by chance and on purpose, through every command that reads one: each ends
+//! with exit code 0, 1 or 2, in bounded memory. `SKINBUS_MUTATIONS=10000` takes so many instead of a few.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod mutate;
+mod seeds;
+
+use std::fs::{self, File};
+use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::process::{Command, ExitStatus, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rand_pcg::Pcg64Mcg;
+
+/// Files of the quick tests.
+const QUICK: u64 = 24;
+/// Only a program that hangs takes so long.
+const HANGS: Duration = Duration::from_secs(120);
+/// Addresses that a command may take, in KiB. What is asked for and not used is none of its memory, and counts here.
+const ADDRESSES: &str = "400000";
+
+/// All that read a recording.
+const COMMANDS: &[&str] = &[
+    "dump FILE",
+    "dump FILE --stats",
+    "dump FILE --json --contact",
+    "convert FILE - --direction",
+    "report FILE -o OUT.html --force",
+    "shadow FILE",
+    "shadow FILE --json --ber 0.0001",
+    "explain FILE --epoch 7",
+    "explain FILE --epoch 2 --skin skin.toml",
+    "replay FILE --bus-kind embedded --expect",
+    "recover FILE -o OUT.mcap --force",
+];
+
+/// Runs a command without a terminal and with few addresses; what became of it, and what it said.
+fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
+    let said = File::create(folder.join("said")).unwrap();
+    let mut command = Command::new("sh");
+    command.args(["-c", "ulimit -v $1 && shift && exec \"$@\"", "sh", ADDRESSES]);
+    command.arg(env!("CARGO_BIN_EXE_gateway")).args(line.split(' '));
+    command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus")).env("RUST_BACKTRACE", "0");
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(said).spawn().unwrap();
+    let began = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        if began.elapsed() > HANGS {
+            child.kill().unwrap();
+            break child.wait().unwrap();
+        }
+        thread::sleep(Duration::from_millis(1));
+    };
+    (status, String::from_utf8_lossy(&fs::read(folder.join("said")).unwrap()).into_owned())
+}
+
+/// With `SKINBUS_MUTATIONS_DIR` files are only written there, for whoever wants to try other programs with them.
+fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
+    if let Some(there) = std::env::var_os("SKINBUS_MUTATIONS_DIR") {
+        let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
+        return fs::write(Path::new(&there).join(format!("{name}.mcap")), file).unwrap();
+    }
+    fs::write(folder.join("m.mcap"), file).unwrap();
+    for line in commands {
+        let line = line.replace("FILE", "m.mcap").replace("OUT", "out");
+        let began = Instant::now();
+        let (status, said) = run(folder, &line);
+        let bad = !matches!(status.code(), Some(0..=2)) || said.contains("panicked");
+        if bad {
+            let kept = std::env::temp_dir().join("mutated.mcap");
+            fs::write(&kept, file).unwrap();
+            panic!(
+                "{what}: gateway {line}: exit code {:?}, signal {:?}, {:.1} s, kept as {}: {}",
+                status.code(),
+                status.signal(),
+                began.elapsed().as_secs_f64(),
+                kept.display(),
+                said.get(..said.len().min(2_000)).unwrap_or_default()
+            );
+        }
+    }
+}
+
+#[test]
+fn whatever_a_recording_is_every_command_ends_and_says_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let skin = seeds::skin();
+    fs::write(folder.path().join("skin.toml"), &skin).unwrap();
+    let seeds = seeds::all(&skin);
+    let (from, count) = match std::env::var("SKINBUS_MUTATIONS") {
+        Ok(count) => count.split_once('+').map_or((0, count.parse().unwrap()), |(from, count)| {
+            (from.parse().unwrap(), count.parse().unwrap())
+        }),
+        Err(_) => (0, QUICK),
+    };
+    for (name, seed) in &seeds {
+        passes(folder.path(), name, seed, COMMANDS);
+    }
+    for number in from..from + count {
+        let mut chance = Pcg64Mcg::new(u128::from(number).wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
+        let (name, seed) = &seeds[usize::try_from(number).unwrap() % seeds.len()];
+        let (how, file) = mutate::mutated(seed, &mut chance);
+        passes(folder.path(), &format!("{number}, {name}, {how}"), &file, COMMANDS);
+    }
+}
+
+#[test]
+fn files_that_unpack_to_far_more_than_they_are_end_in_bounded_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let skin = seeds::skin();
+    fs::write(folder.path().join("skin.toml"), &skin).unwrap();
+    for (name, bomb) in seeds::bombs(&skin) {
+        assert!(bomb.len() <= 1 << 20, "{name}: {}", bomb.len());
+        passes(folder.path(), name, &bomb, COMMANDS);
+    }
+}
