@@ -47,7 +47,7 @@ impl Recover {
             }
             Failure::run(format!("{name}: {error}"))
         };
-        let line = match repair::copy_unless_sound(&self.file, &output, self.force.force).map_err(failure)? {
+        let line = match repair::copy_unless_sound(&file, &output, self.force.force).map_err(failure)? {
             (recovered, None) => {
                 format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
             }

@@ -3,12 +3,15 @@
 //! The only place, beside [`super::recover`], that knows the crate `mcap` and the settings that a recording needs.
 
 use std::collections::BTreeMap;
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{self, Seek, Write};
+use std::os::unix::fs::MetadataExt;
 
-use mcap::records::MessageHeader;
+use mcap::records::{MessageHeader, op};
 use mcap::write::{Metadata, NoSeek};
 use mcap::{Attachment, McapError, WriteOptions, Writer};
 
+use crate::container::{Framed, Record, Source, parse};
 use crate::ros2::Message;
 
 /// Bytes that are compressed together; larger ones take a writer's time in pieces that queues feel.
@@ -23,11 +26,52 @@ const HEAD: u64 = 31;
 pub fn options() -> WriteOptions {
     WriteOptions::new()
         .profile("ros2")
-        .library(concat!("skinbus ", env!("CARGO_PKG_VERSION")))
+        .library(format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")))
         .compression(Some(mcap::Compression::Zstd))
         .compression_threads(0)
         .chunk_size(Some(CHUNK))
         .disable_seeking(true)
+}
+
+/// The metadata that says which file a recording was begun in.
+const MARK: &str = "recorder";
+/// The fact that says it.
+const INODE: &str = "inode";
+/// Who writes.
+const PROGRAM: &str = "skinbus ";
+
+/// What a recording's file begins with: that it is ours, and not a copy of ours.
+///
+/// # Errors
+/// Never, into memory.
+pub fn mark(inode: u64) -> io::Result<Vec<u8>> {
+    let mut writer = FileWriter::in_file(Vec::new(), inode)?;
+    writer.flush()?;
+    Ok(writer.into_inner())
+}
+
+/// Whether a file begins with its mark, of whatever version; its place is moved.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn is_marked(file: &mut File) -> io::Result<bool> {
+    let inode = file.metadata()?.ino().to_string();
+    file.rewind()?;
+    let mut from = Source::new(file, 0);
+    if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
+        return Ok(false);
+    }
+    let ours = match parse(op::HEADER, from.body()) {
+        Ok(Record::Header { library, .. }) => library.starts_with(PROGRAM),
+        _ => false,
+    };
+    if !ours || from.next()? != Framed::Record(op::METADATA) {
+        return Ok(false);
+    }
+    Ok(match parse(op::METADATA, from.body()) {
+        Ok(Record::Metadata { name, facts }) => name == MARK && facts.get(INODE) == Some(&inode),
+        _ => false,
+    })
 }
 
 /// What was written cannot go on.
@@ -67,6 +111,16 @@ impl<W: Write> FileWriter<W> {
     pub fn new(out: W) -> io::Result<Self> {
         let writer = options().create(NoSeek::new(out)).map_err(io_error)?;
         Ok(Self { writer, buffer: Vec::new(), messages: 0, raw: 0, flushes: 0 })
+    }
+
+    /// Begins the file of a run's recording, with its mark.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn in_file(out: W, inode: u64) -> io::Result<Self> {
+        let mut writer = Self::new(out)?;
+        writer.metadata(MARK, &BTreeMap::from([(INODE.to_owned(), inode.to_string())]))?;
+        Ok(writer)
     }
 
     /// Facts by name.

@@ -5,15 +5,21 @@
 //!        └─ writer killed ──────>  run-recovered.mcap
 //! ```
 //!
-//! Who writes a file holds a lock on it, which goes with the process: a `.part` that nobody holds is orphaned.
+//! Who writes a file holds a lock on it, which goes with the process, and has put its own mark into it before it had a
+//! name: a `.part` that nobody holds and that bears this mark is orphaned. Any other is somebody else's.
 
 use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Write};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{
+    AtFlags, CWD, FlockOperation, Mode, OFlags, flock, linkat, open,
+};
 
+use super::file;
 use super::sink::folder_of;
 use crate::run::file::{rename, with_remedy};
 
@@ -27,6 +33,8 @@ pub struct Part {
     pub path: PathBuf,
     /// Its name when it is whole.
     pub goal: PathBuf,
+    /// Which file it is, whatever has its name: device and inode.
+    is: (u64, u64),
 }
 
 /// The file that a part becomes: its name without the end.
@@ -83,15 +91,15 @@ impl Part {
         name.push(".");
         name.push(PART);
         let path = goal.with_file_name(name);
-        let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| {
+        let taken = |error: io::Error| {
             if error.kind() == io::ErrorKind::AlreadyExists {
-                let why = format!("{} is there: another run records to this name now", path.display());
-                return io::Error::new(io::ErrorKind::AlreadyExists, why);
+                return io::Error::new(io::ErrorKind::AlreadyExists, why_taken(&path));
             }
             with_remedy(error)
-        })?;
-        hold(&file)?;
-        Ok((Self { path, goal }, file))
+        };
+        let file = nameless(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
+        let is = identity(&file.metadata()?);
+        Ok((Self { path, goal, is }, file))
     }
 
     /// Gives the file its name; takes another file's place only when `force` says so.
@@ -99,8 +107,84 @@ impl Part {
     /// # Errors
     /// When it cannot have it.
     pub fn finish(&self, force: bool) -> io::Result<()> {
+        if !is_still(&self.path, self.is) {
+            return Err(io::Error::other(format!("{} is another file now", self.path.display())));
+        }
         rename(&self.path, &self.goal, force)
     }
+
+    /// Takes the file away, if it is still there.
+    pub fn remove(&self) {
+        if is_still(&self.path, self.is) {
+            // The next run takes it away.
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+
+    /// The file, to be read.
+    ///
+    /// # Errors
+    /// When it cannot be opened, or its name is that of another file now.
+    pub fn open(&self) -> io::Result<File> {
+        let file = opened(&self.path)?;
+        if identity(&file.metadata()?) != self.is {
+            return Err(io::Error::other("it is another file now"));
+        }
+        Ok(file)
+    }
+}
+
+/// Why a recording cannot begin under a name.
+fn why_taken(path: &Path) -> String {
+    let name = path.display();
+    match opened(path) {
+        Ok(file) if !is_held(&file) => format!(
+            "{name} is there, and no run that was killed has left it: move it away, or record to another name"
+        ),
+        _ => format!("{name} is there: another run records to this name now"),
+    }
+}
+
+/// A file that gets its name when it is held and bears its mark; nothing where the file system has none like it.
+fn nameless(path: &Path) -> Option<io::Result<File>> {
+    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+    let mut file = File::from(open(folder_of(path), flags, Mode::from_raw_mode(0o666)).ok()?);
+    claim(&mut file).ok()?;
+    let from = format!("/proc/self/fd/{}", file.as_raw_fd());
+    match linkat(CWD, from, CWD, path, AtFlags::SYMLINK_FOLLOW) {
+        Ok(()) => Some(Ok(file)),
+        Err(rustix::io::Errno::EXIST) => Some(Err(io::ErrorKind::AlreadyExists.into())),
+        Err(_) => None,
+    }
+}
+
+fn named(path: &Path) -> io::Result<File> {
+    let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
+    claim(&mut file)?;
+    Ok(file)
+}
+
+/// Holds a file, and makes it ours for whoever finds it later.
+fn claim(file: &mut File) -> io::Result<()> {
+    hold(file)?;
+    let inode = file.metadata()?.ino();
+    file.write_all(&file::mark(inode)?)
+}
+
+fn identity(about: &fs::Metadata) -> (u64, u64) {
+    (about.dev(), about.ino())
+}
+
+/// Whether a name is that of a file, and not of a link to it.
+fn is_still(path: &Path, is: (u64, u64)) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|about| identity(&about) == is)
+}
+
+/// Opens what may be anybody's: a link is not followed, and a pipe without a writer is not waited for.
+fn opened(path: &Path) -> io::Result<File> {
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY;
+    let flags = i32::try_from(flags.bits()).unwrap_or_default();
+    OpenOptions::new().read(true).custom_flags(flags).open(path)
 }
 
 /// Holds a file against everybody else, as long as it is open.
@@ -114,32 +198,91 @@ pub fn is_held(file: &File) -> bool {
     hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
-/// The files in a recording's folder whose writers are gone, and that are now held against others.
+/// A `.part` in a recording's folder.
+#[derive(Debug)]
+pub enum Found {
+    /// Left by a run that was killed, and held against others from now on.
+    Orphan(File),
+    /// Not ours to touch, and why; whether it may be a recording.
+    Left(String, bool),
+}
+
+/// What of unfinished recordings is in a recording's folder.
 ///
 /// # Errors
 /// When the folder cannot be read.
-pub fn orphans(path: &Path) -> io::Result<Vec<(PathBuf, File)>> {
+pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Found)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder_of(path))? {
         let path = path.with_file_name(entry?.file_name());
         let is_part = path.extension() == Some(OsStr::new(PART))
             && goal_of(&path).extension() == Some(OsStr::new("mcap"));
-        if !is_part {
-            continue;
-        }
-        // One that somebody else may not even read is not ours to repair.
-        let Ok(file) = File::open(&path) else { continue };
-        if hold(&file).is_ok() {
-            found.push((path, file));
+        if is_part {
+            let what = look(&path);
+            found.push((path, what));
         }
     }
     found.sort_by(|(one, _), (other, _)| one.cmp(other));
     Ok(found)
 }
 
+/// Whose a file is.
+fn look(path: &Path) -> Found {
+    let left = |why: &str| Found::Left(why.to_owned(), false);
+    // Of what is no file not even an opening is harmless.
+    match fs::symlink_metadata(path) {
+        Ok(about) if about.is_symlink() => return left("it is a symlink"),
+        Ok(about) if !about.is_file() => return left("it is no regular file"),
+        Ok(_) => {}
+        Err(error) => return left(&error.to_string()),
+    }
+    let mut file = match opened(path) {
+        Ok(file) => file,
+        Err(error) => return Found::Left(format!("it cannot be read: {error}"), false),
+    };
+    let about = match file.metadata() {
+        Ok(about) if about.is_file() => about,
+        Ok(_) => return left("it is no regular file"),
+        Err(error) => return left(&error.to_string()),
+    };
+    let me = rustix::process::geteuid().as_raw();
+    if about.uid() != me {
+        return Found::Left(format!("it belongs to user {}, and this is user {me}", about.uid()), true);
+    }
+    if about.nlink() != 1 {
+        return Found::Left(format!("it has {} names (hard links)", about.nlink()), true);
+    }
+    if let Err(error) = hold(&file) {
+        let locked = error.kind() == io::ErrorKind::WouldBlock;
+        let why = if locked { "another program is writing it".to_owned() } else { error.to_string() };
+        return Found::Left(why, false);
+    }
+    match file::is_marked(&mut file) {
+        Ok(true) => Found::Orphan(file),
+        Ok(false) => Found::Left("no run of this program has begun it here".to_owned(), true),
+        Err(error) => Found::Left(format!("it cannot be read: {error}"), false),
+    }
+}
+
+/// Takes an orphan away, if its name is still its own.
+///
+/// # Errors
+/// When it is not, or cannot be taken away.
+pub fn remove(path: &Path, file: &File) -> io::Result<()> {
+    if !is_still(path, identity(&file.metadata()?)) {
+        return Err(io::Error::other("another file has its name now, and stays"));
+    }
+    fs::remove_file(path)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn orphans(path: &Path) -> Vec<(PathBuf, Found)> {
+        let found = parts(path).unwrap().into_iter();
+        found.filter(|(_, found)| matches!(found, Found::Orphan(_))).collect()
+    }
 
     #[test]
     fn files_are_numbered_from_the_second_on() {
@@ -154,13 +297,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let goal = folder.path().join("run.mcap");
         let (part, file) = Part::create(goal.clone()).unwrap();
-        assert_eq!(orphans(&goal).unwrap().len(), 0, "somebody writes it");
+        assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
         let error = Part::create(goal.clone()).unwrap_err().to_string();
         assert!(error.ends_with("run.mcap.part is there: another run records to this name now"), "{error}");
         drop(file);
-        let found = orphans(&goal).unwrap();
+        let found = orphans(&goal);
         assert_eq!(found[0].0, part.path);
-        assert_eq!(orphans(&goal).unwrap().len(), 0, "somebody repairs it");
+        assert_eq!(orphans(&goal).len(), 0, "somebody repairs it");
     }
 
     #[test]
@@ -172,7 +315,7 @@ mod tests {
         assert_eq!(part.finish(false).unwrap_err().kind(), io::ErrorKind::AlreadyExists);
         assert_eq!(fs::read_to_string(&goal).unwrap(), "somebody's");
         part.finish(true).unwrap();
-        assert_eq!(fs::read_to_string(&goal).unwrap(), "");
+        assert!(fs::read(&goal).unwrap().starts_with(crate::container::MAGIC));
         assert_eq!(recovered(&goal), folder.path().join("run-recovered.mcap"));
         fs::write(folder.path().join("run-recovered.mcap"), "").unwrap();
         assert_eq!(recovered(&goal), folder.path().join("run-recovered-1.mcap"));

@@ -1,31 +1,67 @@
 //! Files whose writers are gone: found, made whole, said.
 
-use std::fs::{self, File};
-use std::io::{self, BufReader, BufWriter, Write};
-use std::path::Path;
+use std::fs::{File, Permissions};
+use std::io::{self, BufReader, BufWriter, Seek, Write};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
 
-use super::names;
+use rustix::fs::{Gid, fchown};
+
+use super::names::{self, Found};
 use super::recover::{RecoverError, Recovered, recover};
 use crate::run::file::WholeFile;
 
-/// Makes a whole file of one that broke off, and takes the latter away; one of that name is overwritten with `force`.
-/// What it came to, and the new one's bytes.
+/// Names that are tried for a new file, when somebody else takes one after the other.
+const NAMES: u32 = 100;
+
+/// A recording that was made whole.
+#[derive(Clone, Debug)]
+pub struct Repaired {
+    /// What it came to.
+    pub recovered: Recovered,
+    /// The new file and its bytes; none when nothing was recorded.
+    pub new: Option<(PathBuf, u64)>,
+}
+
+/// Makes a whole file of one that broke off, and takes the latter away. `goal` names the new one, at each attempt anew;
+/// it takes another file's place only when `force` says so.
 ///
 /// # Errors
 /// When nothing can be recovered or written; the file stays as it is.
-pub fn repair(part: &Path, goal: &Path, force: bool) -> Result<(Recovered, u64), RecoverError> {
-    let (recovered, bytes) = copy(part, goal, force, |_| true)?;
-    fs::remove_file(part).map_err(RecoverError::Write)?;
-    Ok((recovered, bytes.unwrap_or(0)))
+pub fn repair(
+    part: &Path,
+    from: &File,
+    mut goal: impl FnMut() -> PathBuf,
+    force: bool,
+) -> Result<Repaired, RecoverError> {
+    let something = |recovered: &Recovered| {
+        let Recovered { messages, unfinished, damaged, homeless, .. } = *recovered;
+        messages + unfinished + damaged.0 + homeless > 0
+    };
+    let mut attempts = 0;
+    let repaired = loop {
+        attempts += 1;
+        let path = goal();
+        match copy(from, &path, force, something) {
+            Err(RecoverError::Write(error))
+                if error.kind() == io::ErrorKind::AlreadyExists && attempts < NAMES => {}
+            copied => {
+                let (recovered, bytes) = copied?;
+                break Repaired { recovered, new: bytes.map(|bytes| (path, bytes)) };
+            }
+        }
+    };
+    names::remove(part, from).map_err(RecoverError::Write)?;
+    Ok(repaired)
 }
 
-/// Makes a whole file of another one, unless that is whole itself; one that exists is overwritten with `force`. What it came to, and the new one's bytes if
-/// there is a new one.
+/// Makes a whole file of another one, unless that is whole itself. What it came to, and the new one's bytes if
+/// there is a new one. It takes another file's place only when `force` says so.
 ///
 /// # Errors
 /// When nothing can be recovered or written.
 pub fn copy_unless_sound(
-    from: &Path,
+    from: &File,
     to: &Path,
     force: bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
@@ -33,50 +69,73 @@ pub fn copy_unless_sound(
 }
 
 fn copy(
-    from: &Path,
+    from: &File,
     to: &Path,
     force: bool,
     wanted: impl FnOnce(&Recovered) -> bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
-    let from = BufReader::with_capacity(1 << 20, File::open(from).map_err(RecoverError::Read)?);
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
+    as_private(from, &file).map_err(RecoverError::Write)?;
     let about = file.try_clone().map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
-    let recovered = recover(from, &mut out)?;
+    let mut from = from;
+    // A pipe is where it is.
+    let _ = from.rewind();
+    let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
     let wanted = wanted(&recovered);
     let finish = || -> io::Result<Option<u64>> {
         if !wanted {
             return Ok(None);
         }
         out.flush()?;
-        whole.finish()?;
+        if force { whole.finish() } else { whole.finish_new() }?;
         Ok(Some(about.metadata()?.len()))
     };
     Ok((recovered, finish().map_err(RecoverError::Write)?))
 }
 
-/// Repairs what runs that were killed left in a recording's folder, and says each in a line.
+/// Lets nobody read a copy who could not read the original.
+fn as_private(from: &File, copy: &File) -> io::Result<()> {
+    let (original, about) = (from.metadata()?, copy.metadata()?);
+    if !original.is_file() || !about.is_file() {
+        return Ok(());
+    }
+    let mut mode = original.mode() & about.mode() & 0o777;
+    if original.gid() != about.gid() && fchown(copy, None, Some(Gid::from_raw(original.gid()))).is_err() {
+        // Its group is another one.
+        mode &= 0o707;
+    }
+    copy.set_permissions(Permissions::from_mode(mode))
+}
+
+/// Repairs what runs that were killed left in a recording's folder, and says each in a line; also what is not theirs.
 pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
     // A folder that cannot be read says so when the recording itself is begun.
-    for (part, _held) in names::orphans(path).unwrap_or_default() {
-        let goal = names::recovered(&names::goal_of(&part));
+    for (part, found) in names::parts(path).unwrap_or_default() {
         let name = part.display();
-        match repair(&part, &goal, false) {
-            Ok((recovered, _)) => {
-                say(&format!(
-                    "{name} was left by a run that was killed; repaired, it is {}: {recovered}",
-                    goal.display()
-                ));
+        let held = match found {
+            Found::Orphan(held) => held,
+            Found::Left(why, maybe) => {
+                let remedy = if maybe {
+                    format!(
+                        "; if it is a recording that broke off, `gateway recover {name} -o NAME` copies it"
+                    )
+                } else {
+                    String::new()
+                };
+                say(&format!("{name} is left alone: {why}{remedy}"));
+                continue;
             }
-            Err(RecoverError::Empty(_)) => match fs::remove_file(&part) {
-                Ok(()) => say(&format!(
-                    "{name} was left by a run that was killed; there was nothing in it, it is gone"
-                )),
-                Err(error) => say(&format!("{name} is empty and cannot be removed: {error}")),
-            },
-            Err(error) => {
-                say(&format!("{name} was left by a run that was killed and cannot be repaired: {error}"))
+        };
+        let left = "was left by a run that was killed";
+        match repair(&part, &held, || names::recovered(&names::goal_of(&part)), false) {
+            Ok(Repaired { recovered, new: Some((path, _)) }) => {
+                say(&format!("{name} {left}; repaired, it is {}: {recovered}", path.display()));
             }
+            Ok(Repaired { new: None, .. }) => {
+                say(&format!("{name} {left}; nothing was recorded in it, it is gone"));
+            }
+            Err(error) => say(&format!("{name} {left} and cannot be repaired: {error}")),
         }
     }
 }

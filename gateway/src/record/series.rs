@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,7 +17,8 @@ use rustix::fs::statvfs;
 use super::account::Written;
 use super::file::FileWriter;
 use super::names::{self, Part};
-use super::repair;
+use super::recover::RecoverError;
+use super::repair::{self, Repaired};
 use super::sink::{Gauge, Sink, folder_of};
 
 /// Bytes that go to the file together; a chunk is larger and goes by itself.
@@ -235,8 +237,9 @@ impl<T> Series<T> {
         topics: impl FnOnce(&mut Writer) -> io::Result<T>,
     ) -> io::Result<Open<T>> {
         let begin = || {
+            let inode = file.metadata()?.ino();
             let (sink, gauge) = Sink::new(file, &folder_of(&part.path))?;
-            let mut writer = Writer::new(BufWriter::with_capacity(BUFFER, sink))?;
+            let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), inode)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
             writer.flush()?;
@@ -252,7 +255,7 @@ impl<T> Series<T> {
             }
             Err(error) => {
                 // There is nothing in it.
-                let _ = std::fs::remove_file(&part.path);
+                part.remove();
                 Err(error)
             }
         }
@@ -392,7 +395,7 @@ impl<T> Series<T> {
     pub fn discard(&mut self) {
         if let Some(open) = self.open.take() {
             // What remains is an orphan, which the next run repairs.
-            let _ = std::fs::remove_file(&open.part.path);
+            open.part.remove();
         }
     }
 
@@ -400,16 +403,19 @@ impl<T> Series<T> {
     pub fn finish(&mut self) -> (Vec<Written>, Count) {
         self.end();
         for Broken { part, file, kept } in std::mem::take(&mut self.broken) {
-            match repair::repair(&part.path, &part.goal, self.force) {
-                Ok((recovered, bytes)) => {
+            let from = part.open().map_err(RecoverError::Read);
+            let goal = || part.goal.clone();
+            match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
+                Ok(Repaired { recovered, new: Some((goal, bytes)) }) => {
                     // More may have come to the disk than is known of, or less.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
-                    let path = part.goal.display().to_string();
+                    let path = goal.display().to_string();
                     let (frames, messages) = (recovered.frames, recovered.messages);
                     self.written.push(Written { path, format: "mcap", frames, messages, bytes });
                 }
+                Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
                     let path = part.path.display().to_string();
                     self.said
@@ -435,7 +441,7 @@ impl<T> Drop for Series<T> {
     fn drop(&mut self) {
         if let Some((part, _)) = &self.claimed {
             // There is nothing in it.
-            let _ = std::fs::remove_file(&part.path);
+            part.remove();
         }
     }
 }

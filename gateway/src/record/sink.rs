@@ -72,19 +72,22 @@ impl Gauge {
 #[derive(Debug)]
 pub struct Sink {
     file: File,
+    /// Bytes that it begins with, and that are written again.
+    there: u64,
     gauge: Arc<Gauge>,
 }
 
 impl Sink {
-    /// Takes a file of a folder over, and room beside it. Where the file system gives none, a full disk is
+    /// Takes a file of a folder over, and room beside it. What is in the file already is what it begins with; whoever
+    /// writes begins with the same. Where the file system gives none, a full disk is
     /// like any other error.
     ///
     /// # Errors
     /// When there is not even the room that an end needs.
     pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<Gauge>)> {
-        let reserve = reserve(folder)?;
+        let (reserve, there) = (reserve(folder)?, file.metadata()?.len());
         let gauge = Arc::new(Gauge { reserve: Mutex::new(reserve), ..Gauge::default() });
-        Ok((Self { file, gauge: Arc::clone(&gauge) }, gauge))
+        Ok((Self { file, there, gauge: Arc::clone(&gauge) }, gauge))
     }
 
     /// The file.
@@ -114,6 +117,12 @@ pub fn is_full(error: &io::Error) -> bool {
 
 impl Write for Sink {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.there > 0 {
+            let there = bytes.len().min(usize::try_from(self.there).unwrap_or(usize::MAX));
+            self.there -= there as u64;
+            self.gauge.bytes.fetch_add(there as u64, Ordering::Relaxed);
+            return Ok(there);
+        }
         let written = match self.file.write(bytes) {
             Err(error) if is_full(&error) && self.gauge.use_reserve() => self.file.write(bytes),
             written => written,
