@@ -175,8 +175,11 @@ impl Chunk {
     }
 }
 
-/// The first of some records: its operation code, its bytes, and how many are left behind it.
-fn split(records: &[u8]) -> Option<Result<(u8, &[u8], usize), Damage>> {
+/// A record's operation code, its bytes, and how many are left behind it.
+type First<'a> = (u8, &'a [u8], usize);
+
+/// The first of some records.
+fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
     if records.is_empty() {
         return None;
     }

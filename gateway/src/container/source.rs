@@ -81,6 +81,10 @@ impl<R: Read> Source<R> {
     ///
     /// # Errors
     /// When the input fails.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "a record borrows from the source; an iterator's cannot"
+    )]
     pub fn next(&mut self) -> io::Result<Framed> {
         loop {
             let began = self.read;

@@ -147,7 +147,7 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
                 recovered.damaged.0 += 1;
                 recovered.damaged.1 += match framed {
                     Framed::Long(_, bytes) => bytes,
-                    _ => source.body().len() as u64,
+                    Framed::Record(_) | Framed::End(_) => source.body().len() as u64,
                 };
             }
             Err(Failed::Write(error)) => return Err(RecoverError::Write(error)),

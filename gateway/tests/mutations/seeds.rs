@@ -214,7 +214,7 @@ pub(crate) fn bombs(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
     let each = (0..=u16::MAX).map(|id| message(id, b"")).collect::<Vec<_>>().concat();
     let frames = [schema(1, can), channel(1, b"/can/vcan0", b"")].concat();
     let many = [frames.clone(), message(1, b"").repeat(2_000_000)].concat();
-    let long = [frames.clone(), message(1, &zeros(100 * MIB))].concat();
+    let long = [frames, message(1, &zeros(100 * MIB))].concat();
     let skinned = {
         let attached =
             [&[0; 16][..], &string(b"skin.toml"), &string(b""), &(skin.len() as u64).to_le_bytes()];

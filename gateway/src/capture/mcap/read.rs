@@ -253,7 +253,9 @@ impl State {
     fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
         // Most of what is passed over is longer than this.
         let mut from = BufReader::with_capacity(4 << 10, file);
-        from.seek_relative(MAGIC.len() as i64)?;
+        if from.read_exact(&mut [0; MAGIC.len()]).is_err() {
+            return Ok(());
+        }
         let mut body = Vec::new();
         while let Some((opcode, length)) = find(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])? {
             if opcode == op::FOOTER {
@@ -416,7 +418,7 @@ impl State {
                 frame.map(|frame| Entry::Frame(frame.0)).map_err(|error| error.to_string())
             }),
             What::Foreign(foreign) => within(message, LONGEST_FRAME).and_then(|message| {
-                let bus = topic.get(..topic.floor_char_boundary(LONGEST_BUS)).unwrap_or_default();
+                let bus = beginning(topic);
                 let frame = foreign.decode(message, log_time, bus);
                 frame.map(Entry::Frame).map_err(|error| error.to_string())
             }),
@@ -443,9 +445,15 @@ fn within(message: &[u8], longest: usize) -> Result<&[u8], String> {
     Ok(message)
 }
 
+/// The beginning of a topic's name, which may be as long as anything.
+fn beginning(topic: &str) -> &str {
+    let ends = (0..=LONGEST_BUS.min(topic.len())).rev();
+    ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
+}
+
 /// A message that is not what its channel says.
 fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &str) -> Entry<'a> {
-    let topic = topic.get(..topic.floor_char_boundary(LONGEST_BUS)).unwrap_or_default();
+    let topic = beginning(topic);
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));
     let message = message.get(..LONGEST_LINE).unwrap_or(message);
     Entry::Note(Note { kind, nanos, interface: "", line: 0, text: message })
