@@ -6,6 +6,8 @@
 //! when something is wrong is it read again with them.
 
 use core::fmt;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::Path;
 
 use serde::de::DeserializeOwned;
@@ -79,12 +81,25 @@ pub enum DocumentError {
     },
 }
 
-/// The text of a file.
+/// The most bytes of a file that people write; a skin of 253 cells has 60 KB.
+pub const LONGEST: u64 = 16 << 20;
+
+/// The text of a file of at most [`LONGEST`] bytes.
 ///
 /// # Errors
-/// When it cannot be read as UTF-8.
+/// When it is longer, or cannot be read as UTF-8.
 pub fn text(path: &Path) -> Result<String, DocumentError> {
-    std::fs::read_to_string(path).map_err(|error| DocumentError::Unreadable {
+    let read = || {
+        let mut bytes = Vec::new();
+        File::open(path)?.take(LONGEST + 1).read_to_end(&mut bytes)?;
+        if bytes.len() as u64 > LONGEST {
+            return Err(io::Error::other(format!(
+                "it has more than {LONGEST} bytes: a skin or a scenario may have as many"
+            )));
+        }
+        String::from_utf8(bytes).map_err(|_| io::Error::other("it is not UTF-8"))
+    };
+    read().map_err(|error: io::Error| DocumentError::Unreadable {
         path: path.display().to_string(),
         reason: error.to_string(),
     })

@@ -14,6 +14,8 @@ pub mod packet;
 pub mod parameters;
 #[cfg(feature = "host")]
 pub mod skin;
+#[cfg(feature = "host")]
+pub mod stop;
 pub mod time;
 pub mod touch;
 #[cfg(feature = "host")]

@@ -6,6 +6,8 @@ use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
 use std::process::ExitCode;
 
+use crate::stop::Stoppable;
+
 /// An error for people, and the exit code that goes with it.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Failure {
@@ -53,7 +55,7 @@ pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
     if !text.is_empty() {
         // When it is closed, nobody wants to know.
-        let _ = io::stderr().write_all(format!("{program}: {text}\n").as_bytes());
+        let _ = Stoppable::new(io::stderr()).write_all(format!("{program}: {text}\n").as_bytes());
     }
     ExitCode::from(code)
 }
@@ -63,8 +65,7 @@ pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
 /// # Errors
 /// As [`written`].
 pub fn print(text: &str) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+    written(Stoppable::new(io::stdout()).write_all(text.as_bytes()))
 }
 
 /// The end of writing to standard output: who read it may have left, as `head` does, and that is fine.

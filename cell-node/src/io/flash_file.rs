@@ -1,13 +1,18 @@
 //! Flash as a file.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use protocol::id::CellId;
+use rustix::fs::OFlags;
 
 use crate::flash::{self, FlashError, Kept};
 use crate::node::{Flash, Identity};
+
+/// Bytes that are read of a file; what flash holds is far less.
+const LONGEST: u64 = 64 << 10;
 
 /// Where a cell keeps its parameters; without a directory, in memory only.
 #[derive(Debug)]
@@ -42,7 +47,7 @@ impl FlashFile {
     /// When the file is there and cannot be read.
     pub fn load(&self) -> io::Result<(Option<CellId>, Flash, Option<FlashError>)> {
         let Some(path) = &self.path else { return Ok((None, Flash::Empty, None)) };
-        let bytes = match fs::read(path) {
+        let bytes = match read(path) {
             Ok(bytes) => bytes,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((None, Flash::Empty, None)),
             Err(error) => return Err(error),
@@ -61,7 +66,12 @@ impl FlashFile {
         let Some(path) = &self.path else { return Ok(()) };
         let part = path.with_extension("flash.part");
         let store = || {
-            let mut file = File::create(&part)?;
+            // What is left of an earlier attempt, or of somebody else.
+            match fs::remove_file(&part) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+                _ => {}
+            }
+            let mut file = File::create_new(&part)?;
             file.write_all(&flash::encode(self.identity.serial, kept))?;
             file.sync_all()?;
             fs::rename(&part, path)?;
@@ -77,4 +87,17 @@ impl FlashFile {
         }
         stored
     }
+}
+
+/// The bytes of a regular file, as many as tell that there are too many. A pipe is not waited for.
+fn read(path: &Path) -> io::Result<Vec<u8>> {
+    let mut options = OpenOptions::new();
+    options.read(true).custom_flags(i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or_default());
+    let file = options.open(path)?;
+    if !file.metadata()?.is_file() {
+        return Err(io::Error::other("it is no regular file: move it away"));
+    }
+    let mut bytes = Vec::new();
+    file.take(LONGEST).read_to_end(&mut bytes)?;
+    Ok(bytes)
 }

@@ -14,6 +14,7 @@ use gateway::capture::log::{self, Style};
 use gateway::capture::{Format, ORIGIN, Reader};
 use gateway::run::file::WholeFile;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::stop::Stoppable;
 use protocol::usage::Failure;
 
 use super::input::{Interruptible, stopped};

@@ -20,6 +20,7 @@ use protocol::bus::{Bus, BusError, Choice, Inbox, Options};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
+use protocol::stop::Stoppable;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
 
@@ -138,7 +139,8 @@ impl Dump {
         let Self { kind: kinds, node: nodes, from, to, contact, .. } = self;
         let pick = Pick { kinds, nodes, from, to };
         let max = self.max.unwrap_or(u64::MAX);
-        let mut show = Show::new(BufWriter::new(out.lock()), Decoder::new(format), pick, contact, how, max);
+        let mut show =
+            Show::new(BufWriter::new(Stoppable::new(&out)), Decoder::new(format), pick, contact, how, max);
         let stopped = stopped()?;
         let (what, extras, done) = match file {
             Some(file) => {

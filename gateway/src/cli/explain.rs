@@ -203,6 +203,11 @@ fn attached(path: &Path) -> Result<Skin, Failure> {
     if path.as_os_str() == "-" {
         return Err(Failure::usage("standard input is read once: say which skin with --skin"));
     }
+    if path.metadata().is_ok_and(|about| !about.is_file() && !about.is_dir()) {
+        return Err(Failure::usage(format!(
+            "{name} is no regular file and is read once: say which skin with --skin"
+        )));
+    }
     let mut reader = Reader::open(path).map_err(Failure::usage)?;
     loop {
         let more = reader.next().map_err(Failure::run)?.is_some();

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
@@ -14,7 +15,7 @@ pub(crate) const LOOK: Duration = Duration::from_millis(200);
 
 /// A flag that SIGINT and SIGTERM set.
 pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
-    let stopped = Arc::new(AtomicBool::new(false));
+    let stopped = Arc::clone(stop::flag());
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stopped))
             .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use gateway::run::file::{self, WholeFile};
+use protocol::stop::Stoppable;
 use protocol::usage::Failure;
 
 /// Whether files that exist may be overwritten.
@@ -62,5 +63,5 @@ pub(crate) fn place(path: &Path) -> PathBuf {
 
 /// Says something on standard error; if that is closed, nobody wants to know.
 pub(crate) fn note(text: impl Display) {
-    let _ = writeln!(io::stderr(), "{text}");
+    let _ = Stoppable::new(io::stderr()).write_all(format!("{text}\n").as_bytes());
 }

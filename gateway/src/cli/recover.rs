@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 use gateway::record::recover::RecoverError;
 use gateway::record::{names, repair};
-use protocol::usage::Failure;
+use protocol::usage::{Failure, print};
 
 use super::output::{Force, place};
 
@@ -53,8 +53,6 @@ impl Recover {
             }
             (recovered, Some(bytes)) => format!("{out}, {bytes} bytes: {recovered}"),
         };
-        // Whoever closed it has seen enough.
-        let _ = writeln!(std::io::stdout(), "{line}");
-        Ok(())
+        print(&format!("{line}\n"))
     }
 }

@@ -15,6 +15,7 @@ use gateway::run::{self, Options};
 use gateway::scenario::Scenario;
 use gateway::summary::Summary;
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
+use protocol::document;
 use protocol::skin::Skin;
 use protocol::time::Span;
 use protocol::usage::{Failure, quoted};
@@ -192,16 +193,21 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A file in memory that goes with this program, and how its cells name it.
+fn in_memory(text: &str) -> Result<(File, PathBuf), Failure> {
+    let make = || -> std::io::Result<File> {
+        let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
+        file.write_all(text.as_bytes())?;
+        Ok(file)
+    };
+    let file = make().map_err(|error| Failure::run(format!("a file in memory: {error}")))?;
+    let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
+    Ok((file, path))
+}
+
 impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        // The cells read the skin from a file, which is in memory and goes with this program.
-        let in_memory = || -> std::io::Result<File> {
-            let mut file = File::from(memfd_create("ur5-253.toml", MemfdFlags::CLOEXEC)?);
-            file.write_all(SKIN.as_bytes())?;
-            Ok(file)
-        };
-        let file = in_memory().map_err(|error| Failure::run(format!("a file in memory: {error}")))?;
-        let skin_file = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
+        let (_file, skin_file) = in_memory(SKIN)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
@@ -232,16 +238,23 @@ impl Demo {
 
 impl Run {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
-        let scenario = match &self.scenario {
-            Some(path) => Scenario::read(path, &skin).map_err(Failure::usage)?,
-            None => Scenario::idle(IDLE),
+        let name = |path: &Path| path.display().to_string();
+        let skin_text = document::text(&self.skin).map_err(Failure::usage)?;
+        let skin = Skin::parse(&name(&self.skin), &skin_text).map_err(Failure::usage)?;
+        let scenario_text =
+            self.scenario.as_deref().map(document::text).transpose().map_err(Failure::usage)?;
+        let scenario = match (&self.scenario, &scenario_text) {
+            (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
+            _ => Scenario::idle(IDLE),
         };
-        let read = |path: &Path| {
-            std::fs::read(path).map_err(|error| Failure::usage(format!("{}: {error}", path.display())))
+        // What can be read once only is read by the cells from memory.
+        let (_file, skin_file) = if self.skin.is_file() {
+            (None, self.skin)
+        } else {
+            let (file, path) = in_memory(&skin_text)?;
+            (Some(file), path)
         };
-        let (skin_file, scenario_file) = (self.skin.clone(), self.scenario);
-        let mut options = self.common.options(self.skin, skin, scenario);
+        let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, .. } = self.common;
         let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
             .and_then(|kinds| kinds.only(options.skin.buses.iter().map(|bus| bus.name.as_str())));
@@ -249,8 +262,8 @@ impl Run {
         options.record = recording.options(
             self.candump.map(|path| Candump { path, numbered: false }),
             &options.skin,
-            || read(&skin_file),
-            || scenario_file.as_deref().map(read).transpose(),
+            || Ok(skin_text.into_bytes()),
+            || Ok(scenario_text.map(String::into_bytes)),
         )?;
         options.spawn = !self.no_spawn;
         options.flash = self.flash;

@@ -17,6 +17,7 @@ use gateway::shadow::{Options, Shadow};
 use protocol::bus::{self, Bus, BusError, Choice, Inbox};
 use protocol::can::EXTENDED_MASK;
 use protocol::skin::Skin;
+use protocol::stop::Stoppable;
 use protocol::usage::{Failure, print, written};
 use protocol::wire_time::{BitRates, bit_rate};
 
@@ -108,20 +109,24 @@ struct Taken {
 impl ShadowCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
-        let out = io::stdout();
-        let mut out = BufWriter::new(out.lock());
-        let stopped = stopped()?;
+        let mut out = BufWriter::new(Stoppable::new(io::stdout()));
         let files = self.sources.iter().filter(|source| is_file(source)).count();
         let name =
             self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
-        let (mut shadow, taken) = match self.sources.as_slice() {
-            [source] if files == 1 => {
+        // A pipe that nobody writes to is waited for; until it is open, a signal ends that at once.
+        let file = match self.sources.as_slice() {
+            [source] if files == 1 => Some(open_file(source)?),
+            _ => None,
+        };
+        let stopped = stopped()?;
+        let (mut shadow, taken) = match (self.sources.as_slice(), file) {
+            ([source], Some(file)) => {
                 if self.duration.is_some() {
                     return Err(Failure::usage(format!(
                         "--duration is for live buses, and {name} is a file"
                     )));
                 }
-                let reader = opened(source, &stopped)?;
+                let reader = opened(source, file, &stopped)?;
                 let mut shadow = self.shadow(skin.or_else(|| attached(&name, &reader)))?;
                 for before in &reader.extras().in_force {
                     shadow.in_force(&before.bus, before.nanos, &before.frame);
@@ -132,7 +137,7 @@ impl ShadowCommand {
             _ if files > 0 => {
                 return Err(Failure::usage(format!("{name}: one file alone, or buses without a file")));
             }
-            sources => {
+            (sources, _) => {
                 let mut shadow = self.shadow(skin)?;
                 let taken = self.live(sources, &mut shadow, &mut out, &stopped)?;
                 (shadow, taken)
@@ -281,19 +286,24 @@ fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
     }
 }
 
-/// Opens a capture.
-fn opened(source: &Path, stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
-    let name = source.display().to_string();
-    let file: File = if source.as_os_str() == "-" {
+/// Opens a capture, or standard input.
+fn open_file(source: &Path) -> Result<File, Failure> {
+    let name = source.display();
+    if source.as_os_str() == "-" {
         let input = io::stdin().as_fd().try_clone_to_owned();
-        input.map_err(|error| Failure::run(format!("standard input: {error}")))?.into()
-    } else if source.is_dir() {
+        return input.map(File::from).map_err(|error| Failure::run(format!("standard input: {error}")));
+    }
+    if source.is_dir() {
         return Err(Failure::usage(format!(
             "{name} is a directory: name a candump log, an MCAP recording or a bus"
         )));
-    } else {
-        File::open(source).map_err(|error| Failure::usage(format!("{name}: {error}")))?
-    };
+    }
+    File::open(source).map_err(|error| Failure::usage(format!("{name}: {error}")))
+}
+
+/// Reads a capture's beginning.
+fn opened(source: &Path, file: File, stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
+    let name = source.display().to_string();
     let input = Interruptible { file, stopped: Arc::clone(stopped) };
     Reader::from_read(&name, input).map_err(Failure::usage)
 }

@@ -88,7 +88,7 @@ fn copy(
             return Ok(None);
         }
         out.flush()?;
-        if force { whole.finish() } else { whole.finish_new() }?;
+        whole.finish()?;
         Ok(Some(about.metadata()?.len()))
     };
     Ok((recovered, finish().map_err(RecoverError::Write)?))

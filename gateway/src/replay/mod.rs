@@ -32,13 +32,13 @@ mod teller;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::thread;
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
 use protocol::bus::Kinds;
 use protocol::id::CellId;
+use protocol::stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
@@ -121,17 +121,18 @@ pub struct Options {
 /// When it cannot begin, or could not be read to its end. What went wrong on the buses and in the comparison is in the
 /// summary.
 pub fn replay(options: &Options) -> Result<Summary, RunError> {
-    let signalled = Arc::new(AtomicBool::new(false));
-    for signal in [SIGHUP, SIGINT, SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&signalled))
-            .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
-    }
     let teller = Teller::new(options.quiet);
     let (survey, extras) = look_through(options, &teller)?;
     let survey = Arc::new(survey);
     let routes = Routes::new(options, &survey)?;
     let wearing = options.spawn.as_ref().map(|spawn| start::wearing(options, spawn, &routes, &extras));
     let wearing = wearing.transpose()?;
+    // Until now there was nothing that had to be put in order at an end.
+    let signalled = Arc::clone(stop::flag());
+    for signal in [SIGHUP, SIGINT, SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&signalled))
+            .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
+    }
     let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;
@@ -169,6 +170,11 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
         ));
     }
     let name = options.file.display();
+    if options.file.metadata().is_ok_and(|about| !about.is_file() && !about.is_dir()) {
+        return Err(RunError::Usage(format!(
+            "{name} is no regular file, and a capture is read twice: write it to a file, and name that"
+        )));
+    }
     let mut reader = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
     let mut survey = Survey::new(options.part);
     // What was in force stands before the first frame, and is known when that is read.

@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use protocol::stop::Stoppable;
 
 /// Lines and a bar.
 #[derive(Debug)]
@@ -21,7 +22,7 @@ impl Teller {
         if !self.quiet {
             // Whoever closed it wants to hear nothing.
             self.bar.suspend(|| {
-                let _ = std::io::stderr().write_all(format!("{text}\n").as_bytes());
+                let _ = Stoppable::new(std::io::stderr()).write_all(format!("{text}\n").as_bytes());
             });
         }
     }

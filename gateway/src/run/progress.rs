@@ -4,6 +4,7 @@ use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::stop::Stoppable;
 
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
@@ -11,7 +12,7 @@ const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(
 /// Writes a line on standard error in one piece, for the cells write there too.
 pub fn say(line: &str) {
     // Whoever closed it needs no progress.
-    let _ = std::io::stderr().write_all(format!("{line}\n").as_bytes());
+    let _ = Stoppable::new(std::io::stderr()).write_all(format!("{line}\n").as_bytes());
 }
 
 /// The progress line, on standard error.

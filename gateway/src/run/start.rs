@@ -13,6 +13,7 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
+use protocol::stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
@@ -90,7 +91,7 @@ pub(super) struct Bench<'a> {
 pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     refuse(options)?;
-    let signalled = Arc::new(AtomicBool::new(false));
+    let signalled = Arc::clone(stop::flag());
     for signal in [SIGHUP, SIGINT, SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&signalled))
             .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;

@@ -1,0 +1,124 @@
+//! One signal ends every command, also one that waits for a pipe: to be opened, to be read, or to be written to.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use std::fmt::Write as _;
+use std::fs;
+use std::io::Read;
+use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+use rustix::process::{Pid, Signal, kill_process};
+use tempfile::TempDir;
+
+/// Only a program that hangs takes so long.
+const HANGS: Duration = Duration::from_secs(60);
+
+fn place() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    mknodat(CWD, path("fifo"), FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
+    let skin = Command::new(env!("CARGO_BIN_EXE_gateway"))
+        .args(["skin", "generate", "--cells", "3"])
+        .output()
+        .unwrap();
+    fs::write(path("skin.toml"), skin.stdout).unwrap();
+    let lines = (0..40_000).fold(String::new(), |mut log, at| {
+        writeln!(log, "({}.{:06}) vcan0 123#{:08X}", at / 1_000, at % 1_000, at).unwrap();
+        log
+    });
+    fs::write(path("run.log"), lines).unwrap();
+    folder
+}
+
+fn start(folder: &Path, line: &str, stdout: Stdio) -> Child {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    command.args(line.split(' ')).current_dir(folder).env("SKINBUS_DIR", folder.join("bus"));
+    command.stdin(Stdio::null()).stdout(stdout).stderr(Stdio::null()).spawn().unwrap()
+}
+
+/// Waits until a program does nothing but wait.
+fn until_it_waits(child: &mut Child, line: &str) {
+    let (began, mut idle) = (Instant::now(), 0);
+    while idle < 10 {
+        assert!(began.elapsed() < HANGS, "{line}: always busy");
+        assert_eq!(child.try_wait().unwrap(), None, "{line}: it does not wait");
+        let stat = fs::read_to_string(format!("/proc/{}/stat", child.id())).unwrap();
+        let sleeps = stat.rsplit_once(')').unwrap().1.trim_start().starts_with('S');
+        idle = if sleeps { idle + 1 } else { 0 };
+        thread::sleep(Duration::from_millis(10));
+    }
+}
+
+fn end(child: &mut Child, line: &str, signal: Signal) -> ExitStatus {
+    kill_process(Pid::from_child(child), signal).unwrap();
+    let began = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            return status;
+        }
+        if began.elapsed() > HANGS {
+            child.kill().unwrap();
+            child.wait().unwrap();
+            panic!("{line}: {signal:?} does not end it");
+        }
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_pipe_that_nobody_writes_to_holds_no_command_when_it_is_told_to_end() {
+    let folder = place();
+    let lines = [
+        "dump fifo",
+        "convert fifo out.mcap",
+        "report fifo -o out.html",
+        "shadow fifo",
+        "explain fifo --epoch 1 --skin skin.toml",
+        "explain run.log --epoch 1 --skin fifo",
+        "replay run.log --bus-kind embedded --spawn --skin fifo",
+        "recover fifo -o out.mcap",
+        "fit fifo",
+        "dbc fifo",
+        "skin check fifo",
+        "cells vcan0 --skin fifo",
+        "commission fifo",
+        "run fifo",
+        "run skin.toml --scenario fifo",
+    ];
+    for line in lines {
+        for signal in [Signal::INT, Signal::TERM] {
+            let mut child = start(folder.path(), line, Stdio::null());
+            until_it_waits(&mut child, line);
+            let status = end(&mut child, line, signal);
+            assert!(
+                status.signal() == Some(signal.as_raw()) || matches!(status.code(), Some(0..=2)),
+                "{line}"
+            );
+        }
+    }
+    for line in ["replay fifo --bus-kind embedded", "explain fifo --epoch 1"] {
+        let status = start(folder.path(), line, Stdio::null()).wait().unwrap();
+        assert_eq!(status.code(), Some(2), "{line}: what is read twice cannot be a pipe");
+    }
+}
+
+#[test]
+fn a_reader_that_takes_nothing_holds_no_command_when_it_is_told_to_end() {
+    let folder = place();
+    for line in ["dump run.log", "dump run.log --json", "convert run.log -", "shadow run.log --json"] {
+        for signal in [Signal::INT, Signal::TERM] {
+            let (mut reader, writer) = std::io::pipe().unwrap();
+            let mut child = start(folder.path(), line, writer.into());
+            until_it_waits(&mut child, line);
+            let status = end(&mut child, line, signal);
+            assert!(matches!(status.code(), Some(0..=2)), "{line}: {status:?}");
+            let mut taken = Vec::new();
+            reader.read_to_end(&mut taken).unwrap();
+            assert!(taken.len() > 4_096, "{line}: it has written before");
+        }
+    }
+}
