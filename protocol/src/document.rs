@@ -94,7 +94,7 @@ pub fn text(path: &Path) -> Result<String, DocumentError> {
         File::open(path)?.take(LONGEST + 1).read_to_end(&mut bytes)?;
         if bytes.len() as u64 > LONGEST {
             return Err(io::Error::other(format!(
-                "it has more than {LONGEST} bytes: a skin or a scenario may have as many"
+                "it is longer than a skin or a scenario may be: at most {LONGEST} bytes are read"
             )));
         }
         String::from_utf8(bytes).map_err(|_| io::Error::other("it is not UTF-8"))

@@ -43,6 +43,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
 use crate::decode::pick::Pick;
+use crate::decode::stats::BUSES;
 use crate::run::{RunError, realtime};
 use crate::summary::histogram;
 use judge::Judge;
@@ -175,12 +176,22 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
             "{name} is no regular file, and a capture is read twice: write it to a file, and name that"
         )));
     }
-    let mut reader = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
+    let open = || Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()));
     let mut survey = Survey::new(options.part);
     // What was in force stands before the first frame, and is known when that is read.
-    let mut beginning = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
+    let mut beginning = open()?;
     beginning.next().map_err(failed)?;
-    survey.begin(&beginning.extras().in_force);
+    let too_many = |buses: usize| {
+        let why = "a replay sends to no more than that";
+        (buses > BUSES)
+            .then(|| RunError::Usage(format!("{name} has frames of more than {BUSES} buses: {why}")))
+    };
+    let in_force = &beginning.extras().in_force;
+    let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
+    too_many(buses.len()).map_or(Ok(()), Err)?;
+    survey.begin(in_force);
+    drop(beginning);
+    let mut reader = open()?;
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(failed)? {
         match entry {
@@ -189,6 +200,7 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
                     backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
                 }
                 survey.take(&record);
+                too_many(survey.buses.len()).map_or(Ok(()), Err)?;
             }
             Entry::Note(note) => match note.kind {
                 NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
