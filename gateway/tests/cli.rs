@@ -511,3 +511,12 @@ fn every_command_has_help_with_an_example() {
         );
     }
 }
+
+#[test]
+fn a_file_without_an_end_is_read_up_to_a_limit() {
+    let said = refusal("skin check /dev/zero", 2);
+    assert!(
+        said.contains("/dev/zero: it is longer than a skin or a scenario may be: at most 16777216 bytes"),
+        "{said}"
+    );
+}

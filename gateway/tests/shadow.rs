@@ -128,3 +128,15 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         assert!(said.starts_with(begin), "{arguments}: {said}");
     }
 }
+
+#[test]
+fn a_time_at_the_end_of_all_clocks_is_a_time_like_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = "(18446744073.709551) vcan0 001##500000000000000000000000000000006\n";
+    fs::write(folder.path().join("late.log"), log.repeat(3)).unwrap();
+    for line in ["shadow late.log", "shadow late.log --json", "shadow late.log --ber 0.01"] {
+        let (code, out, said) = gateway(folder.path(), line);
+        assert_eq!((code, said.as_str()), (Some(0), ""), "{line}");
+        assert!(!out.is_empty());
+    }
+}

@@ -84,6 +84,18 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
 }
 
 #[test]
+fn what_is_no_regular_file_is_no_flash_and_holds_nobody_up() {
+    let place = written();
+    let path = place.path("flash/vcan0-3.flash");
+    fs::remove_file(&path).unwrap();
+    let (kind, mode) = (rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600));
+    rustix::fs::mknodat(rustix::fs::CWD, &path, kind, mode, 0).unwrap();
+    let ended = place.bench(1.0, "--flash flash --quiet").end();
+    let why = "flash of cell 3 (flash/vcan0-3.flash): it is no regular file: move it away";
+    assert!(ended.code() == Some(1) && ended.stderr.contains(why), "{ended:#?}");
+}
+
+#[test]
 fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     let place = written();
     damage(&place, 3);

@@ -192,3 +192,76 @@ fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
     let whole = whole.ok_or(Damage::Overrun { bytes, left: rest.len() as u64 });
     Some(whole.map(|(body, rest)| (opcode, body, rest.len())))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A chunk's record, with what it claims to unpack to.
+    fn chunk(claimed: u64, checksum: u32, compression: &str, packed: &[u8]) -> Vec<u8> {
+        let name = u32::try_from(compression.len()).unwrap().to_le_bytes();
+        let packed = [&(packed.len() as u64).to_le_bytes()[..], packed].concat();
+        let head = [[0; 8], [0; 8], claimed.to_le_bytes()].concat();
+        [&head[..], &checksum.to_le_bytes(), &name, compression.as_bytes(), &packed].concat()
+    }
+
+    fn record(claimed: u64, body: &[u8]) -> Vec<u8> {
+        [&[5][..], &claimed.to_le_bytes(), body].concat()
+    }
+
+    fn unpacked(record: &[u8]) -> Result<Vec<(u8, Vec<u8>)>, Damage> {
+        let mut chunk = Chunk::new();
+        chunk.unpack(record, 1_000)?;
+        Ok(std::iter::from_fn(|| chunk.next().map(|(code, body)| (code, body.to_vec()))).collect())
+    }
+
+    #[test]
+    fn whatever_its_compression_a_chunk_has_its_records() {
+        let two = [record(3, b"abc"), record(0, b"")].concat();
+        let length = two.len() as u64;
+        let checksum = crc32fast::hash(&two);
+        let zstd = zstd::bulk::compress(&two, 1).unwrap();
+        // In two frames, and with something behind them.
+        let (first, second) = two.split_at(7);
+        let frames = [first, second].map(|part| zstd::bulk::compress(part, 1).unwrap()).concat();
+        let expected = Ok(vec![(5, b"abc".to_vec()), (5, Vec::new())]);
+        for (compression, packed) in
+            [("", two.clone()), ("zstd", zstd), ("zstd", [&frames[..], b"more"].concat())]
+        {
+            assert_eq!(unpacked(&chunk(length, checksum, compression, &packed)), expected);
+            assert_eq!(unpacked(&chunk(length, 0, compression, &packed)), expected, "no checksum");
+            let wrong = Damage::Checksum { what: "a chunk", saved: 1, found: checksum };
+            assert_eq!(unpacked(&chunk(length, 1, compression, &packed)), Err(wrong));
+        }
+    }
+
+    #[test]
+    fn what_a_chunk_claims_is_compared_with_what_is_there() {
+        let one = record(3, b"abc");
+        let long = record(u64::MAX, b"abc");
+        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(Damage::Overrun { bytes: u64::MAX, left: 3 }));
+        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(Damage::Overrun { bytes: 9, left: 5 }));
+        assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(Damage::Unpacked { claimed: 11, found: 12 }));
+        let none = Damage::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: LONGEST };
+        assert_eq!(unpacked(&chunk(u64::MAX, 0, "zstd", &one)), Err(none));
+        assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(Damage::Unpack(_))));
+        assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(Damage::Unpack(_))));
+        assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(Damage::Compression("br".to_owned())));
+        let whole = chunk(12, 0, "zstd", &zstd::bulk::compress(&one, 1).unwrap());
+        for end in 0..whole.len() {
+            assert!(unpacked(&whole[..end]).is_err(), "{end}");
+        }
+    }
+
+    #[test]
+    fn chunks_may_not_unpack_to_far_more_than_their_file() {
+        let zeros = vec![0; 100 << 20];
+        let packed = zstd::bulk::compress(&record(zeros.len() as u64, &zeros), 1).unwrap();
+        let record = chunk(zeros.len() as u64 + 9, 0, "zstd", &packed);
+        let mut chunk = Chunk::new();
+        assert_eq!((chunk.unpack(&record, 0), chunk.unpack(&record, 0)), (Ok(()), Ok(())));
+        let bomb = Damage::Bomb { read: 0, limit: FREE_BYTES, what: "bytes" };
+        assert_eq!(chunk.unpack(&record, 0), Err(bomb));
+        assert_eq!(chunk.next(), None);
+    }
+}

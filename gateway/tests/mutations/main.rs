@@ -104,6 +104,17 @@ fn whatever_a_recording_is_every_command_ends_and_says_why() {
 }
 
 #[test]
+fn a_report_finds_the_skin_behind_the_messages() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, seed) in seeds::all(&seeds::skin()) {
+        fs::write(folder.path().join("m.mcap"), seed).unwrap();
+        let (status, said) = run(folder.path(), "report m.mcap --force");
+        let of_a_run = !["converted", "another bridge's"].contains(&name);
+        assert_eq!(status.success(), of_a_run, "{name}: {said}");
+    }
+}
+
+#[test]
 fn files_that_unpack_to_far_more_than_they_are_end_in_bounded_memory() {
     let folder = tempfile::tempdir().unwrap();
     let skin = seeds::skin();

@@ -131,21 +131,8 @@ pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
         }
         1 | 2 => damage(&mut file, chance),
         3 => {
-            // The length of a record.
-            let heads = records(&seed[8..]).into_iter().scan(8, |place, (_, body)| {
-                let head = *place;
-                *place += 9 + body.len();
-                Some(head)
-            });
-            let heads: Vec<_> = heads.collect();
-            let head = heads[at(chance, heads.len())] + 1;
-            let length = u64::from_le_bytes(file[head..head + 8].try_into().unwrap());
-            let wrong = match chance.random_range(0..3) {
-                0 => length.wrapping_add(chance.random_range(1..20)),
-                1 => length.wrapping_sub(chance.random_range(1..20)),
-                _ => extreme(chance),
-            };
-            file[head..head + 8].copy_from_slice(&wrong.to_le_bytes());
+            let end = file.len();
+            wrong_length(&mut file, 8, end, chance);
             "a record's length"
         }
         kind => {
@@ -206,11 +193,35 @@ pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
     (how.to_owned(), file)
 }
 
+/// Makes the length of one of the records from a place on a wrong one: often the last one's.
+fn wrong_length(bytes: &mut [u8], from: usize, to: usize, chance: &mut impl Rng) {
+    let heads = records(&bytes[from..to]).into_iter().scan(from, |place, (_, body)| {
+        let head = *place;
+        *place += 9 + body.len();
+        Some(head)
+    });
+    let heads: Vec<_> = heads.collect();
+    let chosen = if chance.random() { at(chance, heads.len()) } else { heads.len() - 1 };
+    let head = heads[chosen] + 1;
+    let length = u64::from_le_bytes(bytes[head..head + 8].try_into().unwrap());
+    let wrong = match chance.random_range(0..3) {
+        0 => length.wrapping_add(chance.random_range(1..200)),
+        1 => length.wrapping_sub(chance.random_range(1..20)),
+        _ => extreme(chance),
+    };
+    bytes[head..head + 8].copy_from_slice(&wrong.to_le_bytes());
+}
+
 /// Damages what is in a chunk: one of its records, mostly so that the others stay what they are.
 fn inside_out(inside: &mut Vec<u8>, chance: &mut impl Rng) {
-    if chance.random_range(0..4) == 0 {
-        damage(inside, chance);
-        return;
+    let end = inside.len();
+    match chance.random_range(0..5) {
+        0 => {
+            damage(inside, chance);
+            return;
+        }
+        1 | 2 => return wrong_length(inside, 0, end, chance),
+        _ => {}
     }
     let mut all = records(inside);
     for _ in 0..chance.random_range(1..4) {

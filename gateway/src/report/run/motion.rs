@@ -162,3 +162,17 @@ fn note(histogram: &mut Histogram<u64>, micros: f64) {
     // The histogram grows by itself; it cannot refuse.
     let _ = histogram.record((micros.max(0.0) * 1e3).round() as u64);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_ticks_that_cannot_be_are_counted_as_far_as_a_count_goes() {
+        let mut motion = Motion::new(1);
+        for tick in [u64::MAX - 1, 0, u64::MAX] {
+            motion.timing(0.0, &LoopTiming { tick, skipped: u64::MAX, ..LoopTiming::default() });
+        }
+        assert_eq!((motion.ticks, motion.skipped), (3, u64::MAX));
+    }
+}
