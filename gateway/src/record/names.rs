@@ -160,7 +160,10 @@ fn nameless(path: &Path) -> Option<io::Result<File>> {
 
 fn named(path: &Path) -> io::Result<File> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
-    claim(&mut file)?;
+    claim(&mut file).inspect_err(|_| {
+        // It is ours, and nobody's without its mark.
+        let _ = fs::remove_file(path);
+    })?;
     Ok(file)
 }
 
