@@ -5,6 +5,7 @@ use std::fs::{self, File, Permissions};
 use std::io::Write;
 use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use gateway::record::file::FileWriter;
 use gateway::record::names::Part;
@@ -41,7 +42,7 @@ fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     };
     let options = Options { mcap: Some(mcap), ..Options::default() };
     let mut said = Vec::new();
-    let claimed = Outputs::claim(&options, |line| {
+    let claimed = Outputs::claim(&options, &AtomicBool::new(false), |line| {
         said.push(line.replace(&format!("{}/", folder.display()), ""));
     });
     (claimed, said)

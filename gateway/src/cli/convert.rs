@@ -156,7 +156,10 @@ impl Convert {
     }
 
     /// The output; standard output is written to as it is.
-    fn create(&self, stopped: &AtomicBool) -> Result<(Option<WholeFile>, BufWriter<File>), Failure> {
+    fn create(
+        &self,
+        stopped: &AtomicBool,
+    ) -> Result<(Option<WholeFile>, BufWriter<Stoppable<File>>), Failure> {
         let begun = if is_standard(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
@@ -164,7 +167,7 @@ impl Convert {
                 .map(|(whole, file)| (Some(whole), file))
         };
         let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;
-        Ok((whole, BufWriter::with_capacity(PIECE, file)))
+        Ok((whole, BufWriter::with_capacity(PIECE, Stoppable::new(file))))
     }
 
     /// What OUT is to be, by its name.

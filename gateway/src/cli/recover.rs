@@ -1,7 +1,6 @@
 //! `gateway recover`: makes a recording whole whose writer was killed.
 
 use std::fs::File;
-use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
