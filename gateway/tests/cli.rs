@@ -77,8 +77,8 @@ fn times_names_and_directions_are_those_of_the_log() {
     let log = "(0000000012.000034567)   can0  123#11.22 T\r\n# more\n\n(1.000000) slcan0 20c##1 R";
     child.stdin.take().unwrap().write_all(log.as_bytes()).unwrap();
     let Output { status, stdout, .. } = child.wait_with_output().unwrap();
-    let expected = "(12.000034567) can0 123#1122 T\tlength  sum 35: 2 data bytes, not 8\n\
-                    (1.000000) slcan0 20C##1 R\tlength  torque 12: 0 data bytes, not 16\n";
+    let expected = "(12.000034567) can0 123#1122 T\tforeign no packet: 2 data bytes, not 8\n\
+                    (1.000000) slcan0 20C##1 R\tforeign no packet: 0 data bytes, not 16\n";
     assert_eq!((status.code(), text(&stdout)), (Some(0), expected));
 }
 
@@ -104,7 +104,7 @@ fn filters_pick_by_kind_node_and_time() {
         ["half    joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
     assert_eq!(decoded(&classic), pair);
     let only_fd = output(gateway(&format!("dump {} --format fd --max 1", golden("classic.log"))));
-    assert_eq!(decoded(&only_fd), ["length  halt: 8 data bytes, not 16"]);
+    assert_eq!(decoded(&only_fd), ["foreign no packet: 8 data bytes, not 16"]);
 }
 
 #[test]

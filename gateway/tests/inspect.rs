@@ -99,31 +99,32 @@ fn a_capture_in_numbers_is_a_table_or_an_object() {
     let folder = folder.path();
     let log = "(1.000000) vcan0 001##500001CCFBE28F5C608C000000706BE4E\n\
                (1.016000) vcan0 20C##5CDFB7B0C000000000000000007014157\n\
+               (1.018000) vcan0 20C##5CDFB7B0C000000000000000007014157\n\
                DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket (total drops 12)\n\
                (1.020000) vcan0 20C##5CDFB7B0C000000000000000007014158\n\
                (1.000000) can1 12345678#\n";
     std::fs::write(folder.join("small.log"), log).unwrap();
     let Output { status, stdout, stderr } = gateway(folder, "dump small.log --stats --json");
-    let complaint = "small.log:3: 12 frames are missing here: candump lost them\n";
+    let complaint = "small.log:4: 12 frames are missing here: candump lost them\n";
     assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(0), Ok(complaint)));
     let numbers: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
-    assert_eq!((&numbers["format"], &numbers["frames"]), (&"candump log".into(), &4.into()));
+    assert_eq!((&numbers["format"], &numbers["frames"]), (&"candump log".into(), &5.into()));
     assert_eq!(numbers["times_backwards"], 1);
     let bus = &numbers["buses"][0];
     assert_eq!(
         (&bus["bus"], &bus["dropped"], &bus["refused"]["crc"]),
         (&"vcan0".into(), &12.into(), &1.into())
     );
-    assert_eq!((&bus["epochs"]["first"], &bus["cells"][0]["torques"]), (&7.into(), &1.into()));
-    assert_eq!(numbers["buses"][1]["refused"]["extended"], 1);
+    assert_eq!((&bus["epochs"]["first"], &bus["cells"][0]["torques"]), (&7.into(), &2.into()));
+    assert_eq!(numbers["buses"][1]["foreign"]["extended"], 1);
     let table = String::from_utf8(gateway(folder, "dump small.log --stats").stdout).unwrap();
     for part in [
         "small.log",
         "candump log, 0.020 s",
-        "4 frames",
+        "5 frames",
         "12 ",
         "1 CRC",
-        "1 29-bit identifier",
+        "29-bit identifiers",
         "7 to 7",
         "7..7",
     ] {

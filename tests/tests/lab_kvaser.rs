@@ -17,7 +17,6 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use gateway::decode::{Decoded, Decoder};
 use gateway::generate::{Format as Generated, Wanted, generate};
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, by_identifier, command, frames_of, tool};
@@ -25,6 +24,7 @@ use process::{PATIENCE, Place, Running, Summary, until};
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Line, parse};
+use protocol::packet::{Half, Paired, data_id};
 use protocol::time::Micros;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -181,14 +181,16 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
 
 /// How many packets a log has, and how many halves that found no other in time.
 fn pairs(log: &str) -> (u64, u64) {
-    let (mut decoder, mut whole, mut incomplete) = (Decoder::new(Some(Format::Classic)), 0, 0);
+    let (mut halves, mut whole, mut incomplete) = (vec![Half::NONE; 1 << 11], 0, 0);
     for line in log.lines() {
         let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
-        match decoder.decode(Micros(record.time.nanos / 1_000), record.interface, &record.frame) {
-            Decoded::Foreign(_) | Decoded::Half { incomplete: false, .. } => {}
-            Decoded::Half { incomplete: true, .. } => incomplete += 1,
-            Decoded::Message(_) | Decoded::Meaningless { .. } => whole += 1,
-            other @ (Decoded::Wire(..) | Decoded::Refused { .. }) => panic!("{line}: {other:?}"),
+        let Ok(id) = data_id(&record.frame) else { continue };
+        let half = &mut halves[usize::from(id.to_bits())];
+        match half.push(Micros(record.time.nanos / 1_000), id, record.frame.data()) {
+            Ok(Paired::Waiting) => {}
+            Ok(Paired::Incomplete) => incomplete += 1,
+            Ok(Paired::Whole(_)) => whole += 1,
+            Err(error) => panic!("{line}: {error}"),
         }
     }
     (whole, incomplete)

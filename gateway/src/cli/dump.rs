@@ -9,11 +9,10 @@ use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use clap::{Args, ValueEnum};
 use gateway::capture::{self, Entry, Extras, NoteKind, Reader};
-use gateway::decode::Decoder;
 use gateway::decode::pick::{self, Pick, Wanted};
 use gateway::decode::stats::Report;
 use protocol::bus::{Bus, BusError, Choice, Inbox, Options};
@@ -21,6 +20,7 @@ use protocol::can::{self, EXTENDED_MASK};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
 use protocol::stop::Stoppable;
+use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
 
@@ -30,9 +30,10 @@ use super::output;
 
 /// Show what is on a bus or in a capture, in words beside the raw frames
 ///
-/// One line a frame: the frame as `candump -L` prints it, a tab, a verdict (ok; half, the first frame of two on
-/// a classic bus; foreign, length, CRC or meaning when it is refused), and what the frame says. So `cut -f1`
-/// gives a candump log. A capture is a candump log or an MCAP recording; what cannot be read of it is named on
+/// One line a frame: the frame as `candump -L` prints it, a tab, a verdict, and what the frame says. The verdict is
+/// ok; half, the first frame of two on a classic bus; foreign, no packet of this protocol; length, CRC or incomplete,
+/// damaged: no packet, under an identifier that carries packets; or meaning, a packet that says nothing known. So
+/// `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; what cannot be read of it is named on
 /// standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with
 /// --stats there are tables at the end instead.
 #[derive(Args, Debug)]
@@ -47,7 +48,7 @@ pub(crate) struct Dump {
     #[arg(value_name = "BUS|FILE")]
     source: PathBuf,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, wire, and foreign
+    /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Wanted>,
     /// Only packets from or to these: a cell's number, gateway, everyone
@@ -72,7 +73,8 @@ pub(crate) struct Dump {
     /// One JSON object a line; with --stats, one in all
     #[arg(long)]
     json: bool,
-    /// At the end, instead of lines: frames and rates by kind, gaps, losses, refused frames, a line for each cell
+    /// At the end, instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for each cell and
+    /// for each foreign identifier
     ///
     /// A live bus is counted until --to, --max or Ctrl-C. Frames that the filters leave out are not counted, and
     /// what needs them (what is missed, what is lost) would be wrong; so only --from, --to and --max go with it.
@@ -140,7 +142,7 @@ impl Dump {
         let pick = Pick { kinds, nodes, from, to };
         let max = self.max.unwrap_or(u64::MAX);
         let mut show =
-            Show::new(BufWriter::new(Stoppable::new(&out)), Decoder::new(format), pick, contact, how, max);
+            Show::new(BufWriter::new(Stoppable::new(&out)), format, pick, contact, how, max);
         let stopped = stopped()?;
         let (what, extras, done) = match file {
             Some(file) => {
@@ -160,7 +162,7 @@ impl Dump {
                 ("live", None, live(&bus, &mut show, to, &stopped))
             }
         };
-        written(show.flush())?;
+        written(show.finish().and_then(|_| show.flush()))?;
         let report = show.report();
         drop(show);
         if let Some(report) = report {
@@ -282,6 +284,15 @@ fn captured(
     Ok(())
 }
 
+/// How often it is looked whether a classic frame waits in vain for its other half.
+const SETTLE: Duration = Duration::from_millis(20);
+
+/// The time, on the clock of received frames.
+fn now() -> Micros {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    Micros(u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
+}
+
 /// Shows a bus until somebody says stop, or it is closed.
 fn live(
     bus: &Bus,
@@ -296,8 +307,13 @@ fn live(
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
         }
-        match bus.wait(Some(LOOK)).and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) }) {
-            Ok(0) => continue,
+        let patience = if show.is_waiting() { SETTLE } else { LOOK };
+        match bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) }) {
+            Ok(0) => match show.handle_time(now()).and_then(|flow| show.flush().map(|()| flow)) {
+                Ok(Flow::More) => continue,
+                Ok(Flow::Enough) => break Ok(()),
+                Err(error) => break written(Err(error)),
+            },
             Ok(_) => down = false,
             Err(error) if error.may_pass() => {
                 if !std::mem::replace(&mut down, true) {

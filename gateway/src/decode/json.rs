@@ -10,13 +10,13 @@ use protocol::message::{
     Answer, From, Heard, Heartbeat, Message, NetworkPage, PortState, Ports, Refused, Request, SensorPage,
     State, Tree,
 };
-use protocol::packet::{BYTES, PacketError, WORDS};
+use protocol::packet::{BYTES, WORDS};
 use protocol::parameters::{Cuts, Events, Parameter, Reply, Sensing, Slots};
 use protocol::wire::{Hello, Label, Lane, PortMessage, Walk};
 use serde::Serialize;
 
 use super::parameter::{Name, reason};
-use super::{Decoded, Foreign, wires};
+use super::{Decoded, Fault, Foreign, wires};
 
 /// A frame and what it says.
 #[derive(Serialize)]
@@ -302,27 +302,21 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
     };
     match *decoded {
         Decoded::Foreign(foreign) => {
-            line.error = Some(match foreign {
-                Foreign::Extended => "29-bit identifier".to_owned(),
-                Foreign::Remote => "remote frame".to_owned(),
-                Foreign::Error => "error frame of the driver".to_owned(),
-            });
+            if let Foreign::Data(fault) = foreign {
+                line.fails(fault);
+            }
+            line.error = Some(foreign.to_string());
         }
         Decoded::Wire(lane, message) => {
             line.kind = Some("wire");
             line.crc = Some(word(last_word(record)));
             line.say_over(lane, message);
         }
-        Decoded::Half { id, incomplete } => {
+        Decoded::Half { id } => line.about(id),
+        Decoded::Damaged { id, fault } => {
             line.about(id);
-            line.error = incomplete.then(|| "the half before it dropped: incomplete".to_owned());
-        }
-        Decoded::Refused { id, error } => {
-            line.about(id);
-            if let PacketError::Crc { expected, got } = error {
-                (line.crc, line.crc_expected) = (Some(word(got)), Some(word(expected)));
-            }
-            line.error = Some(error.to_string());
+            line.fails(fault);
+            line.error = Some(fault.to_string());
         }
         Decoded::Meaningless { packet, error } => {
             line.about(packet.id);
@@ -362,6 +356,13 @@ impl Line<'_> {
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
+    }
+
+    /// The CRC that would have made a packet of it.
+    fn fails(&mut self, fault: Fault) {
+        if let Fault::Crc { expected, got } = fault {
+            (self.crc, self.crc_expected) = (Some(word(got)), Some(word(expected)));
+        }
     }
 
     fn say_over(&mut self, Lane { wire, back }: Lane, message: PortMessage) {
@@ -747,10 +748,20 @@ mod tests {
     #[test]
     fn what_is_no_packet_says_why() {
         let wrong = object(BAD, "bad crc expected=9C2A got=E74B");
-        assert_eq!((&wrong["verdict"], &wrong["kind"]), (&json!("CRC"), &json!("torque")));
+        assert_eq!((&wrong["verdict"], wrong.get("kind")), (&json!("foreign"), None));
         assert_eq!((&wrong["crc"], &wrong["crc_expected"]), (&json!("E74B"), &json!("9C2A")));
-        assert_eq!(wrong["error"], json!("CRC E74B, not 9C2A"));
-        let foreign = objects(BAD).into_iter().find(|(_, object)| object["verdict"] == "foreign").unwrap().1;
+        assert_eq!(wrong["error"], json!("no packet: CRC E74B, not 9C2A"));
+        let frame = candump::parse_frame("20C##10011").unwrap();
+        let time = candump::Timestamp { nanos: 0, nine_digits: false };
+        let record = Record { time, interface: "can0", frame, direction: None };
+        let id = protocol::packet::data_id(&frame).unwrap();
+        let mut line = Vec::new();
+        write(&mut line, &record, &Decoded::Damaged { id, fault: Fault::Crc { expected: 1, got: 2 } })
+            .unwrap();
+        let damaged: Value = serde_json::from_slice(&line).unwrap();
+        assert_eq!((&damaged["verdict"], &damaged["kind"]), (&json!("CRC"), &json!("torque")));
+        assert_eq!((&damaged["node"], &damaged["crc_expected"]), (&json!(12), &json!("0001")));
+        let foreign = objects(BAD).into_iter().find(|(comment, _)| comment == "bad foreign").unwrap().1;
         assert_eq!((foreign.get("node"), &foreign["error"]), (None, &json!("29-bit identifier")));
     }
 

@@ -2,15 +2,18 @@
 //!
 //! ```text
 //!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text
-//!                          └ a waiting half for each identifier of each classic bus
+//!                          └ for each identifier of each bus: a waiting half, and whether packets come under it
 //! ```
 //!
-//! Each line begins with a verdict of one word, by the names under which cells and the gateway count what
-//! they refuse: `ok`, `half` (the first frame of two; classic buses), `foreign`, `length`, `CRC`, `meaning`.
+//! A frame is ours as a whole packet with the right CRC, or as one of its two classic halves. Every other frame is
+//! foreign; one under an identifier that carries packets is damaged. Each line begins with a verdict of one word:
+//! `ok`, `half` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
+//! that says nothing known: `meaning`.
 
 pub mod json;
 pub mod parameter;
 pub mod pick;
+pub mod settle;
 pub mod stats;
 mod switch;
 mod text;
@@ -23,9 +26,10 @@ use protocol::message::{Message, MessageError, NetworkPage, SensorPage, State};
 use protocol::packet::{Half, Packet, PacketError, Paired, WORDS, data_id};
 use protocol::time::Micros;
 use protocol::wire::{self, PortMessage};
+use thiserror::Error;
 
-/// Classic buses whose halves are paired at the same time; beyond them the oldest is forgotten.
-const LANES: usize = 64;
+/// Buses that are followed at the same time; beyond them the oldest is forgotten.
+const BUSES: usize = 64;
 /// Identifiers of 11 bits.
 const IDS: usize = 0x800;
 
@@ -36,19 +40,17 @@ pub enum Decoded {
     Foreign(Foreign),
     /// What a cell, or the gateway's side, says over a simulated wire. It is on no real bus.
     Wire(wire::Lane, PortMessage),
-    /// The first half of a packet in two classic frames.
+    /// The first half of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
     Half {
         /// Its identifier.
         id: Id,
-        /// Whether a half was waiting already, which did not belong to this one and is dropped.
-        incomplete: bool,
     },
-    /// A frame under our identifiers that is no packet.
-    Refused {
+    /// No packet, under an identifier that carries packets.
+    Damaged {
         /// Its identifier.
         id: Id,
-        /// Why.
-        error: PacketError,
+        /// Why it is no packet.
+        fault: Fault,
     },
     /// A packet that says nothing this version knows.
     Meaningless {
@@ -62,14 +64,66 @@ pub enum Decoded {
 }
 
 /// Why a frame is none of this protocol's.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 pub enum Foreign {
     /// 29 bits.
+    #[error("29-bit identifier")]
     Extended,
     /// It asks for data.
+    #[error("remote frame")]
     Remote,
     /// The driver's report of an error.
+    #[error("error frame of the driver")]
     Error,
+    /// A data frame with an 11-bit identifier under which no packets come.
+    #[error("no packet: {0}")]
+    Data(Fault),
+}
+
+/// Why a data frame with an 11-bit identifier is no packet.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+pub enum Fault {
+    /// Another length or format than that of a packet.
+    #[error("{got} data bytes, not {expected}")]
+    Length {
+        /// Bytes that the format has.
+        expected: usize,
+        /// Bytes that came.
+        got: usize,
+    },
+    /// Wrong checksum.
+    #[error("CRC {got:04X}, not {expected:04X}")]
+    Crc {
+        /// What the bytes give.
+        expected: u16,
+        /// What the frame says.
+        got: u16,
+    },
+    /// A classic frame that gives no packet with the one before it or the one after it.
+    #[error("no other half")]
+    Incomplete,
+}
+
+impl Fault {
+    /// One word for it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Length { .. } => "length",
+            Self::Crc { .. } => "CRC",
+            Self::Incomplete => "incomplete",
+        }
+    }
+}
+
+impl From<PacketError> for Fault {
+    fn from(error: PacketError) -> Self {
+        match error {
+            PacketError::Length { expected, got } => Self::Length { expected, got },
+            PacketError::Crc { expected, got } => Self::Crc { expected, got },
+            PacketError::Foreign | _ => Self::Incomplete,
+        }
+    }
 }
 
 impl Foreign {
@@ -91,10 +145,8 @@ impl Decoded {
         match self {
             Self::Message(_) | Self::Wire(..) => "ok",
             Self::Half { .. } => "half",
-            Self::Foreign(_) | Self::Refused { error: PacketError::Foreign, .. } => "foreign",
-            Self::Refused { error: PacketError::Length { .. }, .. } => "length",
-            Self::Refused { error: PacketError::Crc { .. }, .. } => "CRC",
-            Self::Refused { .. } => "refused",
+            Self::Foreign(_) => "foreign",
+            Self::Damaged { fault, .. } => fault.name(),
             Self::Meaningless { .. } => "meaning",
         }
     }
@@ -109,25 +161,10 @@ impl Decoded {
             | Self::Foreign(_)
             | Self::Wire(..)
             | Self::Half { .. }
-            | Self::Refused { .. }
+            | Self::Damaged { .. }
             | Self::Meaningless { .. } => false,
         }
     }
-}
-
-/// Tells what frames are, pairing halves on the way.
-#[derive(Debug)]
-pub struct Decoder {
-    format: Option<Format>,
-    lanes: Vec<Lane>,
-}
-
-/// A classic bus.
-#[derive(Debug)]
-struct Lane {
-    bus: String,
-    /// By identifier.
-    halves: Vec<Half>,
 }
 
 impl Decoded {
@@ -159,7 +196,7 @@ impl Decoded {
             Self::Foreign(_)
             | Self::Wire(..)
             | Self::Half { .. }
-            | Self::Refused { .. }
+            | Self::Damaged { .. }
             | Self::Meaningless { .. } => false,
         }
     }
@@ -173,55 +210,165 @@ pub fn wired(frame: &Frame) -> Option<(wire::Lane, PortMessage)> {
     Some((lane, lane.read(frame)?))
 }
 
+/// What has come under an identifier, and so whether it is one of ours.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Traffic {
+    packets: u64,
+    others: u64,
+}
+
+impl Traffic {
+    /// So many packets are enough: chance makes one of two frames in 65 536.
+    const PACKETS: u64 = 2;
+    /// For each packet there may be so many frames that are none.
+    const OTHERS: u64 = 32;
+
+    /// A packet came.
+    pub const fn packet(&mut self) {
+        self.packets += 1;
+    }
+
+    /// A frame came that is no packet, nor half of one.
+    pub const fn other(&mut self) {
+        self.others += 1;
+    }
+
+    /// Whether the identifier carries packets: then what is no packet is damaged, else it is foreign.
+    #[must_use]
+    pub const fn carries_packets(self) -> bool {
+        self.packets >= Self::PACKETS && self.others <= Self::OTHERS * self.packets
+    }
+}
+
+/// Tells what frames are, pairing halves on the way.
+#[derive(Debug)]
+pub struct Decoder {
+    format: Option<Format>,
+    buses: Vec<Bus>,
+    /// Buses seen, also those that are forgotten.
+    seen: u64,
+}
+
+/// A bus as it is followed.
+#[derive(Debug)]
+struct Bus {
+    name: String,
+    /// Another one than that of any bus before it.
+    number: u64,
+    ids: Vec<Slot>,
+}
+
+/// An identifier of a bus.
+#[derive(Clone, Copy, Debug, Default)]
+struct Slot {
+    half: Half,
+    /// The number of the frame that waits.
+    waiting: Option<u64>,
+    traffic: Traffic,
+}
+
+impl Slot {
+    /// A frame that is no packet, nor half of one.
+    const fn refuse(&mut self, id: Id, fault: Fault) -> Decoded {
+        self.traffic.other();
+        if self.traffic.carries_packets() {
+            Decoded::Damaged { id, fault }
+        } else {
+            Decoded::Foreign(Foreign::Data(fault))
+        }
+    }
+}
+
+/// What came of a frame, and with it of the one that waited under its identifier.
+struct Taken {
+    decoded: Decoded,
+    /// On which bus it waits for its other half.
+    waits: Option<u64>,
+    /// The number of a frame that waited, and what it was.
+    older: Option<(u64, Decoded)>,
+}
+
+impl From<Decoded> for Taken {
+    fn from(decoded: Decoded) -> Self {
+        Self { decoded, waits: None, older: None }
+    }
+}
+
 impl Decoder {
     /// For buses of one format; with `None` each frame is taken for what it is.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
-        Self { format, lanes: Vec::new() }
+        Self { format, buses: Vec::new(), seen: 0 }
     }
 
-    /// Takes the next frame. Bounded memory, whatever comes. Never panics.
+    /// Takes the next frame. What a classic frame is may come out only later: it is told as a [`Decoded::Half`]
+    /// until then; [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
+        self.take(0, at, bus, frame).decoded
+    }
+
+    /// Takes the next frame under a number.
+    fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> Taken {
         let Ok(id) = data_id(frame) else {
-            return wired(frame).map_or_else(
-                || Decoded::Foreign(Foreign::of(frame)),
-                |(lane, message)| Decoded::Wire(lane, message),
-            );
+            let wired = wired(frame).map(|(lane, message)| Decoded::Wire(lane, message));
+            return wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame))).into();
         };
-        let packet = match self.format.unwrap_or_else(|| frame.format()) {
-            Format::Fd => Packet::from_fd(frame),
-            Format::Classic => match self.pair(at, bus, id, frame) {
-                Ok(Paired::Waiting) => return Decoded::Half { id, incomplete: false },
-                Ok(Paired::Incomplete) => return Decoded::Half { id, incomplete: true },
-                Ok(Paired::Whole(packet)) => Ok(packet),
-                Err(error) => Err(error),
+        let format = self.format.unwrap_or_else(|| frame.format());
+        let bus = self.bus(bus);
+        let on = bus.number;
+        let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits");
+        let (packet, older) = match format {
+            Format::Fd => (Packet::from_fd(frame), None),
+            Format::Classic if frame.format() == Format::Fd => {
+                (Err(PacketError::Length { expected: 8, got: frame.data().len() }), None)
+            }
+            Format::Classic => match slot.half.push(at, id, frame.data()) {
+                Ok(Paired::Waiting | Paired::Incomplete) => {
+                    let older = slot.waiting.replace(number);
+                    let older = older.map(|older| (older, slot.refuse(id, Fault::Incomplete)));
+                    return Taken { decoded: Decoded::Half { id }, waits: Some(on), older };
+                }
+                Ok(Paired::Whole(packet)) => {
+                    (Ok(packet), slot.waiting.take().map(|older| (older, Decoded::Half { id })))
+                }
+                Err(error) => (Err(error), None),
             },
         };
-        match packet.map(|packet| (packet, Message::decode(&packet))) {
-            Ok((_, Ok(message))) => Decoded::Message(message),
-            Ok((packet, Err(error))) => Decoded::Meaningless { packet, error },
-            Err(error) => Decoded::Refused { id, error },
-        }
-    }
-
-    fn pair(&mut self, at: Micros, bus: &str, id: Id, frame: &Frame) -> Result<Paired, PacketError> {
-        let wrong = PacketError::Length { expected: 8, got: frame.data().len() };
-        if frame.format() == Format::Fd {
-            return Err(wrong);
-        }
-        let half = self.lane(bus).halves.get_mut(usize::from(id.to_bits())).ok_or(wrong)?;
-        half.push(at, id, frame.data())
-    }
-
-    fn lane(&mut self, bus: &str) -> &mut Lane {
-        let at = self.lanes.iter().position(|lane| lane.bus == bus).unwrap_or_else(|| {
-            if self.lanes.len() == LANES {
-                self.lanes.remove(0);
+        let decoded = match packet {
+            Ok(packet) => {
+                slot.traffic.packet();
+                match Message::decode(&packet) {
+                    Ok(message) => Decoded::Message(message),
+                    Err(error) => Decoded::Meaningless { packet, error },
+                }
             }
-            self.lanes.push(Lane { bus: bus.to_owned(), halves: vec![Half::NONE; IDS] });
-            self.lanes.len() - 1
+            Err(error) => slot.refuse(id, error.into()),
+        };
+        Taken { decoded, waits: None, older }
+    }
+
+    /// What a frame is whose other half does not come any more.
+    fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
+        let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
+        let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));
+        let Some(slot) = slot.filter(|slot| slot.waiting == Some(number)) else {
+            return Decoded::Foreign(Foreign::Data(Fault::Incomplete));
+        };
+        (slot.half, slot.waiting) = (Half::NONE, None);
+        slot.refuse(id, Fault::Incomplete)
+    }
+
+    fn bus(&mut self, name: &str) -> &mut Bus {
+        let at = self.buses.iter().position(|bus| bus.name == name).unwrap_or_else(|| {
+            if self.buses.len() == BUSES {
+                self.buses.remove(0);
+            }
+            self.seen += 1;
+            let ids = vec![Slot::default(); IDS];
+            self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids });
+            self.buses.len() - 1
         });
-        self.lanes.get_mut(at).expect("found, or just made")
+        self.buses.get_mut(at).expect("found, or just made")
     }
 }
 

@@ -7,7 +7,7 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::packet::data_id;
 use thiserror::Error;
 
-use super::wired;
+use super::Decoded;
 
 /// A kind of frame that is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -18,15 +18,17 @@ pub enum Wanted {
     Command(Command),
     /// What cells say over simulated wires.
     Wire,
-    /// What is not of this protocol.
+    /// What is not of this protocol, and what is damaged.
     Foreign,
+    /// What is no packet, under an identifier that carries packets.
+    Damaged,
 }
 
 /// A word that is no kind.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "{got:?} is no kind: command, sum, torque, sensors, network, configure, configured, stimulus are; also halt, \
-     joints, sync, resume, report alone, wire, and foreign"
+     joints, sync, resume, report alone, wire, foreign, and damaged"
 )]
 pub struct UnknownWanted {
     /// The word.
@@ -42,6 +44,7 @@ impl FromStr for Wanted {
         let other = || match word {
             "wire" => Some(Self::Wire),
             "foreign" => Some(Self::Foreign),
+            "damaged" => Some(Self::Damaged),
             _ => None,
         };
         kind.or_else(command).or_else(other).ok_or_else(|| UnknownWanted { got: word.to_owned() })
@@ -77,11 +80,12 @@ pub struct Pick {
 }
 
 impl Pick {
-    /// Whether a frame is shown that came at `nanos`, when the first one came at `first`.
+    /// Whether a frame is shown that came at `nanos` and is this, when the first one came at `first`.
     #[must_use]
-    pub fn takes(&self, first: u64, nanos: u64, frame: &Frame) -> bool {
-        let id = data_id(frame).ok();
-        self.takes_time(first, nanos) && self.takes_kind(id, frame) && self.takes_node(id)
+    pub fn takes(&self, first: u64, nanos: u64, frame: &Frame, decoded: &Decoded) -> bool {
+        let is_foreign = matches!(decoded, Decoded::Foreign(_));
+        let id = data_id(frame).ok().filter(|_| !is_foreign);
+        self.takes_time(first, nanos) && self.takes_kind(id, decoded) && self.takes_node(id)
     }
 
     fn takes_time(&self, first: u64, nanos: u64) -> bool {
@@ -90,16 +94,15 @@ impl Pick {
         after_from && before_to
     }
 
-    fn takes_kind(&self, id: Option<Id>, frame: &Frame) -> bool {
+    fn takes_kind(&self, id: Option<Id>, decoded: &Decoded) -> bool {
+        let is_damaged = matches!(decoded, Decoded::Damaged { .. });
         self.kinds.is_empty()
-            || self.kinds.iter().any(|wanted| match (wanted, id) {
-                (Wanted::Kind(kind), Some(id)) => id.kind == *kind,
-                (Wanted::Command(command), Some(id)) => id == Id::command(*command),
-                (Wanted::Foreign, None) => wired(frame).is_none(),
-                (Wanted::Wire, None) => wired(frame).is_some(),
-                (Wanted::Foreign | Wanted::Wire, Some(_)) | (Wanted::Kind(_) | Wanted::Command(_), None) => {
-                    false
-                }
+            || self.kinds.iter().any(|wanted| match wanted {
+                Wanted::Kind(kind) => id.is_some_and(|id| id.kind == *kind),
+                Wanted::Command(command) => id == Some(Id::command(*command)),
+                Wanted::Foreign => is_damaged || matches!(decoded, Decoded::Foreign(_)),
+                Wanted::Damaged => is_damaged,
+                Wanted::Wire => matches!(decoded, Decoded::Wire(..)),
             })
     }
 
@@ -121,15 +124,25 @@ impl Pick {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::can::EXTENDED;
+    use crate::decode::{Decoder, Foreign};
+    use protocol::can::{EXTENDED, Format};
+    use protocol::packet::{Epoch, Packet};
+    use protocol::time::Micros;
     use protocol::wire;
 
+    /// A packet of this identifier, or a foreign frame.
     fn frame(id: u32) -> Frame {
-        Frame::classic(id, &[]).unwrap()
+        let Ok(bits) = u16::try_from(id) else { return Frame::classic(id, &[]).unwrap() };
+        let packet = Packet { id: Id::from_bits(bits), words: [0; 6], epoch: Epoch(0), count: 1 };
+        packet.frames(Format::Fd).next().unwrap()
+    }
+
+    fn takes(pick: &Pick, frame: &Frame) -> bool {
+        pick.takes(0, 0, frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
     }
 
     #[test]
-    fn kinds_and_nodes_are_told_by_the_identifier() {
+    fn kinds_and_nodes_are_told_by_the_identifier_of_a_packet() {
         let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x400, 0x1234 | EXTENDED];
         let taken = |kinds: &[&str], nodes: &[&str]| -> Vec<u32> {
             let pick = Pick {
@@ -137,7 +150,7 @@ mod tests {
                 nodes: nodes.iter().map(|word| node(word).unwrap()).collect(),
                 ..Pick::default()
             };
-            ids.into_iter().filter(|&id| pick.takes(0, 0, &frame(id))).collect()
+            ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
         };
         assert_eq!(taken(&[], &[]), ids);
         assert_eq!(taken(&["command"], &[]), [0x000, 0x001]);
@@ -145,19 +158,36 @@ mod tests {
         assert_eq!(taken(&[], &["12"]), [0x20C, 0x50C]);
         assert_eq!(taken(&["configure"], &["12", "everyone"]), [0x50C, 0x5FF]);
         assert_eq!(taken(&[], &["gateway"]), [0x000, 0x001, 0x400]);
+        assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
         let wire = wire::Lane { wire: 3, back: true }.frame(wire::PortMessage::Join);
-        let takes = |kind: &str| {
-            let kinds = vec![kind.parse().unwrap()];
-            Pick { kinds, ..Pick::default() }.takes(0, 0, &wire)
+        let kinds = ["wire", "foreign", "command"];
+        let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
+        assert_eq!(kinds.map(|kind| takes(&of(kind), &wire)), [true, false, false]);
+        assert!(takes(&Pick::default(), &wire));
+    }
+
+    #[test]
+    fn a_frame_that_is_no_packet_is_foreign_under_every_identifier_and_damaged_only_under_ours() {
+        let wrong = Frame::fd(0x20C, 0, &[1; 16]).unwrap();
+        let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
+        let mut decoder = Decoder::new(None);
+        let mut taken = |frame: &Frame| {
+            let decoded = decoder.decode(Micros(0), "can0", frame);
+            ["torque", "foreign", "damaged"].map(|kind| of(kind).takes(0, 0, frame, &decoded))
         };
-        assert_eq!(["wire", "foreign", "command"].map(takes), [true, false, false]);
-        assert!(Pick::default().takes(0, 0, &wire));
+        assert_eq!(taken(&wrong), [false, true, false]);
+        assert_eq!([0, 1].map(|_| taken(&frame(0x20C))), [[true, false, false]; 2]);
+        assert_eq!(taken(&wrong), [true, true, true]);
+        let cell = Pick { nodes: vec![node("12").unwrap()], ..Pick::default() };
+        assert!(!takes(&cell, &wrong), "of another bus nothing is known");
     }
 
     #[test]
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
         let pick = Pick { from: Some(10), to: Some(20), ..Pick::default() };
-        let taken: Vec<u64> = (95..=125).filter(|&at| pick.takes(100, at, &frame(1))).collect();
+        let taken: Vec<u64> = (95..=125)
+            .filter(|&at| pick.takes(100, at, &frame(1), &Decoded::Foreign(Foreign::Remote)))
+            .collect();
         assert_eq!(taken, (110..120).collect::<Vec<_>>());
     }
 

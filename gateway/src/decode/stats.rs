@@ -11,10 +11,14 @@ use protocol::candump::Record;
 use protocol::fixed::Q;
 use protocol::id::CellId;
 use protocol::message::{Heartbeat, Message, NetworkPage, State, Tree};
-use protocol::packet::{Epoch, PacketError};
+use protocol::packet::Epoch;
 use serde::Serialize;
 
-use super::{Decoded, Foreign};
+use self::foreign::Foreigners;
+pub use self::foreign::{ForeignFrames, ForeignId, FrameType};
+use super::{Decoded, Fault};
+
+mod foreign;
 
 /// Buses that are told apart; frames of others are counted together.
 pub const BUSES: usize = 64;
@@ -43,6 +47,7 @@ struct Lane {
     kinds: [Count; NAMES.len()],
     wires: Count,
     refused: RefusedFrames,
+    foreign: Foreigners,
     dropped: u64,
     joints: Option<Joints>,
     epochs: Epochs,
@@ -66,7 +71,7 @@ const NAMES: [&str; 12] = [
     "stimulus",
 ];
 
-/// Packets of one kind, and when the first and the last of them came.
+/// Packets or frames of one kind, and when the first and the last of them came.
 #[derive(Clone, Copy, Debug, Default)]
 struct Count {
     packets: u64,
@@ -165,8 +170,10 @@ pub struct BusReport {
     pub kinds: Vec<KindReport>,
     /// What the joints say of themselves.
     pub epochs: Epochs,
-    /// Frames that are no packets of this protocol, by reason.
+    /// Damaged frames, and packets without a meaning, by reason.
     pub refused: RefusedFrames,
+    /// Frames that are none of this protocol.
+    pub foreign: ForeignFrames,
     /// Frames that whoever took the capture lost here, as it says itself.
     pub dropped: u64,
     /// The cells that said something, by number.
@@ -199,15 +206,9 @@ pub struct Epochs {
     pub jumps: u64,
 }
 
-/// Frames that are no packets of this protocol, by reason.
+/// Frames under identifiers that carry packets which are none, and packets that say nothing known, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedFrames {
-    /// 29-bit identifiers.
-    pub extended: u64,
-    /// Remote frames.
-    pub remote: u64,
-    /// The driver's error frames.
-    pub error: u64,
     /// Wrong length.
     pub length: u64,
     /// Wrong CRC.
@@ -221,17 +222,9 @@ pub struct RefusedFrames {
 impl RefusedFrames {
     /// The reasons by name, with how many frames each.
     #[must_use]
-    pub const fn by_reason(&self) -> [(&'static str, u64); 7] {
-        let Self { extended, remote, error, length, crc, meaning, incomplete } = *self;
-        [
-            ("29-bit identifier", extended),
-            ("remote", remote),
-            ("error frame", error),
-            ("length", length),
-            ("CRC", crc),
-            ("meaning", meaning),
-            ("incomplete", incomplete),
-        ]
+    pub const fn by_reason(&self) -> [(&'static str, u64); 4] {
+        let Self { length, crc, meaning, incomplete } = *self;
+        [("length", length), ("CRC", crc), ("meaning", meaning), ("incomplete", incomplete)]
     }
 }
 
@@ -286,7 +279,7 @@ impl Stats {
         let (earliest, latest) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((earliest.min(nanos), latest.max(nanos)));
         match self.lane(record.interface) {
-            Some(lane) => lane.take(nanos, decoded),
+            Some(lane) => lane.take(record, decoded),
             None => self.beyond += 1,
         }
     }
@@ -320,7 +313,7 @@ impl Stats {
             times_backwards: self.backwards,
             dropped: self.dropped,
             frames_of_other_buses: self.beyond,
-            buses: self.lanes.iter().map(|lane| lane.report(nanos)).collect(),
+            buses: self.lanes.iter().map(|lane| lane.report(self.span.unwrap_or_default())).collect(),
         }
     }
 }
@@ -344,6 +337,7 @@ impl Lane {
             kinds: [Count::default(); NAMES.len()],
             wires: Count::default(),
             refused: RefusedFrames::default(),
+            foreign: Foreigners::default(),
             dropped: 0,
             joints: None,
             epochs: Epochs::default(),
@@ -351,7 +345,8 @@ impl Lane {
         }
     }
 
-    fn take(&mut self, nanos: u64, decoded: &Decoded) {
+    fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
+        let nanos = record.time.nanos;
         if let Decoded::Wire(..) = decoded {
             self.wires.take(nanos);
             return;
@@ -359,16 +354,15 @@ impl Lane {
         self.frames += 1;
         let refused = &mut self.refused;
         match decoded {
-            Decoded::Wire(..) => {}
+            Decoded::Wire(..) | Decoded::Half { .. } => {}
             Decoded::Message(message) => self.message(nanos, message),
-            Decoded::Half { incomplete, .. } => refused.incomplete += u64::from(*incomplete),
             Decoded::Meaningless { .. } => refused.meaning += 1,
-            Decoded::Foreign(Foreign::Extended) => refused.extended += 1,
-            Decoded::Foreign(Foreign::Remote) => refused.remote += 1,
-            Decoded::Foreign(Foreign::Error) => refused.error += 1,
-            Decoded::Refused { error: PacketError::Length { .. }, .. } => refused.length += 1,
-            Decoded::Refused { error: PacketError::Crc { .. }, .. } => refused.crc += 1,
-            Decoded::Refused { .. } => refused.extended += 1,
+            Decoded::Foreign(foreign) => self.foreign.take(nanos, &record.frame, *foreign),
+            Decoded::Damaged { fault, .. } => match fault {
+                Fault::Length { .. } => refused.length += 1,
+                Fault::Crc { .. } => refused.crc += 1,
+                Fault::Incomplete => refused.incomplete += 1,
+            },
         }
     }
 
@@ -405,7 +399,7 @@ impl Lane {
         self.joints = Some(Joints { epoch, number: before + u64::try_from(step).unwrap_or(1) });
     }
 
-    fn report(&self, nanos: u64) -> BusReport {
+    fn report(&self, (earliest, latest): (u64, u64)) -> BusReport {
         let kinds = NAMES.into_iter().zip(self.kinds).filter(|(_, count)| count.packets > 0);
         let kinds = kinds.map(|(kind, count)| KindReport {
             kind,
@@ -416,12 +410,13 @@ impl Lane {
         BusReport {
             bus: self.bus.clone(),
             frames: self.frames,
-            frames_per_s: rate(self.frames, nanos),
+            frames_per_s: rate(self.frames, latest - earliest),
             wires: self.wires.packets,
             wires_per_s: self.wires.per_s(),
             kinds: kinds.collect(),
             epochs: self.epochs,
             refused: self.refused,
+            foreign: self.foreign.report(earliest),
             dropped: self.dropped,
             cells: cells.filter_map(|(node, cell)| Some(cell.as_ref()?.report(node))).collect(),
         }
@@ -528,7 +523,7 @@ impl Cell {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::decode::Decoder;
+    use crate::decode::settle::Settler;
     use protocol::can::{Format, Frame};
     use protocol::candump::Timestamp;
     use protocol::fixed::{Q3_12, Q7_8};
@@ -541,6 +536,7 @@ mod tests {
     #[derive(Default)]
     struct Tape {
         stats: Stats,
+        settler: Option<Settler<(u64, String, Frame)>>,
         ms: u64,
     }
 
@@ -548,9 +544,13 @@ mod tests {
         fn frame(&mut self, bus: &str, frame: Frame) {
             self.ms += 1;
             let nanos = self.ms * 1_000_000;
-            let time = Timestamp { nanos, nine_digits: false };
-            let decoded = Decoder::new(None).decode(Micros(nanos / 1_000), bus, &frame);
-            self.stats.take(&Record { time, interface: bus, frame, direction: None }, &decoded);
+            let settler = self.settler.get_or_insert_with(|| Settler::new(None));
+            settler.push(Micros(nanos / 1_000), bus, &frame, (nanos, bus.to_owned(), frame));
+            settler.finish();
+            while let Some(((nanos, bus, frame), decoded)) = settler.pop() {
+                let time = Timestamp { nanos, nine_digits: false };
+                self.stats.take(&Record { time, interface: &bus, frame, direction: None }, &decoded);
+            }
         }
 
         fn say(&mut self, message: &Message) {
@@ -670,13 +670,16 @@ mod tests {
     #[test]
     fn what_is_refused_is_counted_by_reason_and_bus() {
         let mut tape = Tape::default();
+        let packet = "20C##1001000F80100000000000000070175D6";
         for text in [
+            packet,
+            packet,
             "1F334455#11",
             "20C#R8",
             "20000004#0001000000000000",
+            "20D##1001000F80100000000000000070175D6",
             "20C##10011",
             "20C##1001000F80100000000000000070175D7",
-            "20C##1001000F80100000000000000070175D6",
             "20C#001000F801000000",
         ] {
             let frame = protocol::candump::parse_frame(text).unwrap();
@@ -687,10 +690,15 @@ mod tests {
         tape.stats.dropped("can1", 5);
         tape.stats.dropped("", 7);
         let report = tape.stats.report();
-        let expected =
-            RefusedFrames { extended: 1, remote: 1, error: 1, length: 1, crc: 1, meaning: 0, incomplete: 0 };
+        let expected = RefusedFrames { length: 1, crc: 1, meaning: 0, incomplete: 1 };
         for bus in &report.buses {
-            assert_eq!((bus.refused, bus.frames), (expected, 7));
+            assert_eq!((bus.refused, bus.frames), (expected, 9));
+            let ForeignFrames { frames, standard, extended, remote, error, .. } = bus.foreign;
+            assert_eq!((frames, standard, extended, remote, error), (4, 1, 1, 1, 1));
+            let ids: Vec<_> = bus.foreign.identifiers.iter().map(|id| (id.id.as_str(), id.of)).collect();
+            let (data, remote, error) = (FrameType::Data, FrameType::Remote, FrameType::Error);
+            assert_eq!(ids, [("20D", data), ("1F334455", data), ("20C", remote), ("20000004", error)]);
+            assert_eq!(bus.foreign.identifiers[0].wrong_crc, 1);
         }
         let dropped: Vec<_> = report.buses.iter().map(|bus| (bus.bus.as_str(), bus.dropped)).collect();
         assert_eq!((dropped, report.dropped), (vec![("can0", 0), ("can1", 5)], 7));

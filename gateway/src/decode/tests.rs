@@ -1,6 +1,7 @@
 //! The text of every kind of frame, against lines made by hand from the document and the golden logs'
 //! comments.
 
+use super::settle::Settler;
 use super::*;
 use proptest::prelude::*;
 use protocol::candump::{self, Line};
@@ -13,19 +14,36 @@ const CLASSIC: &str = include_str!("../../../protocol/tests/golden/classic.log")
 
 /// Each frame's comment in the log and its text here.
 fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
-    let mut decoder = Decoder::new(format);
-    let (mut comment, mut all) = ("", Vec::new());
+    let mut settler = Settler::new(format);
+    let mut comment = "";
     for line in log.lines() {
         match candump::parse(line).unwrap() {
             Line::Frame(record) => {
                 let at = Micros(record.time.nanos / 1_000);
-                let text = decoder.decode(at, record.interface, &record.frame).to_string();
-                all.push((comment.to_owned(), text));
+                settler.push(at, record.interface, &record.frame, comment.to_owned());
             }
             Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.trim_start_matches("# "),
         }
     }
-    all
+    settler.finish();
+    std::iter::from_fn(|| settler.pop()).map(|(comment, decoded)| (comment, decoded.to_string())).collect()
+}
+
+/// A decoder for which two packets of cell 12 have come, so that its torques are ours.
+fn knowing(format: Option<Format>) -> Decoder {
+    let mut decoder = Decoder::new(format);
+    let packet = Packet {
+        id: Id { kind: protocol::id::Kind::Torque, node: 12 },
+        words: [0; WORDS],
+        epoch: protocol::packet::Epoch(1),
+        count: 1,
+    };
+    for _ in 0..2 {
+        for frame in packet.frames(format.unwrap_or(Format::Fd)) {
+            decoder.decode(Micros(0), "vcan0", &frame);
+        }
+    }
+    decoder
 }
 
 /// The text of a frame as cansend takes it.
@@ -229,18 +247,17 @@ fn everything_that_can_be_said_is_ok() {
 }
 
 #[test]
-fn what_is_refused_says_why() {
+fn what_is_no_packet_is_foreign_and_says_why() {
     for (comment, text) in decoded(BAD, Some(Format::Fd)) {
         let words: Vec<_> = comment.split(' ').collect();
         let field = |name: &str| words.iter().find_map(|word| word.strip_prefix(name)).unwrap().to_owned();
         match words[1] {
             "crc" => {
                 let (expected, got) = (field("expected="), field("got="));
-                assert!(text.starts_with("CRC     "), "{comment}: {text}");
-                assert!(text.ends_with(&format!(": CRC {got}, not {expected}")), "{comment}: {text}");
+                assert_eq!(text, format!("foreign no packet: CRC {got}, not {expected}"), "{comment}");
             }
             "length" => {
-                assert_eq!(text, format!("length  torque 12: {} data bytes, not 16", field("got=")));
+                assert_eq!(text, format!("foreign no packet: {} data bytes, not 16", field("got=")));
             }
             "foreign" => assert_eq!(text, "foreign 29-bit identifier"),
             _ => assert!(text.starts_with("meaning "), "{comment}: {text}"),
@@ -251,21 +268,58 @@ fn what_is_refused_says_why() {
 }
 
 #[test]
-fn halves_meet_by_bus_and_identifier() {
-    for (comment, text) in decoded(CLASSIC, None) {
-        let expected = match comment.split(' ').next().unwrap() {
-            "waiting" => "half    ",
-            "incomplete" => {
-                assert!(text.ends_with(", the half before it dropped: incomplete"), "{comment}: {text}");
-                "half    "
-            }
-            "whole" if comment.contains(" bad ") => "meaning ",
-            "whole" => "ok      ",
-            _ if comment.starts_with("bad length") => "length  ",
-            _ => "foreign ",
-        };
-        assert!(text.starts_with(expected), "{comment}: {text}");
+fn under_an_identifier_that_carries_packets_it_is_damaged() {
+    let text = |format, text| {
+        let frame = candump::parse_frame(text).unwrap();
+        knowing(format).decode(Micros(0), "vcan0", &frame).to_string()
+    };
+    let wrong = "20C##5001000F80100FFFF0000000007014AE7";
+    assert_eq!(text(None, wrong), "CRC     torque 12: CRC E74A, not E74B");
+    assert_eq!(text(None, "20C##5001000F8"), "length  torque 12: 4 data bytes, not 16");
+    assert_eq!(text(Some(Format::Classic), wrong), "length  torque 12: 16 data bytes, not 8");
+    assert_eq!(text(None, "20D##5001000F8"), "foreign no packet: 4 data bytes, not 16");
+    let mut settler = Settler::new(None);
+    let packet = candump::parse_frame("20C##5001000F80100FFFF0000000007014BE7").unwrap();
+    for frame in [packet, packet, candump::parse_frame("20C#0000000007014BE7").unwrap()] {
+        settler.push(Micros(0), "vcan0", &frame, ());
     }
+    settler.finish();
+    let last = std::iter::from_fn(|| settler.pop()).last().unwrap().1;
+    assert_eq!(last.to_string(), "incomplete torque 12: no other half");
+}
+
+#[test]
+fn chance_makes_no_identifier_ours() {
+    let mut traffic = Traffic::default();
+    traffic.packet();
+    assert!(!traffic.carries_packets(), "one packet may be chance");
+    traffic.packet();
+    for _ in 0..2 * Traffic::OTHERS {
+        assert!(traffic.carries_packets());
+        traffic.other();
+    }
+    traffic.other();
+    assert!(!traffic.carries_packets(), "two packets among many frames may be, too");
+}
+
+#[test]
+fn halves_meet_by_bus_and_identifier() {
+    let all = decoded(CLASSIC, None);
+    let (mut halves, mut packets) = (0, 0);
+    for (comment, text) in &all {
+        halves += u32::from(text.starts_with("half    "));
+        let expected: &[&str] = match comment.split(' ').next().unwrap() {
+            "waiting" | "incomplete" => &["half    ", "foreign no packet: no other half", "incomplete "],
+            "whole" => {
+                packets += 1;
+                if comment.contains(" bad ") { &["meaning "] } else { &["ok      "] }
+            }
+            _ if comment.starts_with("bad length") => &["length  ", "foreign no packet: "],
+            _ => &["foreign "],
+        };
+        assert!(expected.iter().any(|expected| text.starts_with(expected)), "{comment}: {text}");
+    }
+    assert_eq!(halves, packets, "each packet has one first half: {all:#?}");
     let mut decoder = Decoder::new(None);
     let [first, second] =
         ["20C#001000F801000000", "20C#00000000070175D6"].map(|text| candump::parse_frame(text).unwrap());
@@ -280,7 +334,7 @@ fn halves_meet_by_bus_and_identifier() {
 fn on_a_bus_of_one_format_the_other_is_refused() {
     let fd = candump::parse_frame("20C##1001000F80100000000000000070175D6").unwrap();
     let classic = candump::parse_frame("20C#001000F801000000").unwrap();
-    let text = |format, frame| Decoder::new(Some(format)).decode(Micros(0), "vcan0", frame).to_string();
+    let text = |format, frame| knowing(Some(format)).decode(Micros(0), "vcan0", frame).to_string();
     assert_eq!(text(Format::Fd, &classic), "length  torque 12: 8 data bytes, not 16");
     assert_eq!(text(Format::Classic, &fd), "length  torque 12: 16 data bytes, not 8");
 }
@@ -360,7 +414,7 @@ fn memory_is_bounded_whatever_buses_a_log_names() {
     for bus in 0..1_000 {
         decoder.decode(Micros(0), &format!("can{bus}"), &frame);
     }
-    assert_eq!(decoder.lanes.len(), LANES);
+    assert_eq!(decoder.buses.len(), BUSES);
 }
 
 proptest! {

@@ -8,24 +8,19 @@ use protocol::message::{
     Answer, From, Heard, Heartbeat, Message, NetworkPage, Refused, Request, SensorPage, SkinSensors, State,
 };
 
+use super::Decoded;
 use super::parameter::{self, Words};
 use super::wires::{Around, Place, Said};
-use super::{Decoded, Foreign};
 
 impl Display for Decoded {
     /// A verdict, a space, and what the frame says.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         write!(f, "{:<7} ", self.verdict())?;
         match *self {
-            Self::Foreign(Foreign::Extended) => f.write_str("29-bit identifier"),
-            Self::Foreign(Foreign::Remote) => f.write_str("remote frame"),
-            Self::Foreign(Foreign::Error) => f.write_str("error frame of the driver"),
+            Self::Foreign(foreign) => write!(f, "{foreign}"),
             Self::Wire(lane, message) => write!(f, "{}", Said(lane, message)),
-            Self::Half { id, incomplete: false } => write!(f, "{}", Subject(id)),
-            Self::Half { id, incomplete: true } => {
-                write!(f, "{}, the half before it dropped: incomplete", Subject(id))
-            }
-            Self::Refused { id, error } => write!(f, "{}: {error}", Subject(id)),
+            Self::Half { id } => write!(f, "{}", Subject(id)),
+            Self::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
             Self::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
             Self::Message(message) => write!(f, "{}", Meaning(&message)),
         }

@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
 use protocol::id::Kind;
-use protocol::packet::{self, BYTES, Half, Paired};
+use protocol::packet::{self, Half, Paired};
 use protocol::time::Micros;
 
 use crate::stimuli::PENDING;
@@ -55,9 +55,6 @@ const WRITE: u8 = 0x80;
 /// The network page that tells where a cell's sums go.
 const TREE: u8 = 3;
 
-/// Where a packet's count stands, which tells pages and commands apart.
-const COUNT: usize = BYTES - 3;
-
 impl Default for InForce {
     fn default() -> Self {
         Self {
@@ -73,7 +70,7 @@ impl Default for InForce {
 }
 
 impl InForce {
-    /// Takes a frame that stood on the bus. Bounded work; whether it makes sense is not looked into.
+    /// Takes a frame that stood on the bus, if it is a packet or completes one. Bounded work.
     pub fn take(&mut self, seen: Seen) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         let wanted = match id.kind {
@@ -84,9 +81,9 @@ impl InForce {
             return;
         }
         let (packet, count) = match seen.frame.format() {
-            Format::Fd => match seen.frame.data().get(COUNT) {
-                Some(&count) => ([Some(seen), None], count),
-                None => return,
+            Format::Fd => match packet::Packet::from_fd(&seen.frame) {
+                Ok(packet) => ([Some(seen), None], packet.count),
+                Err(_) => return,
             },
             Format::Classic => {
                 let Some((half, first)) = self.halves.get_mut(usize::from(id.to_bits())) else { return };

@@ -1,7 +1,7 @@
 //! From the frames of a capture to what is sent, and when.
 //!
 //! ```text
-//!   frames ──> take ──> [ order by time ] ──> picked? ──> Step, Step, ... ──> player
+//!   frames ──> take ──> [ order by time ] ──> [ what is it? ] ──> picked? ──> Step, Step, ... ──> player
 //!                                └── joints, replies ──> judge
 //! ```
 
@@ -18,7 +18,8 @@ use super::judge::Judge;
 use super::order::{Order, Ordered};
 use super::survey::{Survey, is_input, is_joints};
 use crate::decode::pick::Pick;
-use crate::decode::{Decoded, Decoder, wired};
+use crate::decode::settle::Settler;
+use crate::decode::{Decoded, Fault};
 
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
@@ -128,8 +129,8 @@ struct Waiting {
 pub struct Reel<'a> {
     survey: &'a Survey,
     selection: &'a Selection,
-    decoder: Decoder,
     order: Order<Waiting>,
+    settler: Settler<Ordered<Waiting>>,
     cut: Cut,
     read: u64,
     /// When this pass begins, in ns after the first one.
@@ -147,8 +148,8 @@ impl<'a> Reel<'a> {
         Self {
             survey,
             selection,
-            decoder: Decoder::new(None),
             order: Order::default(),
+            settler: Settler::new(None),
             cut: Cut::default(),
             read: 0,
             offset: 0,
@@ -166,7 +167,25 @@ impl<'a> Reel<'a> {
         };
         self.order.push(bus, record.time.nanos, Waiting { bus, frame: record.frame, number: self.read });
         while let Some(next) = self.order.pop() {
-            if self.place(&next, judge, &mut out) == Flow::Enough {
+            self.settle(next);
+            if self.place_settled(judge, &mut out) == Flow::Enough {
+                return Flow::Enough;
+            }
+        }
+        Flow::More
+    }
+
+    /// Finds out what a frame is.
+    fn settle(&mut self, next: Ordered<Waiting>) {
+        let name = self.survey.buses.get(next.item.bus).map_or("", |bus| bus.name.as_str());
+        let frame = next.item.frame;
+        self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
+    }
+
+    /// Frames whose turn has come, as far as it is known what they are.
+    fn place_settled(&mut self, judge: &mut Judge, out: &mut impl FnMut(Step)) -> Flow {
+        while let Some((next, decoded)) = self.settler.pop() {
+            if self.place(&next, &decoded, judge, out) == Flow::Enough {
                 return Flow::Enough;
             }
         }
@@ -176,12 +195,12 @@ impl<'a> Reel<'a> {
     /// Takes in that the capture, or what is of interest of it, is at its end; another pass may follow.
     pub fn end_pass(&mut self, judge: &mut Judge, mut out: impl FnMut(Step)) {
         while let Some(next) = self.order.pop_last() {
-            if self.place(&next, judge, &mut out) == Flow::Enough {
-                break;
-            }
+            self.settle(next);
         }
+        self.settler.finish();
+        self.place_settled(judge, &mut out);
         self.order = Order::default();
-        self.decoder = Decoder::new(None);
+        self.settler = Settler::new(None);
         if let Some((first, last)) = self.sent.take() {
             let (frames, joints) = self.counts;
             let steps = if joints > 1 { joints } else { frames }.saturating_sub(1).max(1);
@@ -215,7 +234,13 @@ impl<'a> Reel<'a> {
     }
 
     /// A frame's turn has come.
-    fn place(&mut self, next: &Ordered<Waiting>, judge: &mut Judge, out: &mut impl FnMut(Step)) -> Flow {
+    fn place(
+        &mut self,
+        next: &Ordered<Waiting>,
+        decoded: &Decoded,
+        judge: &mut Judge,
+        out: &mut impl FnMut(Step),
+    ) -> Flow {
         let (from, to) = self.survey.bounds();
         if next.at >= to.saturating_add(LATE_REPLIES_NS) {
             return Flow::Enough;
@@ -227,9 +252,9 @@ impl<'a> Reel<'a> {
         } else if next.nanos >= to {
             Some(reason::AFTER)
         } else {
-            self.unwanted(bus, &frame)
+            self.unwanted(bus, &frame, decoded)
         };
-        let role = self.read_on(bus, next.nanos, &frame, unwanted.is_none(), is_in_part, judge);
+        let role = self.read_on(bus, next.nanos, decoded, unwanted.is_none(), is_in_part, judge);
         if let Some(reason) = unwanted {
             self.skip(reason);
             return Flow::More;
@@ -250,16 +275,17 @@ impl<'a> Reel<'a> {
     }
 
     /// Why a frame of the part is not sent.
-    fn unwanted(&self, bus: usize, frame: &Frame) -> Option<&'static str> {
+    fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
         let picked = self.selection.lanes.get(bus).is_some_and(Option::is_some)
-            && self.selection.pick.takes(0, 0, frame);
+            && self.selection.pick.takes(0, 0, frame, decoded);
         if frame.is_error() {
             return Some(reason::ERROR);
         }
-        if wired(frame).is_some() {
+        if matches!(decoded, Decoded::Wire(..)) {
             return Some(reason::WIRE);
         }
-        let id = data_id(frame).ok();
+        // Cells heard what is damaged as well.
+        let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),
             Only::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
@@ -270,21 +296,17 @@ impl<'a> Reel<'a> {
 
     /// Reads what a frame says, as far as that is of interest.
     fn read_on(
-        &mut self,
+        &self,
         bus: usize,
         nanos: u64,
-        frame: &Frame,
+        decoded: &Decoded,
         is_sent: bool,
         is_in_part: bool,
         judge: &mut Judge,
     ) -> Role {
-        let (Some(name), Some(lane)) = (
-            self.survey.buses.get(bus).map(|bus| bus.name.as_str()).filter(|_| self.selection.reads),
-            self.selection.lanes.get(bus).copied().flatten(),
-        ) else {
-            return Role::Plain;
-        };
-        match self.decoder.decode(Micros(nanos / 1_000), name, frame) {
+        let lane = self.selection.lanes.get(bus).copied().flatten();
+        let Some(lane) = lane.filter(|_| self.selection.reads) else { return Role::Plain };
+        match *decoded {
             Decoded::Message(Message::Joints { epoch, joints }) => {
                 let round = judge.record_joints(lane, nanos, epoch, is_sent);
                 Role::Joints { epoch, joints, round }
@@ -293,11 +315,13 @@ impl<'a> Reel<'a> {
                 judge.record(lane, &message, is_in_part);
                 Role::Plain
             }
-            Decoded::Half { id, .. } if is_joints(id) => Role::HalfOfJoints,
+            Decoded::Half { id } | Decoded::Damaged { id, fault: Fault::Incomplete } if is_joints(id) => {
+                Role::HalfOfJoints
+            }
             Decoded::Half { .. }
             | Decoded::Foreign(_)
             | Decoded::Wire(..)
-            | Decoded::Refused { .. }
+            | Decoded::Damaged { .. }
             | Decoded::Meaningless { .. } => Role::Plain,
         }
     }

@@ -13,8 +13,8 @@ use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Kinds, Option
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, State as Flags};
-use protocol::packet::data_id;
 use protocol::skin::Skin;
+use protocol::time::Micros;
 use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::hall::Hall;
@@ -25,6 +25,7 @@ use super::survey::{Known, Survey};
 use super::teller::Teller;
 use super::{Options, Spawn};
 use crate::capture::Extras;
+use crate::decode::{Decoded, Decoder};
 use crate::run::RunError;
 use crate::run::launch::{LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
 use crate::run::roots::{Ears, Roots};
@@ -233,15 +234,16 @@ impl Buses {
                 ));
             }
         }
-        let (until, mut inbox) = (Instant::now() + LISTEN, Inbox::new());
+        let (until, mut inbox, mut decoder) = (Instant::now() + LISTEN, Inbox::new(), Decoder::new(None));
         while !open.is_empty() && Instant::now() < until {
             thread::sleep(LOOK);
             for (index, bus) in &open {
                 if bus.receive(&mut inbox)? == 0 {
                     continue;
                 }
-                for frame in inbox.frames().map(|received| received.frame) {
-                    match speaker(&frame) {
+                for received in inbox.frames() {
+                    let at = Micros(received.at_nanos / 1_000);
+                    match speaker(&decoder.decode(at, bus.name(), &received.frame)) {
                         Some(Node::Gateway) => return Err(rival(bus.name())),
                         Some(Node::Cell(cell)) => {
                             if let Some(cells) = heard.get_mut(*index) {
@@ -525,14 +527,13 @@ pub(super) fn send(lane: &Lane, message: &Message) -> Result<(), RunError> {
 }
 
 /// Who speaks, when it is a gateway or a cell that is there for good.
-fn speaker(frame: &Frame) -> Option<Node> {
-    let id = data_id(frame).ok()?;
-    match id.kind {
-        Kind::Command => Some(Node::Gateway),
-        Kind::Network => Some(Node::from_byte(id.node)),
-        Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configure | Kind::Configured | Kind::Stimulus => {
-            None
-        }
+const fn speaker(decoded: &Decoded) -> Option<Node> {
+    if let Decoded::Message(Message::Network { from, .. }) = decoded {
+        Some(*from)
+    } else if let Decoded::Message(Message::Joints { .. }) = decoded {
+        Some(Node::Gateway)
+    } else {
+        None
     }
 }
 

@@ -136,7 +136,8 @@ impl Survey {
         let bus = self.bus(record.interface);
         bus.frames += 1;
         bus.has_fd |= record.frame.format() == Format::Fd;
-        if let Ok(id) = data_id(&record.frame)
+        if let (Ok(id), Decoded::Message(_) | Decoded::Meaningless { .. }) =
+            (data_id(&record.frame), &decoded)
             && let Some(cell) = id.sender()
         {
             bus.heard(cell, nanos);
@@ -150,7 +151,7 @@ impl Survey {
             Decoded::Foreign(_)
             | Decoded::Wire(..)
             | Decoded::Half { .. }
-            | Decoded::Refused { .. }
+            | Decoded::Damaged { .. }
             | Decoded::Meaningless { .. } => {}
         }
     }

@@ -2,11 +2,14 @@
 
 use std::fmt::Write as _;
 use std::io::{self, Write};
+use std::sync::Arc;
 
 use gateway::decode::pick::Pick;
+use gateway::decode::settle::Settler;
 use gateway::decode::stats::{Report, Stats};
-use gateway::decode::{Decoded, Decoder, json};
-use protocol::candump::{Direction, Record};
+use gateway::decode::{Decoded, json};
+use protocol::can::{Format, Frame};
+use protocol::candump::{Direction, Record, Timestamp};
 use protocol::message::Message;
 use protocol::time::Micros;
 
@@ -39,10 +42,20 @@ pub(super) enum Flow {
     Enough,
 }
 
+/// A frame of which it is not known yet what it is.
+struct Waiting {
+    time: Timestamp,
+    bus: Arc<str>,
+    frame: Frame,
+    direction: Option<Direction>,
+}
+
 /// Decodes, picks and shows frames.
 pub(super) struct Show<W> {
     out: W,
-    decoder: Decoder,
+    settler: Settler<Waiting>,
+    /// The bus of the last frame.
+    bus: Arc<str>,
     pick: Pick,
     /// Only what tells of a touch.
     contact: bool,
@@ -55,20 +68,55 @@ pub(super) struct Show<W> {
 }
 
 impl<W: Write> Show<W> {
-    pub(super) const fn new(out: W, decoder: Decoder, pick: Pick, contact: bool, how: How, max: u64) -> Self {
-        Self { out, decoder, pick, contact, how, left: max, first: None, raw: String::new() }
+    pub(super) fn new(out: W, format: Option<Format>, pick: Pick, contact: bool, how: How, max: u64) -> Self {
+        let (settler, bus) = (Settler::new(format), Arc::from(""));
+        Self { out, settler, bus, pick, contact, how, left: max, first: None, raw: String::new() }
+    }
+
+    /// Takes the next frame; it is shown if it is wanted, as soon as it is known what it is.
+    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<Flow> {
+        let Record { time, interface, frame, direction } = *record;
+        if *self.bus != *interface {
+            self.bus = Arc::from(interface);
+        }
+        let waiting = Waiting { time, bus: Arc::clone(&self.bus), frame, direction };
+        self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
+        self.settled()
+    }
+
+    /// It is that late, and no frame came.
+    pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<Flow> {
+        self.settler.handle_time(now);
+        self.settled()
+    }
+
+    /// No more frames follow.
+    pub(super) fn finish(&mut self) -> io::Result<Flow> {
+        self.settler.finish();
+        self.settled()
+    }
+
+    /// Whether frames wait that are not shown yet.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.settler.is_waiting()
+    }
+
+    /// Shows what is known by now.
+    fn settled(&mut self) -> io::Result<Flow> {
+        while self.left > 0
+            && let Some((Waiting { time, bus, frame, direction }, decoded)) = self.settler.pop()
+        {
+            self.show(&Record { time, interface: &bus, frame, direction }, decoded)?;
+        }
+        Ok(if self.left == 0 { Flow::Enough } else { Flow::More })
     }
 
     /// Shows a frame if it is wanted.
-    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<Flow> {
-        if self.left == 0 {
-            return Ok(Flow::Enough);
-        }
+    fn show(&mut self, record: &Record<'_>, decoded: Decoded) -> io::Result<()> {
         let nanos = record.time.nanos;
         let first = *self.first.get_or_insert(nanos);
-        let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
-        if !self.pick.takes(first, nanos, &record.frame) || self.contact && !decoded.is_contact() {
-            return Ok(Flow::More);
+        if !self.pick.takes(first, nanos, &record.frame, &decoded) || self.contact && !decoded.is_contact() {
+            return Ok(());
         }
         match &mut self.how {
             How::Stats(stats) => stats.take(record, &decoded),
@@ -100,7 +148,7 @@ impl<W: Write> Show<W> {
             }
         }
         self.left -= 1;
-        Ok(if self.left == 0 { Flow::Enough } else { Flow::More })
+        Ok(())
     }
 
     /// Frames were lost before this point.
@@ -127,7 +175,7 @@ impl<W: Write> Show<W> {
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Half { .. } => DIM,
-        Decoded::Refused { .. } | Decoded::Meaningless { .. } => RED,
+        Decoded::Damaged { .. } | Decoded::Meaningless { .. } => RED,
         Decoded::Message(_) if decoded.is_saturated() => YELLOW,
         Decoded::Message(message) => match message {
             Message::Halt | Message::Joints { .. } | Message::Sync | Message::Resume | Message::Report => {

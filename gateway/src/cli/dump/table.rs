@@ -2,7 +2,7 @@
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use gateway::capture::{Extras, Topic};
-use gateway::decode::stats::{BusReport, CellReport, Epochs, Report};
+use gateway::decode::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 
 use crate::cli::print::Rows;
 
@@ -26,8 +26,13 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
         beside(&mut rows, extras);
     }
     let mut text = format!("{}\n", rows.table());
-    for bus in report.buses.iter().filter(|bus| !bus.cells.is_empty()) {
-        text += &format!("\n{}\n", cells(bus));
+    for bus in &report.buses {
+        if !bus.cells.is_empty() {
+            text += &format!("\n{}\n", cells(bus));
+        }
+        if bus.foreign.frames > 0 {
+            text += &format!("\n{}\n", foreign(bus));
+        }
     }
     text
 }
@@ -53,7 +58,22 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons: Vec<_> = refused.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
     let total: u64 = refused.iter().map(|(_, count)| count).sum();
-    rows.row("foreign or refused", total, reasons.join(", "));
+    rows.row("damaged or refused", total, reasons.join(", "));
+    let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
+    rows.row("foreign", bus.foreign.frames, "");
+    let of = [
+        (standard, "  11-bit identifiers"),
+        (extended, "  29-bit identifiers"),
+        (remote, "  remote frames"),
+        (error, "  error frames"),
+    ];
+    for (frames, of) in of.into_iter().filter(|(frames, _)| *frames > 0) {
+        rows.row(of, frames, "");
+    }
+    if packets_by_chance >= 0.05 {
+        let chance = format!("{packets_by_chance:.1}");
+        rows.row("  packets by chance", chance, "expected");
+    }
     let why = if bus.dropped > 0 { "lost by whoever took the capture" } else { "" };
     rows.row("frames missing", bus.dropped, why);
 }
@@ -72,6 +92,48 @@ fn beside(rows: &mut Rows, extras: &Extras) {
     for (name, bytes) in &extras.attachments {
         rows.row(name, bytes.len(), "");
     }
+}
+
+/// Foreign identifiers that are shown; --json has all.
+const FOREIGN: usize = 40;
+
+/// One line a foreign identifier, those with the most frames.
+fn foreign(bus: &BusReport) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    let head = format!("{} foreign", bus.bus);
+    table.set_header([head.as_str(), "frames", "per s", "first s", "last s", "bytes", ""]);
+    for id in bus.foreign.identifiers.iter().take(FOREIGN) {
+        let ForeignId { bytes_min, bytes_max, .. } = *id;
+        let bytes =
+            if bytes_min == bytes_max { bytes_min.to_string() } else { format!("{bytes_min}..{bytes_max}") };
+        let what = match id.of {
+            FrameType::Data if id.wrong_crc > 0 => format!("{} wrong CRC", id.wrong_crc),
+            FrameType::Data => String::new(),
+            FrameType::Remote => "remote".to_owned(),
+            FrameType::Error => "error".to_owned(),
+        };
+        table.add_row([
+            id.id.clone(),
+            id.frames.to_string(),
+            id.frames_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default(),
+            format!("{:.3}", id.first_s),
+            format!("{:.3}", id.last_s),
+            bytes,
+            what,
+        ]);
+    }
+    let further = bus.foreign.identifiers.iter().skip(FOREIGN);
+    let count = further.len();
+    let frames = further.map(|id| id.frames).sum::<u64>() + bus.foreign.frames_of_other_identifiers;
+    if frames > 0 {
+        let more = if bus.foreign.frames_of_other_identifiers > 0 { "more than " } else { "" };
+        table.add_row([format!("{more}{count} further"), frames.to_string()]);
+    }
+    for column in table.column_iter_mut().take(6) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    table
 }
 
 /// What stands in a column: its head, and a cell's text there.

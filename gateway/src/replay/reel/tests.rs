@@ -45,10 +45,23 @@ fn capture() -> Vec<(u64, &'static str, Frame)> {
     (5_000_u64..).zip(frames).map(|(at, (bus, frame))| (at * MS, bus, frame)).collect()
 }
 
+/// What a frame is by itself.
+fn decoded(frame: &Frame) -> Decoded {
+    crate::decode::Decoder::new(None).decode(Micros(0), "a", frame)
+}
+
 /// All steps of so many passes.
 fn cut(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<Due>, Cut) {
+    cut_of(&capture(), part, selection, passes)
+}
+
+fn cut_of(
+    capture: &[(u64, &'static str, Frame)],
+    part: Part,
+    selection: impl FnOnce(&mut Selection),
+    passes: u32,
+) -> (Vec<Due>, Cut) {
     let mut survey = Survey::new(part);
-    let capture = capture();
     let record = |(nanos, interface, frame): &(u64, &'static str, Frame)| Record {
         time: Timestamp { nanos: *nanos, nine_digits: true },
         interface,
@@ -65,7 +78,7 @@ fn cut(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<
     let mut reel = Reel::new(&survey, &chosen);
     let mut steps = Vec::new();
     for _ in 0..passes {
-        for it in &capture {
+        for it in capture {
             if reel.take(&record(it), &mut judge, |step| steps.push(step)) == Flow::Enough {
                 break;
             }
@@ -108,16 +121,40 @@ fn inputs_and_replies_are_the_two_sides() {
 }
 
 #[test]
+fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are() {
+    // Somebody else's frames under identifiers of joints, of a torque and of a stimulus, among halves of ours.
+    let data = |id: u32, byte| Frame::classic(id, &[byte; 8]).unwrap();
+    let classic = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
+    let page = SensorPage::Skin(SkinSensors::default());
+    let press = Message::Stimulus { to: Node::Cell(CellId::new(2).unwrap()), from: From::Next, page };
+    let halt = classic(&Message::Halt);
+    let frames: Vec<_> = [data(0x001, 1), data(0x201, 2), halt[0], data(0x701, 3), halt[1], data(0x001, 4)]
+        .into_iter()
+        .chain(classic(&press))
+        .collect();
+    let capture: Vec<_> = (5_000_u64..).zip(frames).map(|(at, frame)| (at * MS, "a", frame)).collect();
+    let of = |only| cut_of(&capture, Part::default(), |selection| selection.only = only, 1);
+    let ids = |due: &[Due]| due.iter().map(|due| due.frame.id()).collect::<Vec<_>>();
+    let (inputs, cut) = of(Only::Inputs);
+    assert_eq!(ids(&inputs), [0, 0, 0x702, 0x702]);
+    assert_eq!(cut.skipped, BTreeMap::from([(reason::NO_INPUT, 4)]));
+    assert_eq!(of(Only::Replies).0.len(), 0);
+    let (all, _) = of(Only::All);
+    assert_eq!(ids(&all), [0x001, 0x201, 0, 0x701, 0, 0x001, 0x702, 0x702], "in their order");
+    assert!(all.iter().all(|due| due.role == Role::Plain));
+}
+
+#[test]
 fn what_cells_said_over_their_wires_is_never_sent() {
     let survey = Survey::new(Part::default());
     for only in [Only::All, Only::Inputs, Only::Replies] {
         let selection = Selection { only, pick: Pick::default(), lanes: vec![Some(0)], reads: true };
         let reel = Reel::new(&survey, &selection);
         let frame = wire::Lane { wire: 9, back: false }.frame(wire::PortMessage::Join);
-        assert_eq!(reel.unwanted(0, &frame), Some(reason::WIRE));
+        assert_eq!(reel.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
         // Damaged it proves nothing, and is somebody else's.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
-        assert_ne!(reel.unwanted(0, &other), Some(reason::WIRE));
+        assert_ne!(reel.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
     }
 }
 
