@@ -239,6 +239,12 @@ impl Half {
         if is_periodic { Self::WITHIN_A_PERIOD } else { Self::WITHIN }
     }
 
+    /// Whether a half waits for its other one.
+    #[must_use]
+    pub const fn is_waiting(&self) -> bool {
+        self.waiting.is_some()
+    }
+
     /// Takes the next classic frame of this identifier.
     ///
     /// # Errors

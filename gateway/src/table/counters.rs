@@ -14,7 +14,7 @@ pub enum Event {
     Meaning,
     /// A classic first half without its second.
     Incomplete,
-    /// A remote frame or a 29-bit identifier.
+    /// A remote frame, a 29-bit identifier, or no packet under an identifier that nobody uses.
     Foreign,
     /// The driver's report of an error on the bus.
     ErrorFrame,

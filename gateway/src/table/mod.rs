@@ -23,7 +23,7 @@ use std::collections::{BTreeMap, VecDeque};
 use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q1_14};
-use protocol::id::{CellId, Id, Node};
+use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
 use protocol::parameters::{Cuts, Events, Parameter, Sensing};
@@ -296,6 +296,7 @@ impl Table {
         let packet = match self.packet(at, id, frame) {
             Ok(Some(packet)) => packet,
             Ok(None) => return,
+            Err(_) if !own && !self.is_used(id) => return self.counters.count(Event::Foreign),
             Err(event) => {
                 self.counters.frame(id.kind, own);
                 return self.reject(id, own, event);
@@ -322,11 +323,27 @@ impl Table {
         if frame.format() != Format::Classic {
             return Err(Event::Length);
         }
+        let is_used = self.is_used(id);
         let half = self.halves.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
+        let waited = half.is_waiting();
         match half.push(at, id, frame.data()).map_err(event)? {
-            Paired::Waiting => Ok(None),
             Paired::Whole(packet) => Ok(Some(packet)),
+            // Foreign frames are counted each, and not as packets that have lost a half.
+            Paired::Waiting | Paired::Incomplete if waited && !is_used => Err(Event::Foreign),
+            Paired::Waiting => Ok(None),
             Paired::Incomplete => Err(Event::Incomplete),
+        }
+    }
+
+    /// Whether somebody on this bus uses an identifier, as the skin describes the bus: what is no packet under another
+    /// one is foreign.
+    fn is_used(&self, id: Id) -> bool {
+        let is_cell = |cell: CellId| self.places.get(cell.index()).copied().flatten().is_some();
+        match (id.kind, Node::from_byte(id.node)) {
+            (Kind::Command, _) => Command::from_byte(id.node).is_some(),
+            (Kind::Network, Node::Gateway) | (Kind::Configure | Kind::Stimulus, Node::Everyone) => true,
+            (_, Node::Cell(cell)) => is_cell(cell),
+            (_, Node::Gateway | Node::Everyone) => false,
         }
     }
 
@@ -776,6 +793,31 @@ mod tests {
             }
         }
         table
+    }
+
+    #[test]
+    fn what_is_no_packet_is_rejected_under_a_cells_identifier_and_foreign_under_one_that_nobody_uses() {
+        let mut skin = crate::testing::skin();
+        for format in [Format::Fd, Format::Classic] {
+            skin.buses[0].format = format;
+            let mut table = Table::new(&skin, 0);
+            let mut hear = |id, byte, at| {
+                let data = [byte; 16];
+                let (length, flags) = if format == Format::Fd { (16, 1) } else { (8, 0) };
+                let frame = Frame::with_data(id, format, flags, &data[..length]).unwrap();
+                table.handle_frame(Micros(at), false, &frame, &mut |_| None);
+            };
+            // Of the only cell; of one that is not there; a command that does not exist; joints.
+            for at in 0..9_u8 {
+                for id in [0x201, 0x263, 0x077, 0x001] {
+                    hear(id, at, 1_000 * u64::from(at));
+                }
+            }
+            let of = |event| table.counters().events(event);
+            let events = [Event::Foreign, Event::Crc, Event::Incomplete].map(of);
+            // Halves: eight of nine were dropped under each; a packet that has lost one is counted once.
+            assert_eq!(events, if format == Format::Fd { [18, 18, 0] } else { [16, 0, 8] }, "{format:?}");
+        }
     }
 
     #[test]
