@@ -59,6 +59,10 @@ pub struct Record {
     pub qdot: [f64; WORDS],
     /// The cells' torque in Nm.
     pub torque: [f64; WORDS],
+    /// Whether the torque could be used.
+    pub valid: bool,
+    /// The epoch of the last joints.
+    pub epoch: Epoch,
     /// The joint velocities in rad/s that the robot was told.
     pub command: [f64; WORDS],
     /// Cells in the torque.
@@ -232,13 +236,15 @@ impl Cycle {
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
         let (joints, broadcasts_skipped) = self.broadcast(tick);
-        let Input { q, qdot, torque, contributing, age, missing, .. } = input;
+        let Input { q, qdot, torque, valid, contributing, age, missing, .. } = input;
         let record = Record {
             tick,
             skipped,
             q,
             qdot,
             torque,
+            valid,
+            epoch: self.epoch,
             command: velocity,
             contributing,
             age,

@@ -10,8 +10,11 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
+pub use self::outcome::{Halted, Outcome, TickBefore};
 pub use crate::record::account::{Recording, Written};
 use crate::table::{Accuracy, Contributions, Errors, Event, Replies, Status, SumCounts, Table, Uplink};
+
+mod outcome;
 
 /// A whole run.
 #[derive(Clone, Debug, Serialize)]
@@ -30,6 +33,12 @@ pub struct Summary {
     pub interrupted: bool,
     /// Why the robot was halted at the end, if it was.
     pub halted: Option<String>,
+    /// Each time that it was halted, oldest first.
+    pub halts: Vec<Halted>,
+    /// Halts beyond the first 100 that have ended.
+    pub further_halts: u64,
+    /// The ticks up to the last halt, oldest first.
+    pub before_halt: Vec<TickBefore>,
     /// From the start of the program to the first broadcast, in s.
     pub first_broadcast_s: f64,
     /// The control loop.
@@ -62,6 +71,9 @@ impl Summary {
             duration_s: 0.0,
             interrupted: false,
             halted: None,
+            halts: Vec::new(),
+            further_halts: 0,
+            before_halt: Vec::new(),
             first_broadcast_s: f64::NAN,
             control: Loop::default(),
             accuracy: Accuracy::default().into(),
@@ -76,13 +88,30 @@ impl Summary {
     /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
     #[must_use]
     pub fn judged(mut self, failure: Option<String>) -> Self {
-        self.failure = failure.or_else(|| self.lost_buses()).or_else(|| self.lost_frames());
+        // A bus that was lost may be why the robot was halted, and the halt says more.
+        let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
+        self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
         self.outcome = match &self.failure {
             Some(_) => Outcome::Failed,
+            None if self.halted.is_some() => Outcome::Halted,
             None if self.interrupted => Outcome::Interrupted,
             None => Outcome::Done,
         };
         self
+    }
+
+    /// What is to be said of its end, a line each, the most important one last; nothing when all is well.
+    #[must_use]
+    pub fn complaints(&self) -> Vec<String> {
+        let lost = self.lost_buses().filter(|lost| self.failure.as_ref() != Some(lost));
+        let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
+            let Halted { at_s, epoch, reason, .. } = halted;
+            format!(
+                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary has the ticks \
+                 before it"
+            )
+        });
+        [lost, halted, self.failure.clone()].into_iter().flatten().collect()
     }
 
     fn lost_buses(&self) -> Option<String> {
@@ -96,28 +125,6 @@ impl Summary {
         let first = errors.first().map_or("", String::as_str);
         (!errors.is_empty() || *lost_write > 0)
             .then(|| format!("the recording is not whole, {lost_write} frames were not written: {first}"))
-    }
-}
-
-/// How a run ended.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Outcome {
-    /// It came to its end.
-    Done,
-    /// A signal ended it early.
-    Interrupted,
-    /// It did not come to its end, a bus was lost at its end, or its recording is not whole.
-    Failed,
-}
-
-impl core::fmt::Display for Outcome {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.write_str(match self {
-            Self::Done => "done",
-            Self::Interrupted => "interrupted",
-            Self::Failed => "failed",
-        })
     }
 }
 

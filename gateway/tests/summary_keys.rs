@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gateway::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Loop, NetworkSummary, Outcome, Processor, Quantiles,
-    Recording, RepliesSummary, Summary, SumsSummary, Written, histogram,
+    AccuracySummary, BusSummary, ErrorsSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Quantiles,
+    Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Written, histogram,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
@@ -37,6 +37,34 @@ fn summary(bus: BusSummary) -> Summary {
         duration_s: 1.0,
         interrupted: false,
         halted: Some("somebody sent a halt frame".to_owned()),
+        halts: vec![Halted {
+            at_s: 0.5,
+            tick: 250,
+            epoch: 31,
+            reason: "somebody sent a halt frame".to_owned(),
+            until_s: None,
+        }],
+        further_halts: 0,
+        before_halt: vec![TickBefore {
+            tick: 250,
+            time_s: 0.5,
+            late_us: 1.0,
+            took_us: 1.0,
+            skipped: 0,
+            epoch: 31,
+            q_rad: vec![0.0; 6],
+            qdot_rad_s: vec![0.0; 6],
+            torque_nm: vec![0.0; 6],
+            valid: true,
+            contributing: 0,
+            age: 0,
+            stale: 0,
+            dead: 0,
+            lost_buses: vec!["vcan1".to_owned()],
+            bad_cycle: Some("the torque is not valid".to_owned()),
+            command_rad_s: vec![0.0; 6],
+            halted: true,
+        }],
         first_broadcast_s: 1.0,
         control: Loop {
             ticks: 500,
@@ -83,7 +111,7 @@ fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<
         Value::Array(all) if all.iter().any(Value::is_object) => {
             return all.iter().for_each(|value| keys(&format!("{path}[]"), value, maps, into));
         }
-        Value::Array(_) if path == "recording.errors" || path == "buses[].network.differences" => "texts",
+        Value::Array(all) if all.iter().any(Value::is_string) || path == "recording.errors" => "texts",
         Value::Array(_) => "numbers",
         Value::Object(object) if object.contains_key("p50") => "quantiles",
         Value::Object(object) if object.contains_key("mean_nm") => "errors",

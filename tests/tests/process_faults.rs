@@ -313,11 +313,15 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     let halted = || bench.stderr().matches("the robot is halted").count() == 2;
     until("a second halt", || halted().then_some(()));
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end();
+    assert_eq!(ended.code(), Some(3), "{ended:#?}");
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
     assert_eq!(summary.0["halted"], "somebody sent a halt frame");
+    let until: Vec<_> =
+        summary.0["halts"].as_array().unwrap().iter().map(|it| it["until_s"].is_null()).collect();
+    assert_eq!(until, [false, true], "the first one was resumed");
     assert!(ended.stdout.contains("somebody sent a halt frame"), "{}", ended.stdout);
 
     let log = Log::read(&place.read("run.log"), Format::Fd);

@@ -1,5 +1,5 @@
 //! The commands. Each is a thin layer over the library; errors are one line, exit codes are 0 (done),
-//! 1 (the run failed) and 2 (wrong use or configuration).
+//! 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
 
 mod ack;
 mod buses;

@@ -4,11 +4,13 @@ use std::fmt::Display;
 
 use comfy_table::{ColumnConstraint, ContentArrangement, Table, presets};
 use gateway::paper;
-use gateway::summary::{BusSummary, ErrorsSummary, Quantiles, Summary};
+use gateway::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Quantiles, Summary};
 use protocol::usage::{Failure, print};
 
 /// A space before a name that stays when the name takes two lines.
 const INDENT: &str = "\u{a0}";
+/// Halts that are told one by one.
+const HALTS: usize = 10;
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 110;
 
@@ -58,8 +60,13 @@ impl Rows {
 }
 
 fn rows(summary: &Summary) -> Rows {
-    let cells = format!("{} cells, {:.1} s, {}", summary.cells, summary.duration_s, summary.outcome);
+    let ended = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
+        Some(halted) => format!("halted at {:.3} s", halted.at_s),
+        None => summary.outcome.to_string(),
+    };
+    let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
     let mut rows = Rows::new([summary.skin.clone(), cells, String::new()]);
+    halts(&mut rows, summary);
     accuracy(&mut rows, summary);
     control(&mut rows, summary);
     for bus in &summary.buses {
@@ -68,6 +75,17 @@ fn rows(summary: &Summary) -> Rows {
     }
     costs(&mut rows, summary);
     rows
+}
+
+fn halts(rows: &mut Rows, summary: &Summary) {
+    for Halted { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(HALTS) {
+        let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
+        rows.section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
+    }
+    let more = summary.halts.len().saturating_sub(HALTS) as u64 + summary.further_halts;
+    if more > 0 {
+        rows.section("halted", format!("{more} times more"), "--summary has when and why");
+    }
 }
 
 fn accuracy(rows: &mut Rows, summary: &Summary) {
@@ -125,9 +143,6 @@ fn control(rows: &mut Rows, summary: &Summary) {
     }
     for (reason, count) in &control.bad_cycles {
         rows.row("bad cycles", count, reason);
-    }
-    if let Some(why) = &summary.halted {
-        rows.row("halted", why, "`gateway ack` leaves the halted state");
     }
     let granted = |granted| if granted { "granted" } else { "refused" };
     let locked = granted(control.memory_locked);

@@ -13,7 +13,7 @@ use gateway::record::series::{Attached, Split};
 use gateway::record::{self, Candump};
 use gateway::run::{self, Options};
 use gateway::scenario::Scenario;
-use gateway::summary::Summary;
+use gateway::summary::{Outcome, Summary};
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
 use protocol::document;
 use protocol::skin::Skin;
@@ -134,7 +134,7 @@ impl Recording {
 ///
 /// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
 /// directory, so any number of demonstrations and runs go on side by side. It says which command shows the frames on
-/// its bus, and where it records them as candump text.
+/// its bus, and where it records them as candump text. Exit codes are those of `gateway run`.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  gateway demo --duration 5")]
 pub(crate) struct Demo {
@@ -153,8 +153,8 @@ pub(crate) struct Demo {
 /// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
 /// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
-/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2: wrong use or
-/// configuration.
+/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2:
+/// wrong use or configuration; 3: the robot was halted at its end.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
@@ -314,15 +314,23 @@ fn bench(options: &Options, summary_file: Option<&Path>, force: Force) -> Result
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
         Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),
     };
-    if let Some((whole, file)) = json {
-        let text = serde_json::to_string_pretty(&ended).map_err(Failure::run)?;
-        output::finish("--summary", whole, file, &format!("{text}\n"))?;
-    }
+    let unwritten = json.and_then(|(whole, file)| {
+        let text = serde_json::to_string_pretty(&ended).map_err(Failure::run);
+        text.and_then(|text| output::finish("--summary", whole, file, &format!("{text}\n"))).err()
+    });
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);
     }
     if ended.control.ticks > 0 {
         print::summary(&ended)?;
     }
-    ended.failure.map_or(Ok(()), |why| Err(Failure::run(why)))
+    // The last line is the failure's own; each of them is one line.
+    let mut lines = ended.complaints();
+    let code = if ended.outcome == Outcome::Halted && unwritten.is_none() { 3 } else { 1 };
+    lines.extend(unwritten.map(|failure| failure.to_string()));
+    let Some(last) = lines.pop() else { return Ok(()) };
+    for line in lines {
+        note(format_args!("gateway: {line}"));
+    }
+    Err(Failure::with_code(code, last))
 }

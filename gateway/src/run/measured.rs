@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
 
+use super::halts::Halts;
 use super::turn::Timed;
-use crate::cycle::Halt;
 use crate::summary::{Quantiles, histogram};
 
 /// What the loop's records add up to.
@@ -21,6 +21,7 @@ pub(super) struct Measured {
     pub(super) bad: BTreeMap<String, u64>,
     /// Ticks without each bus, as [`crate::cycle::Record::missing`] has the buses.
     pub(super) missing: [u64; 32],
+    pub(super) halts: Halts,
     last: Option<Timed>,
     pub(super) first_broadcast_s: Option<f64>,
 }
@@ -36,6 +37,7 @@ impl Measured {
             skipped: 0,
             bad: BTreeMap::new(),
             missing: [0; 32],
+            halts: Halts::default(),
             last: None,
             first_broadcast_s: None,
         }
@@ -60,15 +62,9 @@ impl Measured {
             if let Some(bad) = timed.record.bad {
                 *self.bad.entry(bad.to_string()).or_default() += 1;
             }
+            self.halts.take(&timed);
             self.last = Some(timed);
         }
-    }
-
-    pub(super) fn halted(&self) -> Option<String> {
-        self.last?.record.halted.map(|halt| match halt {
-            Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
-            Halt::Frame => "somebody sent a halt frame".to_owned(),
-        })
     }
 
     /// How it goes: what matters most first, for a narrow terminal shows no more.
@@ -86,7 +82,7 @@ impl Measured {
         let mode = if comparing { "compare" } else { "distributed" };
         let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
         let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
-        let halted = self.halted().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
+        let halted = self.halts.why().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
         format!(
             "{seconds:5.1} of {of:.1} s{lost}{halted}  {:3} of {cells} in contact, {} stale, {} dead  \
              late p99 {:.0} us  {mode:11}  torque {} Nm",

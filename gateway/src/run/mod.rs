@@ -13,6 +13,7 @@
 
 pub(crate) mod backlog;
 pub mod file;
+mod halts;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
 pub mod launch;

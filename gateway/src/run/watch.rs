@@ -174,7 +174,10 @@ impl Bench<'_> {
             failure: None,
             duration_s: driven.seconds,
             interrupted: driven.interrupted,
-            halted: measured.halted(),
+            halted: measured.halts.why().map(str::to_owned),
+            halts: measured.halts.all(),
+            further_halts: measured.halts.further,
+            before_halt: measured.halts.history(&self.options.skin),
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
             control: self.loop_summary(&measured, granted, controller),
             accuracy: accuracy(received),
@@ -225,10 +228,10 @@ impl Bench<'_> {
             progress.note(&note);
         }
         self.switch_again(&mut script.told)?;
-        let before = measured.halted();
+        let was_halted = measured.halts.why().is_some();
         measured.take(records, self.began);
-        match (before, measured.halted()) {
-            (None, Some(why)) => {
+        match (was_halted, measured.halts.why()) {
+            (false, Some(why)) => {
                 // One bus is enough: what is heard on it is said on the others.
                 let lane = self.lanes.iter().find(|lane| lane.link.is_there()).or_else(|| self.lanes.first());
                 let lane = lane.map(|lane| (lane.link.name(), lane.link.kind()));
@@ -236,8 +239,8 @@ impl Bench<'_> {
                 let remedy = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
                 progress.note(&format!("the robot is halted: {why}; {remedy}"));
             }
-            (Some(_), None) => progress.note("the robot goes on"),
-            (Some(_), Some(_)) | (None, None) => {}
+            (true, None) => progress.note("the robot goes on"),
+            (true, Some(_)) | (false, None) => {}
         }
         for line in self.recorder.iter().flat_map(Recorder::said) {
             progress.note(&line);

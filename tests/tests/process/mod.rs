@@ -12,6 +12,7 @@
 )]
 
 pub(crate) mod buses;
+pub(crate) mod external;
 pub(crate) mod guest;
 pub(crate) mod log;
 pub(crate) mod replay;
