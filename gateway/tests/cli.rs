@@ -341,6 +341,38 @@ fn what_is_sent_on_an_embedded_bus_is_shown() {
 }
 
 #[test]
+fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
+    let bench = Bench::new();
+    let mut dump = bench.dump("");
+    bench.open().send(&[Frame::classic(0x20C, &[7; 8]).unwrap()]).unwrap();
+    // It might be half of a packet, and nobody says so but the time.
+    let mut line = String::new();
+    BufReader::new(dump.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other half\n"), "{line}");
+    kill_process(Pid::from_child(&dump), Signal::INT).unwrap();
+    assert_eq!(dump.wait().unwrap().code(), Some(0));
+}
+
+#[test]
+fn cells_on_a_bus_of_other_people_says_that_frames_came_and_none_was_of_a_cell() {
+    let bench = Bench::new();
+    let bus = bench.open();
+    let mut command = bench.gateway("cells vcan0 --for 1");
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut sent = 0_u64;
+    while child.try_wait().unwrap().is_none() {
+        // A frame that is not taken, because nobody listens any more, is no matter.
+        let _ = bus.send(&[Frame::classic(0x20C, &sent.to_le_bytes()).unwrap()]);
+        sent += 1;
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let Output { status, stderr, .. } = child.wait_with_output().unwrap();
+    let said = text(&stderr);
+    assert_eq!(status.code(), Some(1), "{said}");
+    assert!(said.contains(" frames are none of a cell; `gateway dump` shows them): start them"), "{said}");
+}
+
+#[test]
 fn a_signal_ends_a_dump_cleanly() {
     let bench = Bench::new();
     let interrupted = |child: Child| {

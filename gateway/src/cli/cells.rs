@@ -81,6 +81,7 @@ impl Cells {
             decoder: Decoder::new(None),
             inbox: Inbox::new(),
             listing: Listing::new(),
+            others: 0,
             asked: None,
         };
         let seconds = self.seconds.or_else(|| (!self.watch).then_some(LISTEN_S));
@@ -109,8 +110,12 @@ impl Cells {
         }
         if !self.watch && watch.listing.cells().len() == 0 {
             let (name, seconds) = (&self.bus, watch.began.elapsed().as_secs_f64());
+            let others = match watch.others {
+                0 => String::new(),
+                others => format!(" ({others} frames are none of a cell; `gateway dump` shows them)"),
+            };
             return Err(Failure::run(format!(
-                "no cell was heard on {name} for {seconds:.1} s: start them, or switch them on"
+                "no cell was heard on {name} for {seconds:.1} s{others}: start them, or switch them on"
             )));
         }
         if self.watch { Ok(()) } else { print(&show(&watch)?) }
@@ -156,6 +161,8 @@ struct Watch<'a> {
     decoder: Decoder,
     inbox: Inbox,
     listing: Listing,
+    /// Frames that no packet came of.
+    others: u64,
     /// What the description has packets travel in.
     asks_in: Option<Format>,
     asked: Option<Instant>,
@@ -204,6 +211,8 @@ impl Watch<'_> {
             let decoded = self.decoder.decode(at, self.bus.name(), &received.frame);
             if let Decoded::Message(message) = decoded {
                 self.listing.hear(now, received.frame.format(), &message);
+            } else {
+                self.others += 1;
             }
         }
         Ok(())
