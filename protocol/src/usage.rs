@@ -2,7 +2,7 @@
 //! that can be typed again.
 
 use std::borrow::Cow;
-use std::fmt::Display;
+use std::fmt::{self, Display};
 use std::io::{self, ErrorKind, Write};
 use std::process::ExitCode;
 
@@ -45,6 +45,12 @@ impl Failure {
     pub fn and(mut self, more: impl Display) -> Self {
         self.text += &format!("; and {more}");
         self
+    }
+}
+
+impl Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
     }
 }
 

@@ -141,8 +141,7 @@ impl Dump {
         let Self { kind: kinds, node: nodes, from, to, contact, .. } = self;
         let pick = Pick { kinds, nodes, from, to };
         let max = self.max.unwrap_or(u64::MAX);
-        let mut show =
-            Show::new(BufWriter::new(Stoppable::new(&out)), format, pick, contact, how, max);
+        let mut show = Show::new(BufWriter::new(Stoppable::new(&out)), format, pick, contact, how, max);
         let stopped = stopped()?;
         let (what, extras, done) = match file {
             Some(file) => {
