@@ -271,9 +271,9 @@ impl<T> Series<T> {
         }
     }
 
-    /// Hands on what was written; ends a file that is large or old enough, or whose disk is full. Whether another
-    /// file should be begun with [`Series::next`].
-    pub fn flush(&mut self) -> bool {
+    /// Hands on what was written; ends a file that is large or old enough, unless `holds` says that it goes on, or whose
+    /// disk is full. Whether another file should be begun with [`Series::next`].
+    pub fn flush(&mut self, holds: bool) -> bool {
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
             return due && has_room(&self.path);
@@ -291,6 +291,7 @@ impl<T> Series<T> {
         }
         let enough =
             open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
+        let enough = enough && !holds;
         if enough {
             self.end();
         }
