@@ -76,6 +76,8 @@ pub struct Extras {
 pub struct InForce {
     /// Its bus.
     pub bus: String,
+    /// Whether whoever recorded it had sent it.
+    pub own: bool,
     /// What it is.
     pub frame: Frame,
     /// When it was on the bus, in ns since 1970.

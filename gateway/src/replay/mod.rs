@@ -28,6 +28,7 @@ mod start;
 pub mod state;
 pub mod survey;
 mod teller;
+pub mod touched;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;

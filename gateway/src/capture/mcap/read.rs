@@ -6,7 +6,7 @@ use std::io::{self, Read};
 use ::mcap::McapError;
 use ::mcap::records::{Channel, Record as Raw, op};
 use ::mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use protocol::candump::Timestamp;
+use protocol::candump::{Direction, Record, Timestamp};
 
 use super::foreign::Foreign;
 use crate::capture::log::read_some;
@@ -178,14 +178,14 @@ impl McapReader {
                         }
                     }
                     What::InForce => {
-                        let time = Timestamp { nanos: log_time, nine_digits: true };
-                        let frame = CanFrame::decode(data, time);
-                        let frame = frame
+                        let frame = CanFrame::stamp(data).and_then(|nanos| {
+                            CanFrame::decode(data, Timestamp { nanos, nine_digits: true })
+                        });
+                        let CanFrame(Record { time, interface, frame, direction }) = frame
                             .map_err(|error| damaged(format!("a message of {}: {error}", lane.topic)))?;
-                        let CanFrame(record) = frame;
-                        let (bus, frame) = (record.interface.to_owned(), record.frame);
+                        let (bus, own) = (interface.to_owned(), direction == Some(Direction::Sent));
                         self.keep(size_of::<InForce>(), |extras| {
-                            extras.in_force.push(InForce { bus, frame, nanos: log_time })
+                            extras.in_force.push(InForce { bus, own, frame, nanos: time.nanos })
                         });
                         return Ok(None);
                     }

@@ -22,7 +22,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
 pub use lane::Present;
-use lane::{Answers, Asked, Both, Fate, Lane, Pair, Round, excuse_extra};
+use lane::{Asked, Both, Excuse, Fate, Lane, Pair, Round, excuse_extra, take_first_joints};
 pub use sums::Own;
 use sums::{Outcome, Side, Sum, Why, compare};
 pub use tally::{Lacking, Tally};
@@ -71,26 +71,21 @@ impl Judge {
     /// Takes in that the capture has joints next; returns the number of their round on their bus, if they will be
     /// sent.
     pub fn record_joints(&mut self, lane: usize, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
-        let lane = self.lanes.get_mut(lane)?;
-        let round = is_sent.then(|| {
-            lane.rounds.push_back(Round::new(epoch, nanos));
-            lane.base + lane.rounds.len() as u64 - 1
-        });
-        *lane.recorded.get_mut(usize::from(epoch.0))? = round;
-        round
+        self.lanes.get_mut(lane)?.record_joints(nanos, epoch, is_sent)
     }
 
-    /// Takes in a reply of the capture. `is_in_part` says whether it stands in the part that is replayed.
+    /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
     pub fn record(&mut self, lane: usize, message: &Message, is_in_part: bool) {
         let expects = self.expects;
         let (Some(lane), tally) = (self.lanes.get_mut(lane).filter(|_| expects), &mut self.tally) else {
             return;
         };
+        lane.record_state(message, is_in_part);
         if let (Message::Configured { from, tag, answer }, true) = (*message, is_in_part)
             && is_compared(answer)
+            && !lane.record_answer(from, tag, answer)
         {
-            let rounds = lane.base + lane.rounds.len() as u64;
-            lane.answers.entry(from).or_default().recorded.push_back((rounds, tag, answer));
+            tally.lacking.asked_earlier += 1;
         }
         match *message {
             Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Tree(tree) } => {
@@ -103,9 +98,10 @@ impl Judge {
             }
             Message::Sum { from, epoch, torque, count } => {
                 let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
-                let has_rounds = !lane.rounds.is_empty();
+                let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
                 match number.and_then(|number| lane.round(number)) {
                     Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
+                    None if is_in_part && is_earlier => tally.lacking.joints_earlier += 1,
                     None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
                     None => {}
                 }
@@ -127,19 +123,22 @@ impl Judge {
             | Message::Configured { .. }
             | Message::Stimulus { .. } => {}
         }
-        lane.record_first_joints(message);
+        take_first_joints(&mut lane.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && lane.untouched.get(&cell) == Some(&epoch) {
+        if what != What::Torque && lane.untouched.recorded.get(&cell) == Some(&epoch) {
             // Of no joints, even if joints of that epoch stood on the bus by then.
             return;
         }
         let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
         let measured = lane.excuses.get(&cell).is_some_and(|excuse| excuse.cell.measured);
-        let has_rounds = !lane.rounds.is_empty();
+        let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
         match number.and_then(|number| lane.round(number)) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
-            // Before the first joints of the part there are replies to those before it, and of sensors without any.
+            None if is_in_part && what == What::Torque && is_earlier => {
+                tally.lacking.joints_earlier += 1;
+            }
+            // Before the first joints there are replies of sensors without any.
             None if is_in_part && has_rounds && what == What::Torque => {
                 tally.lacking.joints_unrecorded += 1;
             }
@@ -149,9 +148,7 @@ impl Judge {
 
     /// Takes in that the capture begins anew: replies before its first joints answer none of the last pass.
     pub fn record_begin(&mut self) {
-        for lane in &mut self.lanes {
-            lane.recorded.fill(None);
-        }
+        self.lanes.iter_mut().for_each(Lane::begin);
     }
 
     /// Takes in that the capture has no more joints.
@@ -209,6 +206,7 @@ impl Judge {
     pub fn hear(&mut self, index: usize, message: &Message) {
         let Some(lane) = self.lanes.get_mut(index) else { return };
         lane.is_down = false;
+        take_first_joints(&mut lane.untouched.now, message);
         match *message {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
                 self.rival.get_or_insert(index);
@@ -251,6 +249,9 @@ impl Judge {
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let Some(lane) = self.lanes.get_mut(index) else { return };
+        if what != What::Torque && lane.untouched.now.get(&cell) == Some(&epoch) {
+            return;
+        }
         let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
         let Some((number, round)) =
             asked.and_then(|asked| asked.round).and_then(|number| Some((number, lane.round(number)?)))
@@ -262,7 +263,9 @@ impl Judge {
         match pair.now {
             None => pair.now = Some(words),
             // The same joints may be asked twice, and are then answered twice.
-            Some(before) if before == words || what != What::Torque => {}
+            Some(before) if before == words => {}
+            // The last word counts, as in the capture.
+            Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
                 let said = Said::Words { what, recorded: None, now: Some(words) };
@@ -403,12 +406,19 @@ impl Judge {
         if !self.expects || round.fate == Fate::Waiting {
             return;
         }
-        let is_last = lane.last_round == Some(number);
+        let (is_last, begins_later) = (lane.last_round == Some(number), lane.begins_later);
         let at = Some((number, round.epoch, round.nanos));
+        if round.is_first {
+            lane.excuses.values_mut().for_each(|excuse| excuse.speaks = None);
+        }
         for ((cell, what), &Pair { recorded, now }) in &round.replies {
             let (cell, what) = (*cell, *what);
             let Some(lane) = self.lanes.get_mut(index) else { return };
-            let excuse = lane.excuses.get_mut(&cell);
+            let mut excuse = lane.excuses.get_mut(&cell);
+            let spoke = excuse.as_ref().and_then(|excuse| excuse.speaks);
+            if let (Some(excuse), Some(recorded), What::Torque) = (&mut excuse, recorded, what) {
+                excuse.speaks = Some(recorded != [0; WORDS]);
+            }
             let said = Said::Words { what, recorded, now };
             let how = match (recorded, now) {
                 (None, None) => continue,
@@ -433,7 +443,17 @@ impl Judge {
                 }
                 (Some(recorded), None) => {
                     let is_end = what == What::Torque && recorded == [0; WORDS];
-                    if let Some(excuse) = excuse.filter(|excuse| is_end && excuse.ended_earlier) {
+                    // What was over before, by what was sent, or began before the part: the cell had not taken the
+                    // joints at which it ended.
+                    let was_over = match spoke {
+                        Some(spoke) => spoke && !round.may_answer(cell),
+                        None => begins_later,
+                    };
+                    let is_later = |excuse: &&mut Excuse| {
+                        let was_over = was_over && !excuse.cell.is_counted_at(round.nanos);
+                        is_end && (excuse.ended_earlier || was_over)
+                    };
+                    if let Some(excuse) = excuse.filter(is_later) {
                         excuse.ended_earlier = false;
                         self.tally.lacking.said_later += 1;
                         continue;
@@ -444,7 +464,7 @@ impl Judge {
                 // Reports may be asked for by this replay.
                 (None, Some(_)) if what != What::Torque => continue,
                 (None, Some(now)) => {
-                    if excuse_extra(&mut self.tally.lacking, excuse, round.nanos, is_last, now) {
+                    if excuse_extra(&mut self.tally.lacking, excuse, (cell, &round), is_last, now) {
                         continue;
                     }
                     self.tally.extra += 1;
@@ -505,7 +525,7 @@ impl Judge {
                     continue;
                 }
                 // The words only say whether a contact has ended, which a sum does not tell.
-                Outcome::Extra if excuse_extra(lacking, excuse, round.nanos, is_last, [1; WORDS]) => continue,
+                Outcome::Extra if excuse_extra(lacking, excuse, (cell, round), is_last, [1; WORDS]) => continue,
                 Outcome::Extra => (extra, How::Extra),
             };
             *count += 1;
@@ -526,10 +546,11 @@ impl Judge {
     /// Compares the answers to `configure`, in their order.
     fn close_answers(&mut self, index: usize) {
         let Some(lane) = self.lanes.get_mut(index) else { return };
-        for (cell, Answers { mut recorded, mut now }) in std::mem::take(&mut lane.answers) {
+        let rounds = lane.base;
+        for (cell, mut answers) in std::mem::take(&mut lane.answers) {
             loop {
-                let recorded = recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
-                let now = now.pop_front();
+                let recorded = answers.recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
+                let now = answers.now.pop_front();
                 let (count, how) = match (recorded, now) {
                     (None, None) => break,
                     (Some(recorded), Some(now)) if recorded == now => {
@@ -538,6 +559,10 @@ impl Judge {
                     }
                     (Some(_), Some(_)) => (&mut self.tally.different, How::Different),
                     (Some(_), None) => (&mut self.tally.missing, How::Missing),
+                    (None, Some((tag, _))) if answers.is_cut_off(tag, rounds) => {
+                        self.tally.lacking.ended += 1;
+                        continue;
+                    }
                     (None, Some(_)) => (&mut self.tally.extra, How::Extra),
                 };
                 *count += 1;
