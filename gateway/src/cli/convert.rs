@@ -2,11 +2,11 @@
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, IsTerminal};
+use std::io::{self, BufWriter, IsTerminal, Read};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 use gateway::capture::convert::{ConvertError, Converted, Output, convert};
@@ -33,12 +33,13 @@ const PIECE: usize = 1 << 18;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway convert run.mcap run.log
+  gateway convert run.mcap run-*.mcap all.log
   gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
   candump -L can0 | gateway convert - can0.mcap")]
 pub(crate) struct Convert {
-    /// A candump log or an MCAP recording; - for standard input
-    #[arg(value_name = "IN")]
-    from: PathBuf,
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    #[arg(value_name = "IN", required = true)]
+    from: Vec<PathBuf>,
     /// The new capture; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
@@ -84,17 +85,12 @@ impl Convert {
                 "{to} exists: name another file, or overwrite it with --force"
             )));
         }
-        let name = if is_standard(&self.from) {
-            "standard input".to_owned()
-        } else {
-            self.from.display().to_string()
-        };
-        let (file, size) = open(&self.from).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        let size = size(&self.from);
         let stopped = stopped()?;
         let live = size.is_none();
         let bar = bar(size);
-        let input = Interruptible { file, stopped: Arc::clone(&stopped) };
-        let mut reader = Reader::from_read(&name, bar.wrap_read(input)).map_err(Failure::usage)?;
+        let mut reader = open(&self.from, &bar, &stopped)?;
+        let name = reader.name().to_owned();
         if !text && reader.format() == Format::Mcap {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
@@ -176,17 +172,24 @@ fn is_standard(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
-/// The input, and how many bytes it has when that is known.
-fn open(path: &Path) -> io::Result<(File, Option<u64>)> {
-    if is_standard(path) {
-        return Ok((io::stdin().as_fd().try_clone_to_owned()?.into(), None));
+/// How many bytes the input has, when that is known.
+fn size(from: &[PathBuf]) -> Option<u64> {
+    let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
+    from.iter().map(of).sum()
+}
+
+/// The input, with progress.
+fn open(from: &[PathBuf], bar: &ProgressBar, stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
+    let (bar, stopped) = (bar.clone(), Arc::clone(stopped));
+    let through = move |file| -> Box<dyn Read + Send> {
+        Box::new(bar.wrap_read(Interruptible { file, stopped: Arc::clone(&stopped) }))
+    };
+    if from.iter().all(|path| is_standard(path)) {
+        let input = io::stdin().as_fd().try_clone_to_owned();
+        let input = input.map_err(|error| Failure::run(format!("standard input: {error}")))?;
+        return Reader::from_read("standard input", through(input.into())).map_err(Failure::usage);
     }
-    let file = File::open(path)?;
-    let about = file.metadata()?;
-    if about.is_dir() {
-        return Err(io::ErrorKind::IsADirectory.into());
-    }
-    Ok((file, about.is_file().then_some(about.len())))
+    Reader::open_through(from, Box::new(through)).map_err(Failure::usage)
 }
 
 /// The output; standard output is written to as it is.

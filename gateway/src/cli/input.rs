@@ -2,10 +2,13 @@
 
 use std::fs::File;
 use std::io::{self, Read};
+use std::os::fd::AsFd;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use gateway::capture::Reader;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
@@ -20,6 +23,24 @@ pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
             .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;
     }
     Ok(stopped)
+}
+
+/// Opens a capture, standard input or the parts of a recording, so that its reader can be told to stop.
+pub(crate) fn captures(sources: &[PathBuf], stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
+    let through = |stopped: &Arc<AtomicBool>| {
+        let stopped = Arc::clone(stopped);
+        move |file| -> Box<dyn Read + Send> {
+            Box::new(Interruptible { file, stopped: Arc::clone(&stopped) })
+        }
+    };
+    if let [one] = sources
+        && one.as_os_str() == "-"
+    {
+        let input = io::stdin().as_fd().try_clone_to_owned();
+        let input = input.map_err(|error| Failure::run(format!("standard input: {error}")))?;
+        return Reader::from_read("-", through(stopped)(input.into())).map_err(Failure::usage);
+    }
+    Reader::open_through(sources, Box::new(through(stopped))).map_err(Failure::usage)
 }
 
 /// A file whose reader can be told to stop: then it is at its end.

@@ -2,16 +2,14 @@
 
 mod show;
 
-use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use gateway::capture::{Entry, Format, NoteKind, Reader};
+use gateway::capture::{Entry, Format, NoteKind};
 use gateway::shadow::{Options, Shadow};
 use protocol::bus::{self, Bus, BusError, Choice, Inbox};
 use protocol::can::EXTENDED_MASK;
@@ -20,7 +18,7 @@ use protocol::wire_time::{BitRates, bit_rate};
 
 use self::show::write_frames;
 use super::dump::nanos;
-use super::input::{Interruptible, LOOK, stopped};
+use super::input::{LOOK, captures, stopped};
 use super::output;
 
 /// Bytes for frames that wait while others are worked on.
@@ -35,12 +33,14 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway shadow run.mcap
+  gateway shadow run.mcap run-*.mcap
   gateway shadow run.log --nominal 500k --data 2M
   gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
   gateway shadow run.log --json | jq -c 'select(.end_s - .time > 0.016)'
   gateway shadow vcan0 vcan1 --duration 10")]
 pub(crate) struct ShadowCommand {
-    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else buses
+    /// A candump log or MCAP recording when there is a file of this name, all parts of a split recording in any order,
+    /// - for standard input, else buses
     #[arg(value_name = "FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// The bit rate of identifiers, and of all of classic frames: bit/s, as 500k or 1M
@@ -113,16 +113,18 @@ impl ShadowCommand {
         let name =
             self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
         let taken = match self.sources.as_slice() {
-            [source] if files == 1 => {
+            sources if files == sources.len() => {
                 if self.duration.is_some() {
                     return Err(Failure::usage(format!(
                         "--duration is for live buses, and {name} is a file"
                     )));
                 }
-                captured(source, &mut shadow, &mut out, &stopped)?
+                captured(sources, &mut shadow, &mut out, &stopped)?
             }
             _ if files > 0 => {
-                return Err(Failure::usage(format!("{name}: one file alone, or buses without a file")));
+                return Err(Failure::usage(format!(
+                    "{name}: one file, the parts of one recording, or buses without a file"
+                )));
             }
             sources => self.live(sources, &mut shadow, &mut out, &stopped)?,
         };
@@ -250,24 +252,19 @@ fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
 
 /// Takes in a capture, and says what is missing of it.
 fn captured(
-    source: &Path,
+    sources: &[PathBuf],
     shadow: &mut Shadow,
     out: &mut impl Write,
     stopped: &Arc<AtomicBool>,
 ) -> Result<Taken, Failure> {
-    let name = source.display().to_string();
-    let file: File = if source.as_os_str() == "-" {
-        let input = io::stdin().as_fd().try_clone_to_owned();
-        input.map_err(|error| Failure::run(format!("standard input: {error}")))?.into()
-    } else if source.is_dir() {
+    if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
         return Err(Failure::usage(format!(
-            "{name} is a directory: name a candump log, an MCAP recording or a bus"
+            "{} is a directory: name a candump log, an MCAP recording or a bus",
+            folder.display()
         )));
-    } else {
-        File::open(source).map_err(|error| Failure::usage(format!("{name}: {error}")))?
-    };
-    let input = Interruptible { file, stopped: Arc::clone(stopped) };
-    let mut reader = Reader::from_read(&name, input).map_err(Failure::usage)?;
+    }
+    let mut reader = captures(sources, stopped)?;
+    let name = reader.name().to_owned();
     let what = match reader.format() {
         Format::Candump => "candump log",
         Format::Mcap => "MCAP",

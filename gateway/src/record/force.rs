@@ -140,9 +140,10 @@ impl Cell {
     /// It has taken into use what was written before the commit that was asked last.
     fn commit(&mut self) {
         let Some(asked) = self.asked.take() else { return };
-        let later = self.staged.extract_if(.., |_, said| said.place > asked.place).collect();
-        self.committed.append(&mut std::mem::replace(&mut self.staged, later));
-        self.commit = Some(asked);
+        let staged = std::mem::take(&mut self.staged).into_iter();
+        let (mut taken, later): (BTreeMap<_, _>, _) = staged.partition(|(_, said)| said.place < asked.place);
+        self.committed.append(&mut taken);
+        (self.staged, self.commit) = (later, Some(asked));
     }
 
     /// What the cell itself says that it feels, when nothing else is known of it.
@@ -166,8 +167,8 @@ impl Cell {
         let said = [&self.heartbeat, &self.tree, &self.commit, &self.asked].into_iter().chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
         let felt = self.felt.iter().flatten().chain(self.waiting.iter().map(|(_, (_, felt))| felt));
-        let felt = felt
-            .flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
+        let felt =
+            felt.flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
         said.flatten().chain(written).chain(felt)
     }
 }

@@ -76,8 +76,8 @@ pub struct Spawn {
 /// What a replay needs to know.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// The capture.
-    pub file: PathBuf,
+    /// The capture: a file, or the parts of a recording.
+    pub files: Vec<PathBuf>,
     /// Which kind of bus.
     pub kinds: Kinds,
     /// Whose frames are sent.
@@ -128,10 +128,10 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
             .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
     }
     let teller = Teller::new(options.quiet);
-    let (survey, extras) = look_through(options, &teller)?;
+    let (survey, extras, name) = look_through(options, &teller)?;
     let survey = Arc::new(survey);
-    let routes = Routes::new(options, &survey)?;
-    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(options, spawn, &routes, &extras));
+    let routes = Routes::new(options, &survey, &name)?;
+    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
     let wearing = wearing.transpose()?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
     let recorded = start::recorded_skin(&extras);
@@ -152,6 +152,7 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
         routes: routes.clone(),
         expects: options.expect,
         spawned: options.spawn.is_some(),
+        name,
     };
     let judged = routes
         .names
@@ -161,21 +162,19 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
     Session::new(options, checks, judge, buses, signalled, teller).run(idle.as_ref(), wearing.as_ref())
 }
 
-/// Reads the capture once, from end to end.
-fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), RunError> {
-    if options.file.as_os_str() == "-" {
+/// Reads the capture once, from end to end; also what it is called.
+fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, String), RunError> {
+    if options.files.iter().any(|file| file.as_os_str() == "-") {
         return Err(RunError::Usage(
             "a capture is read twice, which standard input cannot be: write it to a file, and name that"
                 .to_owned(),
         ));
     }
-    let name = options.file.display();
-    let mut reader = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
+    let mut reader = Reader::open_all(&options.files).map_err(|error| RunError::Usage(error.to_string()))?;
+    let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    // What was in force stands before the first frame, and is known when that is read.
-    let mut beginning = Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()))?;
-    beginning.next().map_err(failed)?;
-    survey.begin(&beginning.extras().in_force);
+    // What was in force stands before the first frame, and is known when it is open.
+    survey.begin(&reader.extras().in_force);
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(failed)? {
         match entry {
@@ -229,7 +228,7 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
              leave none of it"
         )));
     }
-    Ok((survey, reader.extras().clone()))
+    Ok((survey, reader.extras().clone(), name))
 }
 
 fn failed(error: CaptureError) -> RunError {

@@ -6,9 +6,7 @@ use std::collections::BTreeMap;
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
-use protocol::message::{
-    Answer, Heard, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags,
-};
+use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
 use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -341,7 +339,8 @@ impl Bus {
 impl Cell {
     fn new(nanos: u64, before: Option<&Before>) -> Self {
         // A cell that has just spoken before the capture was there when it began.
-        let first = before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
+        let first =
+            before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         Self {
             hash: before.map_or(Known::No, |before| before.hash),
             measured: before.is_some_and(|before| before.measures),

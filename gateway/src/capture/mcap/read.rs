@@ -47,7 +47,9 @@ pub(crate) struct McapReader {
     any_frame: bool,
     /// Whether messages that are only counted are wanted too.
     others: bool,
-    /// What was read when it was opened: the channel and time of the first message, or why there is none.
+    /// Whether no other part of the recording came before.
+    is_first: bool,
+    /// What was read ahead: the channel and time of the next message, or why there is none.
     first: Option<Result<(u16, u64), Fault>>,
     over: bool,
 }
@@ -95,6 +97,7 @@ impl McapReader {
             bytes: u64::try_from(head.len()).unwrap_or(0),
             any_frame: false,
             others,
+            is_first: true,
             first: None,
             over: false,
         };
@@ -105,6 +108,42 @@ impl McapReader {
 
     pub(crate) const fn extras(&self) -> &Extras {
         &self.extras
+    }
+
+    /// It is a part that follows others, of which this is known: what was in force when it began is no news, and its
+    /// topics are theirs.
+    pub(crate) fn follows(&mut self, before: Extras) {
+        let own = std::mem::replace(&mut self.extras, before);
+        self.is_first = false;
+        self.extras.unfinished = self.extras.unfinished.take().or(own.unfinished);
+        let topics = &mut self.extras.topics;
+        let places = own.topics.into_iter().map(|topic| {
+            let known = topics.iter().position(|it| it.name == topic.name && it.schema == topic.schema);
+            match known.and_then(|at| Some((at, topics.get_mut(at)?))) {
+                Some((at, known)) => {
+                    known.messages += topic.messages;
+                    at
+                }
+                None => {
+                    topics.push(topic);
+                    topics.len() - 1
+                }
+            }
+        });
+        let places: Vec<_> = places.collect();
+        for lane in self.channels.values_mut() {
+            if let What::Counted(topic) = &mut lane.what {
+                *topic = places.get(*topic).copied().unwrap_or_default();
+            }
+        }
+    }
+
+    /// Whether nothing more comes. Reads on up to the next message, which [`McapReader::next`] then gives out.
+    pub(crate) fn is_at_its_end(&mut self) -> Result<bool, Fault> {
+        if self.first.is_none() {
+            self.first = self.advance()?.map(Ok);
+        }
+        Ok(self.first.is_none())
     }
 
     /// The next entry, or message of another topic where these are wanted. Never panics.
@@ -177,10 +216,10 @@ impl McapReader {
                             return Ok(None);
                         }
                     }
+                    What::InForce if !self.is_first => return Ok(None),
                     What::InForce => {
-                        let frame = CanFrame::stamp(data).and_then(|nanos| {
-                            CanFrame::decode(data, Timestamp { nanos, nine_digits: true })
-                        });
+                        let frame = CanFrame::stamp(data)
+                            .and_then(|nanos| CanFrame::decode(data, Timestamp { nanos, nine_digits: true }));
                         let CanFrame(Record { time, interface, frame, direction }) = frame
                             .map_err(|error| damaged(format!("a message of {}: {error}", lane.topic)))?;
                         let (bus, own) = (interface.to_owned(), direction == Some(Direction::Sent));
@@ -232,8 +271,9 @@ impl McapReader {
             Some(Err(McapError::UnexpectedEof)) => {
                 self.over = true;
                 let bytes = self.bytes;
-                self.extras.unfinished =
-                    Some(format!("it has no end: after {bytes} bytes it was cut off, or never finished"));
+                self.extras.unfinished.get_or_insert_with(|| {
+                    format!("it has no end: after {bytes} bytes it was cut off, or never finished")
+                });
             }
             Some(Err(McapError::Io(error))) => {
                 return Err(damaged(format!("a chunk cannot be unpacked: {error}")));

@@ -6,8 +6,8 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
 use protocol::packet::{Epoch, WORDS};
 
-use super::sums::{Sums, Trees};
 use super::WINDOW;
+use super::sums::{Sums, Trees};
 use super::tally::Lacking;
 use crate::replay::difference::What;
 use crate::replay::state::State;
@@ -254,9 +254,10 @@ impl Lane {
     /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
         self.begins_later |= !is_in_part && self.rounds_so_far() == self.first_round;
-        match *message {
-            Message::Joints { epoch, .. } => drop(self.take_joints(epoch)),
-            _ => self.state.take(message),
+        if let Message::Joints { epoch, .. } = *message {
+            self.take_joints(epoch);
+        } else {
+            self.state.take(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
             let rounds = self.rounds_so_far();
@@ -274,9 +275,7 @@ impl Lane {
     pub(super) fn is_earlier(&self, epoch: Epoch) -> bool {
         let rounds = self.rounds_so_far() - self.first_round;
         let last = if rounds == 0 { self.state.last_epoch() } else { self.earlier };
-        self.begins_later
-            && rounds < WINDOW
-            && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
+        self.begins_later && rounds < WINDOW && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
     }
 
     /// Takes in a recorded answer to `configure`; whether what it answers stands in the part.

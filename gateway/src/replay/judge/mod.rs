@@ -525,7 +525,9 @@ impl Judge {
                     continue;
                 }
                 // The words only say whether a contact has ended, which a sum does not tell.
-                Outcome::Extra if excuse_extra(lacking, excuse, (cell, round), is_last, [1; WORDS]) => continue,
+                Outcome::Extra if excuse_extra(lacking, excuse, (cell, round), is_last, [1; WORDS]) => {
+                    continue;
+                }
                 Outcome::Extra => (extra, How::Extra),
             };
             *count += 1;
