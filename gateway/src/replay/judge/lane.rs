@@ -127,9 +127,18 @@ pub(super) struct Excuse {
 pub(super) struct Answers {
     /// With the number of rounds before it.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
-    /// What was asked in the recording and not answered yet: the tag, and the number of rounds before it.
-    asked: VecDeque<(u64, u8)>,
+    /// What was asked in the recording and not answered yet.
+    asked: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
+}
+
+/// A recorded `configure`.
+#[derive(Clone, Copy, Debug)]
+struct Question {
+    tag: u8,
+    /// Rounds before it, and when the last of them was.
+    round: u64,
+    nanos: u64,
 }
 
 /// One bus.
@@ -183,7 +192,7 @@ impl Lane {
             recorded: vec![None; 256],
             base: 0,
             rounds: VecDeque::new(),
-            trees: Both::default(),
+            trees: Both { recorded: Trees::default(), now: Trees::of_joints_asked_again() },
             answers: BTreeMap::new(),
             speaking: BTreeSet::new(),
             senses: false,
@@ -260,13 +269,14 @@ impl Lane {
             self.state.take(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
-            let rounds = self.rounds_so_far();
+            let round = self.rounds_so_far();
+            let nanos = self.rounds.back().map_or(0, |round| round.nanos);
             for cell in self.excuses.keys().filter(|cell| to.names(**cell)) {
                 let asked = &mut self.answers.entry(*cell).or_default().asked;
                 if asked.len() == ASKED {
                     asked.pop_front();
                 }
-                asked.push_back((rounds, tag));
+                asked.push_back(Question { tag, round, nanos });
             }
         }
     }
@@ -282,7 +292,7 @@ impl Lane {
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
         let rounds = self.rounds_so_far();
         let answers = self.answers.entry(from).or_default();
-        match answers.asked.iter().position(|(_, asked)| *asked == tag) {
+        match answers.asked.iter().position(|asked| asked.tag == tag) {
             Some(at) => drop(answers.asked.remove(at)),
             None if self.begins_later => return false,
             None => {}
@@ -345,11 +355,34 @@ impl Lane {
 }
 
 impl Answers {
-    /// Whether the recording ended before such an answer: it was asked for at the last joints, after `rounds` rounds.
-    pub(super) fn is_cut_off(&mut self, tag: u8, rounds: u64) -> bool {
-        let late = |(asked_at, asked): &(u64, u8)| *asked == tag && asked_at + AT_THE_END >= rounds;
-        let at = self.asked.iter().position(late);
-        at.and_then(|at| self.asked.remove(at)).is_some()
+    /// Whether the recording says why it has the question of this tag and not the answer; `rounds` are all there were.
+    pub(super) fn excuse_extra(
+        &mut self,
+        lacking: &mut Lacking,
+        excuse: Option<&mut Excuse>,
+        tag: u8,
+        rounds: u64,
+    ) -> bool {
+        let Some(Excuse { cell, .. }) = excuse else {
+            // A cell that the recording does not have.
+            lacking.silent += 1;
+            return true;
+        };
+        let Some(at) = self.asked.iter().position(|asked| asked.tag == tag) else { return false };
+        let Some(Question { round, nanos, .. }) = self.asked.remove(at) else { return false };
+        if cell.is_silent_at(nanos) {
+            lacking.silent += 1;
+        } else if round + AT_THE_END >= rounds {
+            lacking.ended += 1;
+        } else if !cell.is_counted_at(nanos) {
+            lacking.uncounted += 1;
+        } else if cell.unrecorded > 0 {
+            cell.unrecorded -= 1;
+            lacking.unrecorded += 1;
+        } else {
+            return false;
+        }
+        true
     }
 }
 
@@ -401,11 +434,9 @@ pub(super) fn excuse_extra(
     } else if is_last && !is_counted {
         lacking.ended += 1;
     } else if may_answer && !is_counted {
-        excuse.ended_earlier = now == [0; WORDS];
         lacking.uncounted += 1;
     } else if cell.untaken > 0 {
         cell.untaken -= 1;
-        excuse.ended_earlier = now == [0; WORDS];
         lacking.untaken += 1;
     } else if cell.unrecorded > 0 {
         cell.unrecorded -= 1;
@@ -415,5 +446,7 @@ pub(super) fn excuse_extra(
     } else {
         return false;
     }
+    // Counters say how many, and not which: whatever it is that is lacking, the end may have been said later then.
+    excuse.ended_earlier = now == [0; WORDS];
     true
 }

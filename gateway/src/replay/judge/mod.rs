@@ -548,9 +548,17 @@ impl Judge {
     /// Compares the answers to `configure`, in their order.
     fn close_answers(&mut self, index: usize) {
         let Some(lane) = self.lanes.get_mut(index) else { return };
-        let rounds = lane.base;
+        let (rounds, mut differences) = (lane.base, Vec::new());
         for (cell, mut answers) in std::mem::take(&mut lane.answers) {
             loop {
+                let excuse = lane.excuses.get_mut(&cell);
+                let next = answers.recorded.front().map(|(_, tag, _)| *tag);
+                if let Some((tag, _)) = answers.now.front().copied().filter(|(tag, _)| Some(*tag) != next)
+                    && answers.excuse_extra(&mut self.tally.lacking, excuse, tag, rounds)
+                {
+                    answers.now.pop_front();
+                    continue;
+                }
                 let recorded = answers.recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
                 let now = answers.now.pop_front();
                 let (count, how) = match (recorded, now) {
@@ -561,15 +569,14 @@ impl Judge {
                     }
                     (Some(_), Some(_)) => (&mut self.tally.different, How::Different),
                     (Some(_), None) => (&mut self.tally.missing, How::Missing),
-                    (None, Some((tag, _))) if answers.is_cut_off(tag, rounds) => {
-                        self.tally.lacking.ended += 1;
-                        continue;
-                    }
                     (None, Some(_)) => (&mut self.tally.extra, How::Extra),
                 };
                 *count += 1;
-                self.note(index, how, cell, None, Said::Answers { recorded, now });
+                differences.push((how, cell, Said::Answers { recorded, now }));
             }
+        }
+        for (how, cell, said) in differences {
+            self.note(index, how, cell, None, said);
         }
     }
 }
