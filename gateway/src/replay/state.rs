@@ -66,15 +66,15 @@ impl Feeling {
         }
     }
 
-    /// Whether something touches it from the joints of an epoch on.
-    fn is_touched_from(&self, epoch: Epoch) -> bool {
+    /// Whether something touches it from the joints of an epoch on, if that is known.
+    fn is_touched_from(&self, epoch: Epoch) -> Option<bool> {
         let touches = |skin: &SkinSensors| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
         if self.pending.is_empty() {
-            return self.skin.as_ref().is_some_and(touches);
+            return self.skin.as_ref().map(touches);
         }
         let mut then = self.clone();
         then.latch(epoch);
-        then.skin.as_ref().is_some_and(touches)
+        then.skin.as_ref().map(touches)
     }
 
     /// Nothing, in either mode.
@@ -249,8 +249,11 @@ impl State {
     pub fn touched(&self) -> Touched {
         let mut touched = Touched::default();
         let Some((epoch, _)) = self.joints else { return touched };
-        let all = CellId::all().zip(&self.before.cells);
-        all.filter(|(_, it)| it.is_touched_from(epoch)).for_each(|(cell, _)| touched.insert(cell));
+        for (cell, feeling) in CellId::all().zip(&self.before.cells) {
+            if let Some(is_touched) = feeling.is_touched_from(epoch) {
+                touched.insert(cell, is_touched);
+            }
+        }
         touched
     }
 

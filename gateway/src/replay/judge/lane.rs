@@ -86,6 +86,8 @@ pub(super) struct Round {
     pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were asked last.
     pub(super) asked_as: Epoch,
+    /// How often they were.
+    pub(super) asked: u32,
     /// Who is touched at these joints and at the ones before, by what the recording says that was sent.
     pub(super) touched: [Touched; 2],
     /// Whether a pass begins with them.
@@ -101,14 +103,20 @@ impl Round {
             replies: BTreeMap::new(),
             sums: Both::default(),
             asked_as: epoch,
+            asked: 0,
             touched: [Touched::default(); 2],
             is_first: false,
         }
     }
 
+    /// Whether something touches a cell at these joints, if that is known.
+    pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
+        self.touched.last().and_then(|touched| touched.is(cell))
+    }
+
     /// Whether a cell that takes these joints has anything to say: a torque, or the end of what it felt before.
     pub(super) fn may_answer(&self, cell: CellId) -> bool {
-        self.touched.iter().any(|touched| touched.has(cell))
+        self.touched.iter().any(|touched| touched.is(cell) == Some(true))
     }
 }
 
@@ -192,7 +200,7 @@ impl Lane {
             recorded: vec![None; 256],
             base: 0,
             rounds: VecDeque::new(),
-            trees: Both { recorded: Trees::default(), now: Trees::of_joints_asked_again() },
+            trees: Both::default(),
             answers: BTreeMap::new(),
             speaking: BTreeSet::new(),
             senses: false,

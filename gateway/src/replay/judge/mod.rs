@@ -176,6 +176,7 @@ impl Judge {
             // Asked again, all cells say their sums again.
             round.sums.now.clear();
             round.asked_as = epoch;
+            round.asked += 1;
         }
         while self.lanes.get(lane).is_some_and(|lane| lane.base + WINDOW < number) {
             self.close_round(lane);
@@ -497,7 +498,16 @@ impl Judge {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
-            let (count, how) = match compare(&then, &now, cell) {
+            let outcome = match compare(&then, &now, cell) {
+                Outcome::Different | Outcome::Missing | Outcome::Extra
+                    if then.is_doubtful(cell, round.is_touched(cell), false)
+                        || round.asked > 1 && now.is_doubtful(cell, round.is_touched(cell), true) =>
+                {
+                    Outcome::LeftOut(Why::NotTaken)
+                }
+                outcome => outcome,
+            };
+            let (count, how) = match outcome {
                 Outcome::Nothing => continue,
                 Outcome::Equal => {
                     self.tally.equal += 1;

@@ -18,16 +18,7 @@ use protocol::packet::WORDS;
 
 /// Where each cell's sums go, from round to round.
 #[derive(Debug, Default)]
-pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>, Asked);
-
-/// How often each joints are asked. A page tells the epoch of the last joints; those that are asked again go out under
-/// the epoch before as well, so that it may mean either round.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) enum Asked {
-    #[default]
-    Once,
-    Again,
-}
+pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
 
 /// From a round on they go there.
 #[derive(Clone, Copy, Debug)]
@@ -38,11 +29,6 @@ struct Step {
 }
 
 impl Trees {
-    /// Of joints that are asked again where cells came too late.
-    pub(super) const fn of_joints_asked_again() -> Self {
-        Self(BTreeMap::new(), Asked::Again)
-    }
-
     /// Takes in where a cell's sums go from a round on, as it says itself.
     pub(super) fn say(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
@@ -67,17 +53,13 @@ impl Trees {
     /// says nothing; one that finds none any more is not between two.
     fn affected(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
-        let last = match self.1 {
-            Asked::Once => round + 1,
-            Asked::Again => round + 2,
-        };
         for (cell, steps) in &self.0 {
             let is_away = self.parent(*cell, round) == Some(None);
             if is_away && steps.back().is_some_and(|last| last.parent.is_some()) {
                 all.insert(*cell);
             }
             for (before, after) in steps.iter().zip(steps.iter().skip(1)) {
-                if (round..=last).contains(&after.since) {
+                if after.since == round || after.since == round + 1 {
                     all.insert(*cell);
                     let parents = [before.parent, after.parent].into_iter().flatten();
                     all.extend(parents.filter_map(|parent| CellId::new(parent.into()).ok()));
@@ -224,6 +206,15 @@ impl<'a> Side<'a> {
             }
         }
         Some(Own { sum, count, children, steps, cells })
+    }
+
+    /// Whether what is left of a cell's sum cannot be its own, by whether it was touched: then its children were others
+    /// than their pages say. Where joints were asked again, sums of two times may be mixed too.
+    pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
+        self.own(cell).is_some_and(|own| {
+            let adds = own.cells == 0 && !own.is_nothing();
+            is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
+        })
     }
 
     /// Whether a cell feels something itself.
