@@ -347,7 +347,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             }
         }
         let mut table = Table::new(&skin, 0);
-        let mut take = |table: &mut Table, own, nanos, frame: &Frame| {
+        let take = |table: &mut Table, own, nanos, frame: &Frame| {
             table.handle_frame(Micros(nanos / 1_000), own, frame, &mut |_| None);
         };
         before.iter().for_each(|kept| take(&mut table, kept.own, kept.nanos, &kept.frame));

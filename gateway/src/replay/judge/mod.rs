@@ -498,15 +498,15 @@ impl Judge {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
-            let outcome = match compare(&then, &now, cell) {
-                Outcome::Different | Outcome::Missing | Outcome::Extra
-                    if then.is_doubtful(cell, round.is_touched(cell), false)
-                        || round.asked > 1 && now.is_doubtful(cell, round.is_touched(cell), true) =>
-                {
-                    Outcome::LeftOut(Why::NotTaken)
-                }
-                outcome => outcome,
+            let mut outcome = compare(&then, &now, cell);
+            let is_touched = round.is_touched(cell);
+            let is_doubtful = || {
+                then.is_doubtful(cell, is_touched, false)
+                    || round.asked > 1 && now.is_doubtful(cell, is_touched, true)
             };
+            if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
+                outcome = Outcome::LeftOut(Why::NotTaken);
+            }
             let (count, how) = match outcome {
                 Outcome::Nothing => continue,
                 Outcome::Equal => {
