@@ -144,7 +144,9 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     place.start("gateway", &format!("shadow {parts}")).end().well();
 
     // No packet of the part before counts as lost in this one.
-    let lost = place.summary().number("/buses/0/uplink/lost");
+    let summary = place.summary();
+    let ways = ["dropped", "backlog", "outage", "unknown"];
+    let lost: u64 = ways.iter().map(|way| summary.number(&format!("/buses/0/uplink/{way}"))).sum();
     for files in [parts.as_str(), "run-2.mcap"] {
         let files: Vec<_> = files.split(' ').map(|name| place.path(name)).collect();
         let report = report(&files, &Options::default()).unwrap();
