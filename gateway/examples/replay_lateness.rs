@@ -40,7 +40,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("spin, us   late 50 % / 90 % / 99 % / greatest, us   idle        processor, cores");
     for spin in [0, 20, 50, 100, 150, 300] {
         let options = Options {
-            file: file.clone(),
+            files: vec![file.clone()],
             kinds: Kinds::all(kind),
             only: Only::All,
             pick: gateway::decode::pick::Pick::default(),

@@ -24,7 +24,7 @@ fn recorded_bench(place: &Place, seconds: f64) -> Recorded {
 }
 
 fn page(place: &Place, name: &str) -> (Page, Option<String>) {
-    let report = report(&place.path(name), &Options::default()).unwrap();
+    let report = report(&[place.path(name)], &Options::default()).unwrap();
     (report.page, report.missing)
 }
 

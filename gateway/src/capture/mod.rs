@@ -13,10 +13,11 @@ pub mod convert;
 pub mod log;
 mod magic;
 mod mcap;
+mod parts;
 mod reader;
 
 pub use mcap::ORIGIN;
-pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, SKIN, Topic};
+pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, SKIN, Through, Topic};
 
 use protocol::candump::Record;
 

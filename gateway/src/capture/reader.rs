@@ -1,9 +1,10 @@
 //! Reading a capture of either format.
 
+use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
 use std::io::{self, Read, Seek};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use protocol::can::Frame;
 use protocol::document::DocumentError;
@@ -13,7 +14,7 @@ use thiserror::Error;
 use super::log::LogReader;
 use super::magic::{self, Kind};
 use super::mcap::{Fault, McapReader, ORIGIN, SOURCE};
-use super::{Entry, Item};
+use super::{Entry, Item, parts};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -36,6 +37,9 @@ pub enum CaptureError {
         /// Why.
         source: io::Error,
     },
+    /// Several files are not the parts of one recording.
+    #[error("{0}")]
+    Parts(String),
     /// Its first bytes say that it is something else.
     #[error("{name} is {what}, and no candump log or MCAP recording: {remedy}")]
     Other {
@@ -93,6 +97,8 @@ impl Extras {
 pub struct InForce {
     /// Its bus.
     pub bus: String,
+    /// Whether whoever recorded it had sent it.
+    pub own: bool,
     /// What it is.
     pub frame: Frame,
     /// When it was on the bus, in ns since 1970.
@@ -110,16 +116,67 @@ pub struct Topic {
     pub messages: u64,
 }
 
-/// Reads a capture from its beginning to its end, in bounded memory.
+/// What a file is read through.
+pub type Through = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
+
+/// Reads a capture from its beginning to its end, in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
+    /// What all of it is called.
     name: String,
+    /// The file that is being read.
+    file: String,
     source: Source,
+    /// Whether messages of all topics are wanted.
+    others: bool,
     entries: u64,
+    /// Parts that follow.
+    rest: VecDeque<PathBuf>,
+    through: Through,
+    /// Whether a part before this one has no end.
+    is_unfinished: bool,
 }
 
 enum Source {
     Log(LogReader),
     Mcap(Box<McapReader>),
+}
+
+impl Source {
+    /// Of a recording that is a regular file, attachments and metadata are known from the beginning.
+    fn open(path: &Path, through: &Through, others: bool) -> Result<(String, Self), CaptureError> {
+        let name = path.display().to_string();
+        let failed = |source| CaptureError::Io { name: name.clone(), source };
+        let mut file = File::open(path).map_err(failed)?;
+        let about = file.metadata().map_err(failed)?;
+        if about.is_dir() {
+            return Err(failed(io::ErrorKind::IsADirectory.into()));
+        }
+        if about.is_file() {
+            let looked = magic::look(&mut file).and_then(|looked| file.rewind().map(|()| looked));
+            if let (Kind::Mcap, _) = looked.map_err(failed)? {
+                let mcap = McapReader::with_files(file, through, others).map_err(failed)?;
+                return Ok((name, Self::Mcap(Box::new(mcap))));
+            }
+        }
+        let source = Self::begin(&name, through(file), others)?;
+        Ok((name, source))
+    }
+
+    fn begin(name: &str, input: impl Read + Send + 'static, others: bool) -> Result<Self, CaptureError> {
+        let (name, mut input) = (name.to_owned(), Box::new(input));
+        match magic::look(&mut input) {
+            Ok((Kind::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
+            Ok((Kind::Mcap, head)) => Ok(Self::Mcap(Box::new(McapReader::new(&head, input, others)))),
+            Ok((Kind::Other(what, remedy), _)) => Err(CaptureError::Other { name, what, remedy }),
+            Err(source) => Err(CaptureError::Io { name, source }),
+        }
+    }
+
+    /// Whether nothing more comes of it, when it is a recording.
+    fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
+        let Self::Mcap(mcap) = self else { return Ok(false) };
+        mcap.is_at_its_end().map_err(|fault| fault.of(name, entries))
+    }
 }
 
 impl fmt::Debug for Reader {
@@ -140,7 +197,7 @@ impl Reader {
         if path.as_os_str() == "-" {
             return Self::from_read("standard input", io::stdin());
         }
-        Self::begin_file(path, false)
+        Self::begin_parts(&[path.to_owned()], plain(), false)
     }
 
     /// Reads from anything; the name is for errors. What it is, is told by its first bytes, which are waited
@@ -155,43 +212,64 @@ impl Reader {
         Self::begin(name.into(), input, false)
     }
 
-    /// Of a recording that is a regular file, attachments and metadata are known from the beginning.
-    fn begin_file(path: &Path, others: bool) -> Result<Self, CaptureError> {
-        let name = path.display().to_string();
-        let failed = |source| CaptureError::Io { name: name.clone(), source };
-        let mut file = File::open(path).map_err(failed)?;
-        let about = file.metadata().map_err(failed)?;
-        if about.is_dir() {
-            return Err(failed(io::ErrorKind::IsADirectory.into()));
+    /// Opens one file, or the parts of one recording in any order.
+    ///
+    /// # Errors
+    /// As [`Reader::open`]; when several files are not parts of one recording that follow each other.
+    pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
+        Self::open_through(paths, plain())
+    }
+
+    /// The same, read through something.
+    ///
+    /// # Errors
+    /// As [`Reader::open_all`].
+    pub fn open_through(paths: &[PathBuf], through: Through) -> Result<Self, CaptureError> {
+        Self::begin_parts(paths, through, false)
+    }
+
+    fn begin_parts(paths: &[PathBuf], through: Through, others: bool) -> Result<Self, CaptureError> {
+        if let [one] = paths
+            && one.as_os_str() == "-"
+        {
+            return Self::begin("standard input".to_owned(), io::stdin(), others);
         }
-        if !about.is_file() {
-            return Self::begin(name, file, others);
-        }
-        let looked = magic::look(&mut file).and_then(|looked| file.rewind().map(|()| looked));
-        match looked.map_err(failed)? {
-            (Kind::Mcap, _) => {
-                let mcap = McapReader::with_files(file, others).map_err(failed)?;
-                Ok(Self { source: Source::Mcap(Box::new(mcap)), name, entries: 0 })
-            }
-            _ => Self::begin(name, file, others),
-        }
+        let paths = parts::ordered(paths)?;
+        let name = parts::title(&paths);
+        let mut rest = VecDeque::from(paths);
+        let Some(first) = rest.pop_front() else {
+            return Err(CaptureError::Parts("no file is named: name a capture".to_owned()));
+        };
+        let (file, source) = Source::open(&first, &through, others)?;
+        Ok(Self { name, file, source, others, entries: 0, rest, through, is_unfinished: false })
     }
 
     fn begin(name: String, input: impl Read + Send + 'static, others: bool) -> Result<Self, CaptureError> {
-        let mut input = Box::new(input);
-        let source = match magic::look(&mut input) {
-            Ok((Kind::Text, head)) => Source::Log(LogReader::new(&head, input)),
-            Ok((Kind::Mcap, head)) => Source::Mcap(Box::new(McapReader::new(&head, input, others))),
-            Ok((Kind::Other(what, remedy), _)) => return Err(CaptureError::Other { name, what, remedy }),
-            Err(source) => return Err(CaptureError::Io { name, source }),
-        };
-        Ok(Self { name, source, entries: 0 })
+        let source = Source::begin(&name, input, others)?;
+        let (file, rest) = (name.clone(), VecDeque::new());
+        Ok(Self { name, file, source, others, entries: 0, rest, through: plain(), is_unfinished: false })
     }
 
-    /// Its name, as errors have it.
+    /// What it is called: its name, or those of its first and last part.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Goes on with the part that follows; whether there is one.
+    fn go_on(&mut self) -> Result<bool, CaptureError> {
+        let Some(path) = self.rest.pop_front() else { return Ok(false) };
+        let (name, mut next) = Source::open(&path, &self.through, self.others)?;
+        if let (Source::Mcap(before), Source::Mcap(next)) = (&self.source, &mut next) {
+            let mut extras = before.extras().clone();
+            if let Some(what) = extras.unfinished.as_mut().filter(|_| !self.is_unfinished) {
+                *what = format!("{}: {what}", self.file);
+                self.is_unfinished = true;
+            }
+            next.follows(extras);
+        }
+        (self.file, self.source) = (name, next);
+        Ok(true)
     }
 
     /// What it is written in.
@@ -220,7 +298,10 @@ impl Reader {
     }
 
     fn next_item(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
-        let Self { name, source, entries } = self;
+        while !self.rest.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
+            self.go_on()?;
+        }
+        let Self { file: name, source, entries, .. } = self;
         let next = match source {
             Source::Log(log) => match log.next() {
                 Ok(next) => next.map(Item::Entry),
@@ -228,10 +309,7 @@ impl Reader {
             },
             Source::Mcap(mcap) => match mcap.next() {
                 Ok(next) => next,
-                Err(Fault::Io(source)) => return Err(CaptureError::Io { name: name.clone(), source }),
-                Err(Fault::Damaged(what)) => {
-                    return Err(CaptureError::Damaged { name: name.clone(), what, entries: *entries });
-                }
+                Err(fault) => return Err(fault.of(name, *entries)),
             },
         };
         *entries += u64::from(matches!(next, Some(Item::Entry(_))));
@@ -268,8 +346,8 @@ impl Reader {
         }
     }
 
-    /// What it has beside frames and notes, as far as it has been read; from the beginning what stands before the first
-    /// of them, and the attachments and metadata of a regular file wherever they stand. A log has nothing.
+    /// What it has beside frames and notes, as far as it has been read; what stands before the first of them, from
+    /// the beginning. A log has nothing.
     #[must_use]
     pub fn extras(&self) -> &Extras {
         static NONE: Extras = Extras {
@@ -291,12 +369,18 @@ impl Reader {
 pub struct Items(Reader);
 
 impl Items {
-    /// Opens a file.
+    /// Opens one file, or the parts of one recording in any order.
     ///
     /// # Errors
-    /// When it cannot be opened or is no capture.
-    pub fn open(path: &Path) -> Result<Self, CaptureError> {
-        Reader::begin_file(path, true).map(Self)
+    /// As [`Reader::open_all`].
+    pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
+        Reader::begin_parts(paths, plain(), true).map(Self)
+    }
+
+    /// What it is called, as [`Reader::name`].
+    #[must_use]
+    pub fn name(&self) -> &str {
+        self.0.name()
     }
 
     /// What it is written in.
@@ -322,4 +406,20 @@ impl Items {
     pub fn extras(&self) -> &Extras {
         self.0.extras()
     }
+}
+
+impl Fault {
+    /// As an error of a file of which so many entries have been read.
+    fn of(self, name: &str, entries: u64) -> CaptureError {
+        let name = name.to_owned();
+        match self {
+            Self::Io(source) => CaptureError::Io { name, source },
+            Self::Damaged(what) => CaptureError::Damaged { name, what, entries },
+        }
+    }
+}
+
+/// Files as they are.
+fn plain() -> Through {
+    Box::new(|file| Box::new(file))
 }

@@ -5,7 +5,6 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, IsTerminal};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
@@ -14,10 +13,10 @@ use gateway::capture::log::{self, Style};
 use gateway::capture::{Format, ORIGIN, Reader};
 use gateway::run::file::WholeFile;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use protocol::stop::Stoppable;
+use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 
-use super::input::{Interruptible, stopped};
+use super::input::captures;
 use super::output::{Force, note, refused};
 
 /// Lines that cannot be read and are named; further ones are counted.
@@ -34,12 +33,13 @@ const PIECE: usize = 1 << 18;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway convert run.mcap run.log
+  gateway convert run.mcap run-*.mcap all.log
   gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
   candump -L can0 | gateway convert - can0.mcap")]
 pub(crate) struct Convert {
-    /// A candump log or an MCAP recording; - for standard input
-    #[arg(value_name = "IN")]
-    from: PathBuf,
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    #[arg(value_name = "IN", required = true)]
+    from: Vec<PathBuf>,
     /// The new capture; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
@@ -82,17 +82,13 @@ impl Convert {
         if !is_standard(&self.to) {
             self.force.check("", &self.to)?;
         }
-        let name = if is_standard(&self.from) {
-            "standard input".to_owned()
-        } else {
-            self.from.display().to_string()
-        };
-        let (file, size) = open(&self.from).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
-        let stopped = stopped()?;
+        let size = size(&self.from);
         let live = size.is_none();
         let bar = bar(size);
-        let input = Interruptible { file, stopped: Arc::clone(&stopped) };
-        let mut reader = Reader::from_read(&name, bar.wrap_read(input)).map_err(Failure::usage)?;
+        let progress = bar.clone();
+        let mut reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let stopped = stop::flag();
+        let name = reader.name().to_owned();
         if !text && reader.format() == Format::Mcap {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
@@ -105,7 +101,7 @@ impl Convert {
         let directions = !self.plain && (self.direction || reader.is_of_a_log());
         let style = Style { digits, plain: self.plain, directions };
         let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
-        let (whole, out) = self.create(&stopped)?;
+        let (whole, out) = self.create(stopped)?;
         let mut output = Output::new(out, format, style).map_err(failed)?;
         let mut named = 0;
         let done = convert(&mut reader, &mut output, |line, why| {
@@ -189,17 +185,10 @@ fn is_standard(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
-/// The input, and how many bytes it has when that is known.
-fn open(path: &Path) -> io::Result<(File, Option<u64>)> {
-    if is_standard(path) {
-        return Ok((io::stdin().as_fd().try_clone_to_owned()?.into(), None));
-    }
-    let file = File::open(path)?;
-    let about = file.metadata()?;
-    if about.is_dir() {
-        return Err(io::ErrorKind::IsADirectory.into());
-    }
-    Ok((file, about.is_file().then_some(about.len())))
+/// How many bytes the input has, when that is known.
+fn size(from: &[PathBuf]) -> Option<u64> {
+    let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
+    from.iter().map(of).sum()
 }
 
 /// What becomes of an error of the output: who read it may have left, as `head` does.

@@ -3,11 +3,8 @@
 mod show;
 mod table;
 
-use std::fs::File;
 use std::io::{self, BufWriter, IsTerminal, Write};
-use std::os::fd::AsFd;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -19,13 +16,13 @@ use protocol::bus::{Bus, BusError, Choice, Inbox, Options};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
-use protocol::stop::Stoppable;
+use protocol::stop::{self, Stoppable};
 use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
 
 use self::show::{Flow, How, Show};
-use super::input::{Interruptible, LOOK, stopped};
+use super::input::{LOOK, captures, stopped};
 use super::output;
 
 /// Show what is on a bus or in a capture, in words beside the raw frames
@@ -41,12 +38,14 @@ use super::output;
   gateway dump vcan0 --kind torque --node 12
   gateway dump run.log --kind joints,sync --from 2 --to 2.5
   gateway dump run.mcap --contact --json | jq -c 'select(.kind == \"torque\") | [.node, .epoch, .values.torque_nm]'
+  gateway dump run.mcap run-*.mcap --stats
   gateway dump can0 --stats --to 10
   candump -L can0 | gateway dump - --max 100")]
 pub(crate) struct Dump {
-    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else a bus
-    #[arg(value_name = "BUS|FILE")]
-    source: PathBuf,
+    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else a bus; all parts
+    /// of a split recording are one, in any order
+    #[arg(required = true, value_name = "BUS|FILE")]
+    sources: Vec<PathBuf>,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
     /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
@@ -112,18 +111,19 @@ pub(super) fn nanos(text: &str) -> Result<u64, String> {
 
 impl Dump {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let name = self.source.display().to_string();
-        let file = if self.source.as_os_str() == "-" {
-            let input = io::stdin().as_fd().try_clone_to_owned();
-            Some(input.map_err(|error| Failure::run(format!("standard input: {error}")))?.into())
-        } else if self.source.exists() {
-            if self.source.is_dir() {
-                return Err(Failure::usage(format!("{name} is a directory: name a candump log or a bus")));
-            }
-            Some(File::open(&self.source).map_err(|error| Failure::usage(format!("{name}: {error}")))?)
-        } else {
-            None
-        };
+        let name =
+            self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
+        let is_file = |source: &PathBuf| source.as_os_str() == "-" || source.exists();
+        if let Some(bus) = self.sources.iter().find(|source| self.sources.len() > 1 && !is_file(source)) {
+            return Err(Failure::usage(format!(
+                "there is no file {}: several captures are the parts of one recording, and a bus is dumped alone",
+                bus.display()
+            )));
+        }
+        if let Some(folder) = self.sources.iter().find(|source| source.is_dir()) {
+            let folder = folder.display();
+            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or a bus")));
+        }
         let out = io::stdout();
         let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         let colour = out.is_terminal() && !no_color;
@@ -142,23 +142,23 @@ impl Dump {
         let pick = Pick { kinds, nodes, from, to };
         let max = self.max.unwrap_or(u64::MAX);
         let mut show = Show::new(BufWriter::new(Stoppable::new(&out)), format, pick, contact, how, max);
-        let stopped = stopped()?;
-        let (what, extras, done) = match file {
-            Some(file) => {
-                let input = Interruptible { file, stopped: Arc::clone(&stopped) };
-                let mut reader = Reader::from_read(&name, input).map_err(Failure::usage)?;
-                let done = captured(&mut reader, &mut show, &stopped, self.strict);
+        let mut title = name.clone();
+        let (what, extras, done) = match self.sources.iter().all(is_file) {
+            true => {
+                let mut reader = captures(&self.sources, |file| Box::new(file))?;
+                reader.name().clone_into(&mut title);
+                let done = captured(&mut reader, &mut show, stop::flag(), self.strict);
                 let what = match reader.format() {
                     capture::Format::Candump => "candump log",
                     capture::Format::Mcap => "MCAP",
                 };
                 (what, Some(reader.extras().clone()), done)
             }
-            None => {
+            false => {
                 let bus = open(&name, self.bus_kind, self.format).map_err(|error| {
                     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
                 })?;
-                ("live", None, live(&bus, &mut show, to, &stopped))
+                ("live", None, live(&bus, &mut show, to, &*stopped()?))
             }
         };
         written(show.finish().and_then(|_| show.flush()))?;
@@ -167,9 +167,9 @@ impl Dump {
         if let Some(report) = report {
             // What was counted is shown whatever ended it.
             if self.json {
-                print(&as_json(&name, what, &report, extras.as_ref())?)?;
+                print(&as_json(&title, what, &report, extras.as_ref())?)?;
             } else {
-                print(&table::text(&name, what, &report, extras.as_ref()))?;
+                print(&table::text(&title, what, &report, extras.as_ref()))?;
             }
         }
         done

@@ -2,7 +2,7 @@
 
 mod show;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use gateway::capture::{Entry, NoteKind, Reader};
@@ -29,10 +29,12 @@ const ATTACHED: &str = "skin.toml";
 #[command(after_help = "Examples:
   gateway explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
   gateway explain run.mcap --epoch 77 --cell 12
+  gateway explain run.mcap run-*.mcap --epoch 77 --at 700
   gateway explain run.mcap --epoch 77 --at 20 --joint 2 --json")]
 pub(crate) struct Explain {
-    /// A candump log or an MCAP recording; - for standard input
-    file: PathBuf,
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
     /// The number of the joints, modulo 256
     #[arg(long, value_name = "N")]
     epoch: u8,
@@ -87,10 +89,10 @@ impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = match &self.skin {
             Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => attached(&self.file)?,
+            None => attached(&self.files)?,
         };
         self.check(&skin)?;
-        let mut reader = Reader::open(&self.file).map_err(Failure::usage)?;
+        let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
         let asked = Asked { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
         let (moments, first) = find(&mut reader, &skin, asked)?;
@@ -167,6 +169,12 @@ fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<(Found, u64), 
     let name = reader.name().to_owned();
     let mut watch = Watch::new(skin, asked);
     let mut decoder = Decoder::new(None);
+    for before in &reader.extras().in_force {
+        let at = Micros(before.nanos / 1_000);
+        if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
+            watch.begin(before.nanos, &before.bus, &message);
+        }
+    }
     let (mut first, mut dropped, mut unreadable) = (None, 0, 0_u64);
     while let Some(entry) = reader.next().map_err(Failure::run)? {
         match entry {
@@ -198,17 +206,20 @@ fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<(Found, u64), 
 }
 
 /// The skin that a recording has with it.
-fn attached(path: &Path) -> Result<Skin, Failure> {
-    let name = path.display();
-    if path.as_os_str() == "-" {
+fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
+    if files.iter().any(|file| file.as_os_str() == "-") {
         return Err(Failure::usage("standard input is read once: say which skin with --skin"));
     }
-    if path.metadata().is_ok_and(|about| !about.is_file() && !about.is_dir()) {
+    if let Some(pipe) =
+        files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
+    {
         return Err(Failure::usage(format!(
-            "{name} is no regular file and is read once: say which skin with --skin"
+            "{} is no regular file and is read once: say which skin with --skin",
+            pipe.display()
         )));
     }
-    let mut reader = Reader::open(path).map_err(Failure::usage)?;
+    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    let name = reader.name().to_owned();
     loop {
         let more = reader.next().map_err(Failure::run)?.is_some();
         let found = reader.extras().attachments.iter().find(|(name, _)| name == ATTACHED);

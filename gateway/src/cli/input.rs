@@ -2,10 +2,13 @@
 
 use std::fs::File;
 use std::io::{self, Read};
+use std::os::fd::AsFd;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use gateway::capture::Reader;
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -21,6 +24,27 @@ pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
             .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;
     }
     Ok(stopped)
+}
+
+/// Opens a capture, standard input or the parts of a recording, so that its reader can be told to stop. Signals are caught
+/// from when a file is open: one that ends the program while it waits for a pipe's other end has nothing to put in order.
+pub(crate) fn captures(
+    sources: &[PathBuf],
+    through: impl Fn(Interruptible) -> Box<dyn Read + Send> + Send + 'static,
+) -> Result<Reader, Failure> {
+    let interruptible = move |file| {
+        // Where signals cannot be caught they end the program at once.
+        let stopped = stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
+        through(Interruptible { file, stopped })
+    };
+    if let [one] = sources
+        && one.as_os_str() == "-"
+    {
+        let input = io::stdin().as_fd().try_clone_to_owned();
+        let input = input.map_err(|error| Failure::run(format!("standard input: {error}")))?;
+        return Reader::from_read("standard input", interruptible(input.into())).map_err(Failure::usage);
+    }
+    Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 
 /// A file whose reader can be told to stop: then it is at its end.

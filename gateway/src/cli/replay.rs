@@ -31,10 +31,12 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 #[command(after_help = "Examples:
   gateway replay run.log --only inputs --speed 0.5
   gateway replay run.mcap --expect --spawn --lockstep
+  gateway replay run.mcap run-*.mcap --expect --spawn --lockstep
   gateway replay foreign.log --map can0=vcan0 --max --loop 10")]
 pub(crate) struct Replay {
-    /// A candump log or an MCAP recording
-    file: PathBuf,
+    /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
     /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
     /// several BUS=KIND, as often as there are buses
     #[arg(long, value_name = "[BUS=]KIND")]
@@ -180,7 +182,7 @@ impl Replay {
             (Some(Only::All) | None, None) => What::All,
         };
         Ok(Options {
-            file: self.file.clone(),
+            files: self.files.clone(),
             kinds: Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)?,
             only,
             pick: Pick { kinds: self.kind.clone(), nodes: self.node.clone(), ..Pick::default() },

@@ -20,10 +20,12 @@ use super::output::{Force, note, place};
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway report run.mcap -o run.html
-  gateway report run.mcap --svg figures --force")]
+  gateway report run.mcap --svg figures --force
+  gateway report run.mcap run-*.mcap -o all.html")]
 pub(crate) struct Report {
-    /// The recording of a run: what `gateway run SKIN --record FILE` wrote
-    file: PathBuf,
+    /// The recording of a run: what `gateway run SKIN --record FILE` wrote; all parts of a split one in any order
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
     /// The page; else the recording's name with .html
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
@@ -42,11 +44,13 @@ pub(crate) struct Report {
 
 impl Report {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let output = self.output.clone().unwrap_or_else(|| self.file.with_extension("html"));
+        let first = self.files.iter().min_by_key(|file| (file.as_os_str().len(), file.as_os_str()));
+        let page = first.map(|first| first.with_extension("html")).unwrap_or_default();
+        let output = self.output.clone().unwrap_or(page);
         self.is_free(&output, "-o")?;
         let command: Vec<_> = std::env::args().collect();
         let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
-        let report = run::report(&self.file, &options).map_err(refused)?;
+        let report = run::report(&self.files, &options).map_err(refused)?;
         let mut files = vec![("-o", output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {
             for (name, drawing) in drawings(&report.page) {
@@ -66,7 +70,7 @@ impl Report {
             return Err(failure);
         }
         if let Some(missing) = &report.missing {
-            note(format_args!("gateway: {}: {missing}", self.file.display()));
+            note(format_args!("gateway: {}: {missing}", report.name));
         }
         let figures: usize = report.page.sections.iter().map(|section| section.figures.len()).sum();
         let beside =
@@ -77,7 +81,7 @@ impl Report {
     /// What is there is not overwritten unless that is asked for.
     fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
         let name = path.display();
-        if place(&self.file) == place(path) {
+        if self.files.iter().any(|file| place(file) == place(path)) {
             return Err(Failure::usage(format!(
                 "{option} {name} is the recording itself: name another file"
             )));

@@ -2,9 +2,7 @@
 
 mod show;
 
-use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,13 +15,13 @@ use gateway::shadow::{Options, Shadow};
 use protocol::bus::{self, Bus, BusError, Choice, Inbox};
 use protocol::can::EXTENDED_MASK;
 use protocol::skin::Skin;
-use protocol::stop::Stoppable;
+use protocol::stop::{self, Stoppable};
 use protocol::usage::{Failure, print, written};
 use protocol::wire_time::{BitRates, bit_rate};
 
 use self::show::write_frames;
 use super::dump::nanos;
-use super::input::{Interruptible, LOOK, stopped};
+use super::input::{LOOK, captures, stopped};
 use super::output;
 
 /// Bytes for frames that wait while others are worked on.
@@ -40,13 +38,15 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway shadow run.mcap
+  gateway shadow run.mcap run-*.mcap
   gateway shadow run.log --nominal 500k --data 2M
   gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
   gateway shadow run.log --skin skin.toml
   gateway shadow run.log --json | jq -c 'select(.end_s - .time > 0.016)'
   gateway shadow vcan0 vcan1 --duration 10")]
 pub(crate) struct ShadowCommand {
-    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else buses
+    /// A candump log or MCAP recording when there is a file of this name, all parts of a split recording in any order,
+    /// - for standard input, else buses
     #[arg(value_name = "FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// The bit rate of identifiers, and of all of classic frames: bit/s, as 500k or 1M; else the skin's, else 1M
@@ -113,31 +113,34 @@ impl ShadowCommand {
         let files = self.sources.iter().filter(|source| is_file(source)).count();
         let name =
             self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
-        // A pipe that nobody writes to is waited for; until it is open, a signal ends that at once.
-        let file = match self.sources.as_slice() {
-            [source] if files == 1 => Some(open_file(source)?),
-            _ => None,
-        };
-        let stopped = stopped()?;
-        let (mut shadow, taken) = match (self.sources.as_slice(), file) {
-            ([source], Some(file)) => {
+        let (mut shadow, taken) = match self.sources.as_slice() {
+            sources if files == sources.len() => {
                 if self.duration.is_some() {
                     return Err(Failure::usage(format!(
                         "--duration is for live buses, and {name} is a file"
                     )));
                 }
-                let reader = opened(source, file, &stopped)?;
-                let mut shadow = self.shadow(skin.or_else(|| attached(&name, &reader)))?;
+                if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
+                    return Err(Failure::usage(format!(
+                        "{} is a directory: name a candump log, an MCAP recording or a bus",
+                        folder.display()
+                    )));
+                }
+                let reader = captures(sources, |file| Box::new(file))?;
+                let mut shadow = self.shadow(skin.or_else(|| attached(reader.name(), &reader)))?;
                 for before in &reader.extras().in_force {
                     shadow.in_force(&before.bus, before.nanos, &before.frame);
                 }
-                let taken = captured(reader, &mut shadow, &mut out, &stopped)?;
+                let taken = captured(reader, &mut shadow, &mut out, stop::flag())?;
                 (shadow, taken)
             }
             _ if files > 0 => {
-                return Err(Failure::usage(format!("{name}: one file alone, or buses without a file")));
+                return Err(Failure::usage(format!(
+                    "{name}: one file, the parts of one recording, or buses without a file"
+                )));
             }
-            (sources, _) => {
+            sources => {
+                let stopped = stopped()?;
                 let mut shadow = self.shadow(skin)?;
                 let taken = self.live(sources, &mut shadow, &mut out, &stopped)?;
                 (shadow, taken)
@@ -284,28 +287,6 @@ fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
         Err(BusError::ClassicOnly { .. }) => Bus::open(name, kind, &options(false)),
         opened => opened,
     }
-}
-
-/// Opens a capture, or standard input.
-fn open_file(source: &Path) -> Result<File, Failure> {
-    let name = source.display();
-    if source.as_os_str() == "-" {
-        let input = io::stdin().as_fd().try_clone_to_owned();
-        return input.map(File::from).map_err(|error| Failure::run(format!("standard input: {error}")));
-    }
-    if source.is_dir() {
-        return Err(Failure::usage(format!(
-            "{name} is a directory: name a candump log, an MCAP recording or a bus"
-        )));
-    }
-    File::open(source).map_err(|error| Failure::usage(format!("{name}: {error}")))
-}
-
-/// Reads a capture's beginning.
-fn opened(source: &Path, file: File, stopped: &Arc<AtomicBool>) -> Result<Reader, Failure> {
-    let name = source.display().to_string();
-    let input = Interruptible { file, stopped: Arc::clone(stopped) };
-    Reader::from_read(&name, input).map_err(Failure::usage)
 }
 
 /// The skin that is attached to a recording.

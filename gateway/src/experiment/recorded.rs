@@ -36,7 +36,7 @@ pub struct Row {
 /// # Errors
 /// When it cannot be read, is damaged, or has no ticks.
 pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
-    let mut items = Items::open(path)?;
+    let mut items = Items::open_all(&[path.to_path_buf()])?;
     let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
     while let Some(item) = items.next()? {
         if let Item::Other(other) = item {

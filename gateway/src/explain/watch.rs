@@ -148,6 +148,20 @@ impl<'a> Watch<'a> {
         Self { skin, asked, first: None, lanes, others: Vec::new() }
     }
 
+    /// Takes in what was said before the first frame and is in force when the capture begins.
+    pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
+        let joints = self.skin.robot.joints.len();
+        if let Some(lane) = self.skin.bus_named(bus).and_then(|at| self.lanes.get_mut(at)) {
+            if let Message::Joints { epoch, joints: Joints { in_use, .. } } = *message {
+                if usize::from(in_use) == joints && lane.last != Some(epoch) {
+                    lane.latch(epoch);
+                }
+            } else {
+                lane.take(nanos, 0, message, self.asked, joints);
+            }
+        }
+    }
+
     /// Takes in the next frame; `message` is what it says, when that is anything. Whether all is known now.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let first = *self.first.get_or_insert(nanos);
@@ -323,10 +337,7 @@ impl Lane {
 
     fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, asked: Asked) {
         self.run(nanos, epoch);
-        self.last = Some(epoch);
-        for cell in &mut self.cells {
-            cell.felt.latch(epoch);
-        }
+        self.latch(epoch);
         if self.moment.is_some() {
             self.since += 1;
         } else if epoch == asked.epoch && after >= asked.from_ns {
@@ -345,9 +356,16 @@ impl Lane {
         }
     }
 
+    fn latch(&mut self, epoch: Epoch) {
+        self.last = Some(epoch);
+        for cell in &mut self.cells {
+            cell.felt.latch(epoch);
+        }
+    }
+
     /// Notes which epochs there are.
     fn run(&mut self, nanos: u64, epoch: Epoch) {
-        let follows = self.last.is_some_and(|last| last.next() == epoch);
+        let follows = !self.runs.is_empty() && self.last.is_some_and(|last| last.next() == epoch);
         if !follows && self.runs.len() == RUNS {
             self.further_runs += 1;
         } else if !follows {

@@ -1,20 +1,26 @@
-//! What is in force on a bus: the frames that somebody needs who begins in the middle.
+//! What is in force on a bus: the packets that somebody needs who begins in the middle.
 //!
-//! The last heartbeat of every cell, with the hash of its configuration, and its place in the tree; what was switched
-//! at run time; the stimuli that it feels and that wait for their epochs; the last joints, and whether cells were
-//! halted.
+//! ```text
+//!   frames of a bus ──> take ──> [ InForce ] ──> frames: what still counts, in the bus' own order
+//! ```
+//!
+//! The last heartbeat of every cell, with the hash of its configuration, its last start and its place in the tree; what
+//! was switched and configured at run time; the stimuli that it feels and that wait for their epochs; the last joints,
+//! and whether cells were halted. Epochs count modulo 256, so a stimulus alone does not say whether it still waits. So
+//! with each stimulus come the joints before it and those from which on it holds: who takes these packets in their
+//! order by the protocol's rules comes to the same state as who took all of them.
 
-use std::collections::VecDeque;
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use protocol::can::{Format, Frame};
-use protocol::id::Kind;
-use protocol::packet::{self, Half, Paired};
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State};
+use protocol::packet::{self, Epoch, Half, Packet, Paired};
+use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use crate::stimuli::PENDING;
-
-/// As many stimuli as a cell lets wait, and the one that it feels.
-const STIMULI: usize = PENDING + 1;
+use crate::stimuli::Waiting;
 
 /// A frame that somebody saw.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,116 +33,271 @@ pub struct Seen {
     pub frame: Frame,
 }
 
-/// Frames that together are one packet.
-type Packet = [Option<Seen>; 2];
-
-/// The frames of one bus that are in force.
+/// The frames of one packet, and its place in the bus' order.
 #[derive(Debug)]
-pub struct InForce {
-    /// By node: the last heartbeat.
-    heartbeats: Vec<Packet>,
-    /// By node: the last word on where its sums go.
-    trees: Vec<Packet>,
-    /// By node, everyone being the last, and parameter: the last write.
-    switches: Vec<[Packet; SWITCHES.len()]>,
-    /// By node, everyone being the last: the last stimuli.
-    stimuli: Vec<VecDeque<Packet>>,
-    joints: Packet,
-    /// The last halt or resume.
-    halt: Packet,
-    /// By identifier: a classic first half whose second one is to come.
-    halves: Vec<(Half, Option<Seen>)>,
+struct Said {
+    place: u64,
+    frames: [Option<Seen>; 2],
 }
 
-/// Parameters that are in force as soon as they are written, and are not stored: mode, reply, sensing, events, cuts.
-const SWITCHES: [u8; 5] = [5, 6, 7, 8, 9];
-/// Set in the count of a write.
-const WRITE: u8 = 0x80;
-/// The network page that tells where a cell's sums go.
-const TREE: u8 = 3;
+type Kept = Option<Arc<Said>>;
+
+/// A page that a cell feels: who said it, the last joints before that, and those from which on it holds.
+#[derive(Clone, Debug)]
+struct Felt {
+    said: Arc<Said>,
+    before: Kept,
+    since: Kept,
+}
+
+/// What is in force for one cell.
+#[derive(Clone, Debug, Default)]
+struct Cell {
+    /// Its last heartbeat.
+    heartbeat: Kept,
+    /// The first and the last heartbeat of its last start.
+    starts: [Kept; 2],
+    /// Its last word on where its sums go.
+    tree: Kept,
+    /// By number: the last writes of what is not stored.
+    switches: BTreeMap<u8, Arc<Said>>,
+    /// By number: the last writes that a commit has taken into use, and that commit.
+    committed: BTreeMap<u8, Arc<Said>>,
+    commit: Kept,
+    /// By number: the last writes since then, and a commit that has not been answered.
+    staged: BTreeMap<u8, Arc<Said>>,
+    asked: Kept,
+    /// The skin's page and the acceleration, once something is known of them.
+    felt: [Option<Felt>; 2],
+    waiting: Waiting<(usize, Felt)>,
+    /// It was told to measure: then it refuses stimuli.
+    measures: bool,
+}
+
+/// The packets of one bus that are in force.
+#[derive(Debug)]
+pub struct InForce {
+    /// Packets so far.
+    places: u64,
+    cells: Vec<Cell>,
+    joints: Option<(Epoch, Arc<Said>)>,
+    /// The last halt or resume.
+    halt: Kept,
+    /// By identifier: a classic first half whose second one is to come.
+    halves: Vec<(Half, Option<Seen>)>,
+    /// Identifiers of the gateway's side of which a first half stood on the bus last, and when, in ns since 1970.
+    open: BTreeMap<u16, u64>,
+}
 
 impl Default for InForce {
     fn default() -> Self {
         Self {
-            heartbeats: vec![[None; 2]; 256],
-            trees: vec![[None; 2]; 256],
-            switches: vec![[[None; 2]; SWITCHES.len()]; 256],
-            stimuli: vec![VecDeque::new(); 256],
-            joints: [None; 2],
-            halt: [None; 2],
+            places: 0,
+            cells: vec![Cell::default(); CellId::COUNT],
+            joints: None,
+            halt: None,
             halves: vec![(Half::NONE, None); 1 << 11],
+            open: BTreeMap::new(),
         }
     }
 }
 
-impl InForce {
-    /// Takes a frame that stood on the bus, if it is a packet or completes one. Bounded work.
-    pub fn take(&mut self, seen: Seen) {
-        let Ok(id) = packet::data_id(&seen.frame) else { return };
-        let wanted = match id.kind {
-            Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => true,
-            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
-        };
-        if !wanted {
-            return;
+impl Cell {
+    /// It has started, or was told its mode: it forgets what it felt.
+    fn clear(&mut self, measures: bool) {
+        self.felt = [None, None];
+        self.waiting.clear();
+        self.measures = measures;
+    }
+
+    /// What a start forgets.
+    fn start(&mut self, said: &Arc<Said>, is_first: bool) {
+        self.clear(false);
+        self.switches.clear();
+        self.staged.clear();
+        self.asked = None;
+        let [first, last] = &mut self.starts;
+        if is_first {
+            *first = Some(Arc::clone(said));
         }
-        let (packet, count) = match seen.frame.format() {
-            Format::Fd => match packet::Packet::from_fd(&seen.frame) {
-                Ok(packet) => ([Some(seen), None], packet.count),
-                Err(_) => return,
-            },
-            Format::Classic => {
-                let Some((half, first)) = self.halves.get_mut(usize::from(id.to_bits())) else { return };
-                match half.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
-                    Ok(Paired::Whole(packet)) => ([first.take(), Some(seen)], packet.count),
-                    Ok(Paired::Waiting | Paired::Incomplete) => return *first = Some(seen),
-                    Err(_) => return,
-                }
-            }
-        };
-        let node = usize::from(id.node);
-        match (id.kind, count) {
-            (Kind::Command, _) => match id.node {
-                1 => self.joints = packet,
-                0 | 3 => self.halt = packet,
-                _ => {}
-            },
-            (Kind::Network, 0) => {
-                if let Some(last) = self.heartbeats.get_mut(node) {
-                    *last = packet;
-                }
-            }
-            (Kind::Network, TREE) => {
-                if let Some(last) = self.trees.get_mut(node) {
-                    *last = packet;
-                }
-            }
-            (Kind::Configure, count) => {
-                let switch = SWITCHES.iter().position(|number| number | WRITE == count);
-                if let Some(last) = switch.and_then(|at| self.switches.get_mut(node)?.get_mut(at)) {
-                    *last = packet;
-                }
-            }
-            // Only what touches the skin; its page may bear a flag.
-            (Kind::Stimulus, count) if count & 0x7F == 0 => {
-                let Some(last) = self.stimuli.get_mut(node) else { return };
-                if last.len() == STIMULI {
-                    last.pop_front();
-                }
-                last.push_back(packet);
-            }
-            _ => {}
+        *last = Some(Arc::clone(said));
+    }
+
+    fn write(&mut self, number: u8, said: &Arc<Said>, obeys: bool) {
+        let parameter = Parameter::from_number(number);
+        if parameter == Some(Parameter::Commit) {
+            self.asked = Some(Arc::clone(said));
+        } else if parameter.is_some_and(Parameter::is_volatile) {
+            self.switches.insert(number, Arc::clone(said));
+        } else if parameter.is_some() {
+            self.staged.insert(number, Arc::clone(said));
+        }
+        if parameter == Some(Parameter::Mode) {
+            self.clear(!obeys);
         }
     }
 
-    /// All of them, oldest first.
+    /// It has taken into use what was written before the commit that was asked last.
+    fn commit(&mut self) {
+        let Some(asked) = self.asked.take() else { return };
+        let staged = std::mem::take(&mut self.staged).into_iter();
+        let (mut taken, later): (BTreeMap<_, _>, _) = staged.partition(|(_, said)| said.place < asked.place);
+        self.committed.append(&mut taken);
+        (self.staged, self.commit) = (later, Some(asked));
+    }
+
+    /// What the cell itself says that it feels, when nothing else is known of it.
+    fn learn(&mut self, page: usize, felt: Felt) {
+        let joints = felt.before.as_ref().map_or(0, |joints| joints.place);
+        let waits = self.waiting.iter().any(|(_, (_, felt))| felt.said.place < joints);
+        if let Some(known @ None) = self.felt.get_mut(page).filter(|_| !waits) {
+            *known = Some(felt);
+        }
+    }
+
+    fn latch(&mut self, epoch: Epoch, joints: &Arc<Said>) {
+        for (page, felt) in self.waiting.latch(epoch) {
+            if let Some(known) = self.felt.get_mut(page) {
+                *known = Some(Felt { since: Some(Arc::clone(joints)), ..felt });
+            }
+        }
+    }
+
+    fn packets(&self) -> impl Iterator<Item = &Arc<Said>> {
+        let said = [&self.heartbeat, &self.tree, &self.commit, &self.asked].into_iter().chain(&self.starts);
+        let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
+        let felt = self.felt.iter().flatten().chain(self.waiting.iter().map(|(_, (_, felt))| felt));
+        let felt =
+            felt.flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
+        said.flatten().chain(written).chain(felt)
+    }
+}
+
+/// Where a page stands in [`Cell::felt`].
+const fn place_of(page: &SensorPage) -> usize {
+    match page {
+        SensorPage::Skin(_) => 0,
+        SensorPage::Acceleration(_) => 1,
+    }
+}
+
+impl InForce {
+    /// Takes a frame that stood on the bus. Bounded work; what is no packet counts for nothing.
+    pub fn take(&mut self, seen: Seen) {
+        let Ok(id) = packet::data_id(&seen.frame) else { return };
+        match id.kind {
+            Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => {}
+            Kind::Sensors | Kind::Configured => {}
+            Kind::Sum | Kind::Torque => return,
+        }
+        let Some((frames, packet)) = self.packet(id, seen) else { return };
+        let Ok(message) = Message::decode(&packet) else { return };
+        self.places += 1;
+        self.hear(&message, &Arc::new(Said { place: self.places, frames }));
+    }
+
+    /// The packet that a frame is or completes.
+    fn packet(&mut self, id: Id, seen: Seen) -> Option<([Option<Seen>; 2], Packet)> {
+        if seen.frame.format() == Format::Fd {
+            return Some(([Some(seen), None], Packet::from_fd(&seen.frame).ok()?));
+        }
+        let (half, first) = self.halves.get_mut(usize::from(id.to_bits()))?;
+        match half.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
+            Ok(Paired::Whole(packet)) => {
+                self.open.remove(&id.to_bits());
+                Some(([first.take(), Some(seen)], packet))
+            }
+            Ok(Paired::Waiting | Paired::Incomplete) => {
+                *first = Some(seen);
+                if !id.kind.is_from_cells() {
+                    self.open.insert(id.to_bits(), seen.at_nanos);
+                }
+                None
+            }
+            Err(_) => None,
+        }
+    }
+
+    /// Whether the second half of something that the gateway's side says may still come: nobody should begin between
+    /// the two.
+    #[must_use]
+    pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
+        let within = |bits: u16| Half::within(Id::from_bits(bits)).0 * 1_000;
+        self.open.iter().any(|(bits, at)| now_nanos < at.saturating_add(within(*bits)))
+    }
+
+    fn hear(&mut self, message: &Message, said: &Arc<Said>) {
+        let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
+        let before = self.joints.as_ref().map(|(_, joints)| Arc::clone(joints));
+        match *message {
+            Message::Joints { epoch, .. } => {
+                // Cells drop joints of the last epoch.
+                if last != Some(epoch) {
+                    self.cells.iter_mut().for_each(|cell| cell.latch(epoch, said));
+                }
+                self.joints = Some((epoch, Arc::clone(said)));
+            }
+            Message::Halt | Message::Resume => self.halt = Some(Arc::clone(said)),
+            Message::Network { from: Node::Cell(from), page, .. } => {
+                let Some(cell) = self.cells.get_mut(from.index()) else { return };
+                match page {
+                    NetworkPage::Heartbeat(heartbeat) => {
+                        if heartbeat.state.has(State::CLAIMING) {
+                            cell.start(said, heartbeat.sent == 0);
+                        }
+                        cell.heartbeat = Some(Arc::clone(said));
+                    }
+                    NetworkPage::Tree(_) => cell.tree = Some(Arc::clone(said)),
+                    NetworkPage::Heard(_) | NetworkPage::Refused(_) | NetworkPage::Ports(_) => {}
+                }
+            }
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                self.each(to, |cell| cell.write(number, said, words.first() == Some(&1)));
+            }
+            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. } => {
+                if number == Parameter::Commit.number() {
+                    self.each(Node::Cell(from), Cell::commit);
+                }
+            }
+            Message::Stimulus { to, from, page } => {
+                let felt = Felt { said: Arc::clone(said), before, since: None };
+                self.each(to, |cell| {
+                    if !cell.measures {
+                        cell.waiting.push(from, (place_of(&page), felt.clone()), last);
+                    }
+                });
+            }
+            Message::Sensors { from, epoch, page } => {
+                if last.is_none_or(|last| last == epoch) {
+                    let felt = Felt { said: Arc::clone(said), before, since: None };
+                    self.each(Node::Cell(from), |cell| cell.learn(place_of(&page), felt.clone()));
+                }
+            }
+            Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Cell)) {
+        for (cell, it) in CellId::all().zip(&mut self.cells) {
+            if to.names(cell) {
+                act(it);
+            }
+        }
+    }
+
+    /// All of them, in the bus' order.
+    #[must_use]
     pub fn frames(&self) -> Vec<Seen> {
-        let cells = self.heartbeats.iter().chain(&self.trees).chain(self.switches.iter().flatten());
-        let packets = cells.chain(self.stimuli.iter().flatten()).chain([&self.joints, &self.halt]);
-        let mut frames: Vec<_> = packets.flatten().flatten().copied().collect();
-        // Halves of a packet may bear one time: they stay in order.
-        frames.sort_by_key(|seen| seen.at_nanos);
-        frames
+        let joints = self.joints.iter().map(|(_, joints)| joints);
+        let packets = self.cells.iter().flat_map(Cell::packets).chain(joints).chain(&self.halt);
+        let ordered: BTreeMap<_, _> = packets.map(|said| (said.place, said)).collect();
+        ordered.values().flat_map(|said| said.frames.iter().flatten().copied()).collect()
     }
 }
 
@@ -144,12 +305,8 @@ impl InForce {
 mod tests {
     use super::*;
     use protocol::fixed::{Q1_14, Q5_10};
-    use protocol::id::{CellId, Node};
-    use protocol::message::{
-        From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, Tree,
-    };
-    use protocol::packet::{Epoch, WORDS};
-    use protocol::parameters::Parameter;
+    use protocol::message::{From, Heartbeat, Joints, SkinSensors, Tree};
+    use protocol::packet::WORDS;
 
     fn say(force: &mut InForce, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
         let frames: Vec<_> = message.encode().frames(format).collect();
@@ -171,11 +328,15 @@ mod tests {
         Message::Network { from: Node::from_byte(node), epoch: Epoch(0), page }
     }
 
+    fn joints(epoch: u8) -> Message {
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        Message::Joints { epoch: Epoch(epoch), joints }
+    }
+
     #[test]
     fn the_last_of_everything_is_kept_in_both_formats() {
         for format in [Format::Fd, Format::Classic] {
             let mut force = InForce::default();
-            let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
             let cell = CellId::new(3).unwrap();
             say(&mut force, 1, format, &heartbeat(3, 1));
             let write = |number, word| Message::Configure {
@@ -193,39 +354,82 @@ mod tests {
             say(&mut force, 1, format, &tree(4));
             say(&mut force, 2, format, &Message::Halt);
             let mut expected = vec![];
+            expected.extend(say(&mut force, 2, format, &write(1, 2)));
             expected.extend(say(&mut force, 2, format, &tree(5)));
             expected.extend(say(&mut force, 2, format, &write(7, 2)));
             expected.extend(say(&mut force, 2, format, &write(9, 2)));
             expected.extend(say(&mut force, 3, format, &heartbeat(3, 2)));
-            say(&mut force, 4, format, &Message::Joints { epoch: Epoch(1), joints });
-            expected.extend(say(&mut force, 5, format, &stimulus(3, 1.0, 7)));
+            // The order is the bus', whatever the times say.
+            expected.extend(say(&mut force, 4, format, &joints(1)));
+            expected.extend(say(&mut force, 1, format, &stimulus(3, 1.0, 7)));
             expected.extend(say(&mut force, 6, format, &stimulus(255, 2.0, 8)));
-            expected.extend(say(&mut force, 7, format, &Message::Joints { epoch: Epoch(2), joints }));
+            expected.extend(say(&mut force, 7, format, &joints(2)));
             expected.extend(say(&mut force, 8, format, &Message::Resume));
-            say(
-                &mut force,
-                9,
-                format,
-                &Message::Torque { from: cell, epoch: Epoch(2), torque: Default::default() },
-            );
+            let torque = Message::Torque { from: cell, epoch: Epoch(2), torque: Default::default() };
+            say(&mut force, 9, format, &torque);
             let frames: Vec<_> = force.frames().iter().map(|seen| seen.frame).collect();
             assert_eq!(frames, expected, "{format:?}");
         }
     }
 
     #[test]
-    fn what_is_switched_is_what_is_not_stored() {
-        let volatile = |&number: &u8| Parameter::from_number(number).is_some_and(Parameter::is_volatile);
-        assert!((0..=u8::MAX).filter(volatile).eq(SWITCHES));
+    fn of_stimuli_those_are_kept_that_are_felt_or_wait_with_the_joints_that_say_which() {
+        let mut force = InForce::default();
+        let mut kept = vec![];
+        let mut now = 0;
+        let mut say = |message: &Message, keep: bool| {
+            now += 1;
+            say(&mut force, now, Format::Fd, message);
+            kept.extend(keep.then_some(now));
+        };
+        say(&joints(1), false);
+        say(&stimulus(9, 1.0, 2), false);
+        say(&joints(2), true);
+        say(&stimulus(9, 2.0, 3), true);
+        say(&joints(3), true);
+        // More than the half of all epochs later it is still felt.
+        (4..=199).for_each(|epoch| say(&joints(epoch), false));
+        say(&joints(200), true);
+        (0..12).for_each(|at| say(&stimulus(8, 1.0, 210), at < 8));
+        let frames: Vec<_> = force.frames().iter().map(|seen| seen.at_nanos).collect();
+        assert_eq!(frames, kept);
     }
 
     #[test]
-    fn as_many_stimuli_are_kept_as_may_wait_and_the_one_that_is_felt() {
+    fn who_has_started_anew_has_nothing_in_force_but_what_was_committed() {
         let mut force = InForce::default();
-        for epoch in 0..20 {
-            say(&mut force, epoch.into(), Format::Fd, &stimulus(9, 1.0, epoch));
-        }
-        let kept: Vec<_> = force.frames().iter().map(|seen| seen.at_nanos).collect();
-        assert_eq!(kept, (11..20).collect::<Vec<_>>());
+        let to = Node::Cell(CellId::new(3).unwrap());
+        let write = |number, word| {
+            let request = Request::Write { number, words: [word, 0, 0, 0, 0, 0] };
+            Message::Configure { to, tag: 0, request }
+        };
+        let taken = Answer::Value { number: Parameter::Commit.number(), written: true, words: [0; WORDS] };
+        let taken = Message::Configured { from: CellId::new(3).unwrap(), tag: 0, answer: taken };
+        let claims = |sent| {
+            let beat = Heartbeat { state: State::CLAIMING, sent, ..Heartbeat::default() };
+            Message::Network { from: to, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
+        };
+        let said = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
+        let said = [&said[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
+        let kept = |force: &InForce| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
+        (0..).zip(&said).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
+        assert_eq!(kept(&force), [0, 1, 3, 4, 5, 6, 7]);
+        say(&mut force, 8, Format::Fd, &claims(0));
+        say(&mut force, 9, Format::Fd, &claims(1));
+        assert_eq!(kept(&force), [0, 1, 7, 8, 9]);
+    }
+
+    #[test]
+    fn nobody_begins_between_the_halves_of_what_the_gateway_says() {
+        let mut force = InForce::default();
+        let halves = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
+        let (ours, theirs) = (halves(&joints(1)), halves(&heartbeat(3, 1)));
+        let mut take = |at_nanos, frame| {
+            force.take(Seen { at_nanos, own: true, frame });
+            [0, 14_000_000, 16_000_000].map(|later| force.is_within_a_packet(at_nanos + later))
+        };
+        assert_eq!(take(5, theirs[0]), [false; 3]);
+        assert_eq!(take(6, ours[0]), [true, true, false]);
+        assert_eq!(take(7, ours[1]), [false; 3]);
     }
 }

@@ -25,6 +25,8 @@ use super::sink::{Gauge, Sink, folder_of};
 const BUFFER: usize = 64 << 10;
 /// Between an error and another attempt.
 const RETRY: Duration = Duration::from_secs(5);
+/// A file that is to end waits so long at most for what holds it: any traffic may look like half of a packet.
+const HOLD: Duration = Duration::from_millis(500);
 /// Room on a disk that was full before it is tried again.
 const ROOM: u64 = 64 << 20;
 
@@ -123,6 +125,8 @@ struct Open<T> {
     /// Bytes before the first message.
     head: u64,
     began: Instant,
+    /// Since when it is large or old enough.
+    enough: Option<Instant>,
     /// In the file, flushed.
     kept: Count,
     /// Written since.
@@ -251,7 +255,17 @@ impl<T> Series<T> {
         match begin() {
             Ok((writer, topics, gauge)) => {
                 let (kept, pending, head) = (Count::default(), Count::default(), gauge.bytes());
-                Ok(Open { writer, topics, part, gauge, head, began: Instant::now(), kept, pending })
+                Ok(Open {
+                    writer,
+                    topics,
+                    part,
+                    gauge,
+                    head,
+                    began: Instant::now(),
+                    enough: None,
+                    kept,
+                    pending,
+                })
             }
             Err(error) => {
                 // There is nothing in it.
@@ -274,9 +288,9 @@ impl<T> Series<T> {
         }
     }
 
-    /// Hands on what was written; ends a file that is large or old enough, or whose disk is full. Whether another
-    /// file should be begun with [`Series::next`].
-    pub fn flush(&mut self) -> bool {
+    /// Hands on what was written; ends a file that is large or old enough, as soon as nothing `holds` it, or whose
+    /// disk is full. Whether another file should be begun with [`Series::next`].
+    pub fn flush(&mut self, holds: bool) -> bool {
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
             return due && has_room(&self.path);
@@ -294,6 +308,8 @@ impl<T> Series<T> {
         }
         let enough =
             open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
+        let since = enough.then(|| *open.enough.get_or_insert_with(Instant::now));
+        let enough = since.is_some_and(|since| !holds || since.elapsed() >= HOLD);
         if enough {
             self.end();
         }

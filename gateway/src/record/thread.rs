@@ -281,11 +281,13 @@ impl Work {
             self.errors.push(failed(text, &error));
         }
         let Some(series) = &mut self.series else { return };
-        if !series.flush() || !series.next(|writer| Topics::new(writer, &self.layout)) {
+        // Both halves of what the cells are told stand in one file.
+        let now = wall();
+        let holds = self.buses.iter().any(|bus| bus.in_force.is_within_a_packet(now));
+        if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
         // So that this file can be understood without the one before.
-        let now = wall();
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.in_force.frames() {
                 series

@@ -1,6 +1,6 @@
 //! The thread that reads the capture, ahead of what is sent.
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -31,7 +31,7 @@ pub(super) struct Source {
 
 impl Source {
     /// Reads to the end, or until nobody wants more.
-    pub(super) fn run(self, path: &Path, mut queue: rtrb::Producer<Step>) -> Result<Cut, CaptureError> {
+    pub(super) fn run(self, files: &[PathBuf], mut queue: rtrb::Producer<Step>) -> Result<Cut, CaptureError> {
         let mut reel = Reel::new(&self.survey, &self.selection);
         let mut pass = 0_u32;
         while self.passes.is_none_or(|passes| pass < passes) && !self.is_over(&queue) {
@@ -46,7 +46,7 @@ impl Source {
                 in_force.for_each(|(lane, message)| judge.record(lane, message, false));
             }
             drop(judge);
-            self.pass(path, &mut reel, &mut queue)?;
+            self.pass(files, &mut reel, &mut queue)?;
             pass = pass.saturating_add(1);
         }
         self.hall.judge().record_end();
@@ -56,11 +56,11 @@ impl Source {
 
     fn pass(
         &self,
-        path: &Path,
+        files: &[PathBuf],
         reel: &mut Reel<'_>,
         queue: &mut rtrb::Producer<Step>,
     ) -> Result<(), CaptureError> {
-        let mut reader = Reader::open(path)?;
+        let mut reader = Reader::open_all(files)?;
         let mut steps = Vec::new();
         while let Some(entry) = reader.next()? {
             let Entry::Frame(record) = entry else {

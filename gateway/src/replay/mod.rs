@@ -28,6 +28,7 @@ mod start;
 pub mod state;
 pub mod survey;
 mod teller;
+pub mod touched;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -76,8 +77,8 @@ pub struct Spawn {
 /// What a replay needs to know.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// The capture.
-    pub file: PathBuf,
+    /// The capture: a file, or the parts of a recording.
+    pub files: Vec<PathBuf>,
     /// Which kind of bus.
     pub kinds: Kinds,
     /// Whose frames are sent.
@@ -123,10 +124,10 @@ pub struct Options {
 /// summary.
 pub fn replay(options: &Options) -> Result<Summary, RunError> {
     let teller = Teller::new(options.quiet);
-    let (survey, extras) = look_through(options, &teller)?;
+    let (survey, extras, name) = look_through(options, &teller)?;
     let survey = Arc::new(survey);
-    let routes = Routes::new(options, &survey)?;
-    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(options, spawn, &routes, &extras));
+    let routes = Routes::new(options, &survey, &name)?;
+    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
     let wearing = wearing.transpose()?;
     // Until now there was nothing that had to be put in order at an end.
     let signalled = Arc::clone(stop::flag());
@@ -153,6 +154,7 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
         routes: routes.clone(),
         expects: options.expect,
         spawned: options.spawn.is_some(),
+        name,
     };
     let judged = routes
         .names
@@ -162,36 +164,35 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
     Session::new(options, checks, judge, buses, signalled, teller).run(idle.as_ref(), wearing.as_ref())
 }
 
-/// Reads the capture once, from end to end.
-fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), RunError> {
-    if options.file.as_os_str() == "-" {
+/// Reads the capture once, from end to end; also what it is called.
+fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, String), RunError> {
+    if options.files.iter().any(|file| file.as_os_str() == "-") {
         return Err(RunError::Usage(
             "a capture is read twice, which standard input cannot be: write it to a file, and name that"
                 .to_owned(),
         ));
     }
-    let name = options.file.display();
-    if options.file.metadata().is_ok_and(|about| !about.is_file() && !about.is_dir()) {
+    if let Some(pipe) =
+        options.files.iter().find(|it| it.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
+    {
         return Err(RunError::Usage(format!(
-            "{name} is no regular file, and a capture is read twice: write it to a file, and name that"
+            "{} is no regular file, and a capture is read twice: write it to a file, and name that",
+            pipe.display()
         )));
     }
-    let open = || Reader::open(&options.file).map_err(|error| RunError::Usage(error.to_string()));
+    let mut reader = Reader::open_all(&options.files).map_err(|error| RunError::Usage(error.to_string()))?;
+    let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    // What was in force stands before the first frame, and is known when that is read.
-    let mut beginning = open()?;
-    beginning.next().map_err(failed)?;
     let too_many = |buses: usize| {
         let why = "a replay sends to no more than that";
         (buses > BUSES)
             .then(|| RunError::Usage(format!("{name} has frames of more than {BUSES} buses: {why}")))
     };
-    let in_force = &beginning.extras().in_force;
+    // What was in force stands before the first frame, and is known when it is open.
+    let in_force = &reader.extras().in_force;
     let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
     too_many(buses.len()).map_or(Ok(()), Err)?;
     survey.begin(in_force);
-    drop(beginning);
-    let mut reader = open()?;
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(failed)? {
         match entry {
@@ -246,7 +247,7 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras), 
              leave none of it"
         )));
     }
-    Ok((survey, reader.extras().clone()))
+    Ok((survey, reader.extras().clone(), name))
 }
 
 fn failed(error: CaptureError) -> RunError {

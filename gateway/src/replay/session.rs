@@ -159,8 +159,9 @@ impl<'a> Session<'a> {
             hall: Arc::clone(&self.hall),
             ready: Arc::clone(&ready),
         };
-        let file = self.options.file.clone();
-        let reader = thread::Builder::new().name("reader".to_owned()).spawn(move || source.run(&file, queue));
+        let files = self.options.files.clone();
+        let reader =
+            thread::Builder::new().name("reader".to_owned()).spawn(move || source.run(&files, queue));
         let reader = reader.map_err(no_thread)?;
         while !ready.load(Ordering::Relaxed) && !reader.is_finished() {
             thread::sleep(Duration::from_millis(1));
@@ -318,7 +319,7 @@ impl<'a> Session<'a> {
         let mut silent_cells: Vec<_> = live.silent.iter().map(silent).collect();
         silent_cells.dedup();
         Summary {
-            file: self.options.file.display().to_string(),
+            file: self.checks.name.clone(),
             duration_s,
             interrupted: played.was_stopped && self.signalled.load(Ordering::Relaxed),
             sent: total(|lane| lane.sent),

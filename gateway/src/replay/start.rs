@@ -48,12 +48,11 @@ pub(super) struct Routes {
 
 impl Routes {
     /// By `--bus` and `--map`.
-    pub(super) fn new(options: &Options, survey: &Survey) -> Result<Self, RunError> {
+    pub(super) fn new(options: &Options, survey: &Survey, capture: &str) -> Result<Self, RunError> {
         let known = |name: &str, option: &str| match survey.bus_named(name) {
             Some(bus) => Ok(bus),
             None => Err(RunError::Usage(format!(
-                "{option}: {} has no bus {name}; it has {}",
-                options.file.display(),
+                "{option}: {capture} has no bus {name}; it has {}",
                 survey.names()
             ))),
         };
@@ -123,16 +122,15 @@ pub(super) struct Wearing {
 
 /// The skin of the cells that are started: the one that is named, or the one that the recording has.
 pub(super) fn wearing(
-    options: &Options,
     spawn: &Spawn,
     routes: &Routes,
     extras: &Extras,
+    file: &str,
 ) -> Result<Wearing, RunError> {
     let mut wearing = if let Some(path) = &spawn.skin {
         Wearing { skin: Skin::read(path)?, file: path.clone(), _memory: None }
     } else {
         let attached = extras.attachments.iter().find(|(name, _)| name == "skin.toml");
-        let file = options.file.display();
         let Some((_, bytes)) = attached else {
             return Err(RunError::Usage(format!(
                 "--spawn: {file} has no skin attached, as recordings of `gateway run --record` have: name it with \
@@ -378,6 +376,8 @@ pub(super) struct Checks {
     pub(super) expects: bool,
     /// Whether cells were started here.
     pub(super) spawned: bool,
+    /// What the capture is called.
+    pub(super) name: String,
 }
 
 impl Checks {

@@ -10,7 +10,7 @@
 //! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
 //! were said.
 
-use protocol::fixed::Q3_12;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{
     From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State as Flags,
@@ -18,6 +18,7 @@ use protocol::message::{
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 
+use super::touched::Touched;
 use crate::stimuli::Waiting;
 
 /// Messages since the last joints that are kept as they were said.
@@ -63,6 +64,17 @@ impl Feeling {
         if unknown && self.pending.is_empty() {
             self.feel(page);
         }
+    }
+
+    /// Whether something touches it from the joints of an epoch on, if that is known.
+    fn is_touched_from(&self, epoch: Epoch) -> Option<bool> {
+        let touches = |skin: &SkinSensors| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
+        if self.pending.is_empty() {
+            return self.skin.as_ref().map(touches);
+        }
+        let mut then = self.clone();
+        then.latch(epoch);
+        then.skin.as_ref().map(touches)
     }
 
     /// Nothing, in either mode.
@@ -176,9 +188,12 @@ impl State {
     /// Takes in the bus' next message.
     pub fn take(&mut self, message: &Message) {
         match *message {
+            // Cells drop joints of the last epoch.
             Message::Joints { epoch, joints } => {
-                self.fold();
-                self.joints = Some((epoch, joints));
+                if self.joints.is_none_or(|(last, _)| last != epoch) {
+                    self.fold();
+                    self.joints = Some((epoch, joints));
+                }
             }
             Message::Halt
             | Message::Resume
@@ -221,6 +236,25 @@ impl State {
         for message in self.since.drain(..) {
             self.before.take(&message, last);
         }
+    }
+
+    /// The epoch of the last joints.
+    #[must_use]
+    pub fn last_epoch(&self) -> Option<Epoch> {
+        self.joints.map(|(epoch, _)| epoch)
+    }
+
+    /// Who is touched since the last joints, by what was said before them.
+    #[must_use]
+    pub fn touched(&self) -> Touched {
+        let mut touched = Touched::default();
+        let Some((epoch, _)) = self.joints else { return touched };
+        for (cell, feeling) in CellId::all().zip(&self.before.cells) {
+            if let Some(is_touched) = feeling.is_touched_from(epoch) {
+                touched.insert(cell, is_touched);
+            }
+        }
+        touched
     }
 
     /// Whether a cell that has just started is in this state already.
@@ -285,7 +319,6 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::fixed::Q5_10;
     use protocol::message::Heartbeat;
 
     fn press(newtons: f64) -> SensorPage {

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
-use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
+use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
 use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -57,8 +57,13 @@ pub struct Bus {
     pub format: Option<Format>,
     /// Joint broadcasts on it.
     pub joints: u64,
-    /// Of these, those that were under way when somebody last asked for a report.
-    at_report: u64,
+    /// When the last of them stood on it, in ns since 1970.
+    last_joints: u64,
+    /// Of these, those that were under way when somebody last asked for a report; none when nobody has.
+    at_report: Option<(u64, u64)>,
+    /// Whether a cell told its counters, or something was in force when the capture began: then a part of a
+    /// recording, or one that was cut off, may lack what its counters would account for.
+    is_accounted: bool,
     /// What was said before the capture began and is in force at its beginning, as it has it.
     pub in_force: Vec<Message>,
     /// The state in force where the part begins.
@@ -69,6 +74,17 @@ pub struct Bus {
     pub sums: u64,
     /// Its cells.
     pub cells: BTreeMap<CellId, Cell>,
+    /// What is known of cells from before the capture.
+    before: BTreeMap<CellId, Before>,
+}
+
+/// What is known of a cell from before the capture.
+#[derive(Clone, Copy, Debug)]
+struct Before {
+    /// When it was heard last, in ns since 1970.
+    heard: u64,
+    hash: Known<u16>,
+    measures: bool,
 }
 
 /// One cell.
@@ -86,12 +102,16 @@ pub struct Cell {
     pub unrecorded: u64,
     /// Joints that it did not take or came too late for.
     pub untaken: u64,
+    /// Between which joints its counters account for that: from after one time up to another, in ns since 1970.
+    accounted: Vec<(u64, u64)>,
+    /// Whether counters account for anything on its bus; else whatever is lacking is a difference.
+    is_accounted: bool,
     /// Since when it claims its number, which it does after each start.
     claims: Option<u64>,
     /// Packets since the last heartbeat, which says how many were sent before it.
     counted: Option<(u16, u64)>,
-    /// Its counters at the last report, and the joints until then.
-    report: Option<(Heard, u64)>,
+    /// Its counters at the last report, the joints until then, and the time of the last of them.
+    report: Option<(Heard, u64, u64)>,
 }
 
 /// Something that may have been learnt too late.
@@ -116,10 +136,12 @@ impl Survey {
     /// Takes what was in force when the capture began, before its first frame.
     pub fn begin(&mut self, in_force: &[InForce]) {
         let mut decoder = Decoder::new(None);
-        for InForce { bus, frame, nanos } in in_force {
+        for InForce { bus, frame, nanos, .. } in in_force {
             if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
                 let bus = self.bus(bus);
+                bus.is_accounted = true;
                 bus.state.take(&message);
+                bus.take_before(&message, *nanos);
                 bus.in_force.push(message);
             }
         }
@@ -159,8 +181,11 @@ impl Survey {
     /// Takes in that the capture is at its end.
     pub fn finish(&mut self) {
         let last = self.last;
-        for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
-            cell.end(last);
+        for bus in &mut self.buses {
+            for cell in bus.cells.values_mut() {
+                cell.end(last);
+                cell.is_accounted = bus.is_accounted;
+            }
         }
     }
 
@@ -202,17 +227,54 @@ impl Bus {
             has_fd: false,
             format: None,
             joints: 0,
-            at_report: 0,
+            last_joints: 0,
+            at_report: None,
+            is_accounted: false,
             in_force: Vec::new(),
             state: State::default(),
             first_joints: None,
             sums: 0,
             cells: BTreeMap::new(),
+            before: BTreeMap::new(),
+        }
+    }
+
+    /// Takes in what was said before the capture and is in force at its beginning.
+    fn take_before(&mut self, message: &Message, nanos: u64) {
+        match *message {
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                let is_settled = !heartbeat.state.has(Flags::CLAIMING);
+                let measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
+                let hash = if is_settled { Known::Yes(heartbeat.configuration) } else { Known::No };
+                self.before.insert(from, Before { heard: nanos, hash, measures });
+            }
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.names(**cell)) {
+                    if number == Parameter::Mode.number() {
+                        before.measures = words.first() != Some(&1);
+                    } else if number == Parameter::Commit.number() {
+                        before.hash = Known::No;
+                    }
+                }
+            }
+            Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
         }
     }
 
     fn heard(&mut self, cell: CellId, nanos: u64) {
-        self.cells.entry(cell).or_insert_with(|| Cell::new(nanos)).hear(nanos);
+        let before = self.before.get(&cell);
+        self.cells.entry(cell).or_insert_with(|| Cell::new(nanos, before)).hear(nanos);
     }
 
     fn take(&mut self, message: &Message, nanos: u64, is_before: bool, is_in_part: bool) {
@@ -222,14 +284,16 @@ impl Bus {
         match *message {
             Message::Joints { epoch, joints } => {
                 self.joints += 1;
+                self.last_joints = self.last_joints.max(nanos);
                 if is_in_part {
                     self.first_joints.get_or_insert((epoch, joints));
                 }
             }
-            Message::Report => self.at_report = self.joints,
+            Message::Report => self.at_report = Some((self.joints, self.last_joints)),
             Message::Sum { .. } => self.sums += 1,
             Message::Network { from: Node::Cell(from), page, .. } => {
-                let (at_report, joints) = (self.at_report, self.joints);
+                let (at_report, joints) = (self.at_report, (self.joints, self.last_joints));
+                self.is_accounted |= matches!(page, NetworkPage::Heard(_));
                 let Some(cell) = self.cells.get_mut(&from) else { return };
                 match page {
                     NetworkPage::Heartbeat(heartbeat) => {
@@ -274,14 +338,19 @@ impl Bus {
 }
 
 impl Cell {
-    const fn new(nanos: u64) -> Self {
+    fn new(nanos: u64, before: Option<&Before>) -> Self {
+        // A cell that has just spoken before the capture was there when it began.
+        let first =
+            before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         Self {
-            hash: Known::No,
-            measured: false,
-            heard: (nanos, nanos),
+            hash: before.map_or(Known::No, |before| before.hash),
+            measured: before.is_some_and(|before| before.measures),
+            heard: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
             silences: Vec::new(),
             unrecorded: 0,
             untaken: 0,
+            accounted: Vec::new(),
+            is_accounted: false,
             claims: None,
             counted: None,
             report: None,
@@ -305,11 +374,11 @@ impl Cell {
     }
 
     /// While it claims its number it answers nothing, and after a start its counters begin anew.
-    fn claim(&mut self, heartbeat: &Heartbeat, nanos: u64, joints: u64) {
+    fn claim(&mut self, heartbeat: &Heartbeat, nanos: u64, (joints, last): (u64, u64)) {
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
             self.counted = None;
-            self.report = Some((Heard::default(), joints));
+            self.report = Some((Heard::default(), joints, last));
         } else if let Some(since) = self.claims.take() {
             self.silences.push((since, nanos));
         }
@@ -335,14 +404,28 @@ impl Cell {
         self.measured |= settled && is_in_part && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
-    fn report(&mut self, heard: Heard, joints: u64) {
-        if let Some((before, joints_before)) = self.report {
+    /// Counters that were asked for at some joints. When that was before the capture, nobody knows which joints they
+    /// account for.
+    fn report(&mut self, heard: Heard, asked: Option<(u64, u64)>) {
+        let Some((joints, last)) = asked else { return };
+        if let Some((before, joints_before, from)) = self.report {
             let taken = heard.joints.wrapping_sub(before.joints);
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
             let known = u64::from(taken) + u64::from(repeated);
             self.untaken += joints.saturating_sub(joints_before).saturating_sub(known);
+            match self.accounted.last_mut() {
+                Some((_, until)) if *until == from => *until = last,
+                _ => self.accounted.push((from, last)),
+            }
         }
-        self.report = Some((heard, joints));
+        self.report = Some((heard, joints, last));
+    }
+
+    /// Whether counters that it told before and after account for joints of this time, in ns since 1970; where none on
+    /// its bus do, nothing is excused by what they would say.
+    #[must_use]
+    pub fn is_counted_at(&self, nanos: u64) -> bool {
+        !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
     }
 
     /// Whether it said nothing for long around a time, in ns since 1970.

@@ -96,6 +96,17 @@ uint8[] data
 }
 
 impl<'a> CanFrame<'a> {
+    /// When the frame was on its bus, by its header, in ns since 1970: of a frame of before, that is long before the
+    /// recording has it.
+    ///
+    /// # Errors
+    /// When it is no such message.
+    pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
+        let mut from = Reader::new(message)?;
+        let (sec, nanosec) = (from.i32()?, from.u32()?);
+        Ok(u64::try_from(sec).unwrap_or(0) * NANOS + u64::from(nanosec))
+    }
+
     /// Reads a message that the recording holds at a time. Never panics.
     ///
     /// # Errors

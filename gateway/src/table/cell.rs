@@ -200,6 +200,12 @@ impl Cell {
         }
     }
 
+    /// What has come so far is from before, and counts for nothing.
+    pub(super) fn begin_accounts(&mut self) {
+        (self.uplink, self.replies, self.sensed) = Default::default();
+        (self.due, self.expected, self.told) = (0, [None; LATEST + 1], 0);
+    }
+
     /// Any valid frame is a sign of life. Returns whether the cell was thought dead.
     pub(super) const fn hear(&mut self, at: Micros) -> bool {
         self.last_word = Some(at);

@@ -655,6 +655,20 @@ impl Table {
         }
     }
 
+    /// What was taken so far is from before: it says what holds, and counts for nothing.
+    pub fn begin_accounts(&mut self) {
+        self.cells.iter_mut().for_each(Cell::begin_accounts);
+        if let Some(broadcast) = &mut self.broadcast {
+            (broadcast.due, broadcast.in_time, broadcast.last_reply) = (0, 0, None);
+        }
+        if let Some(trunk) = &mut self.trunk {
+            *trunk = Trunk::default();
+        }
+        (self.counters, self.accuracy) = (Counters::default(), Accuracy::default());
+        self.last_reply.reset();
+        self.notices.clear();
+    }
+
     /// The bus is lost: what was on its way is in doubt. The torques stay as they are, and the loop lets them go.
     pub fn interrupt(&mut self) {
         self.interrupted = true;

@@ -1,14 +1,15 @@
 //! The entries of an MCAP recording, and what else it has.
 
 use std::collections::HashMap;
+use std::fs::File;
 use std::io::{self, BufReader, Chain, Cursor, Read, Seek};
 
 use ::mcap::records::op;
-use protocol::candump::Timestamp;
+use protocol::candump::{Direction, Timestamp};
 
 use super::foreign::Foreign;
 use crate::capture::log::LONGEST as LONGEST_LINE;
-use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
+use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Through, Topic};
 use crate::container::{Chunk, Damage, Facts, Framed, MAGIC, Names, Record as Raw, Source, find, parse};
 use crate::record::TOPIC_OF_STATE;
 use crate::ros2::Message;
@@ -82,6 +83,8 @@ struct State {
     any_frame: bool,
     /// Whether messages that are only counted are wanted too.
     others: bool,
+    /// Whether no other part of the recording came before.
+    is_first: bool,
 }
 
 /// A message that is wanted. What it says is the record that was read last.
@@ -118,11 +121,11 @@ impl McapReader {
     }
 
     /// Reads a file from its beginning. Its attachments and metadata are known from then on, wherever they stand.
-    pub(crate) fn with_files(mut file: impl Read + Seek + Send + 'static, others: bool) -> io::Result<Self> {
+    pub(crate) fn with_files(mut file: File, through: &Through, others: bool) -> io::Result<Self> {
         let mut state = State::new(others);
         state.find_files(&mut file)?;
         file.rewind()?;
-        Ok(Self::begin(&[], Box::new(file), state))
+        Ok(Self::begin(&[], through(file), state))
     }
 
     fn begin(head: &[u8], input: Box<dyn Read + Send>, state: State) -> Self {
@@ -136,6 +139,45 @@ impl McapReader {
 
     pub(crate) const fn extras(&self) -> &Extras {
         &self.state.extras
+    }
+
+    /// It is a part that follows others, of which this is known: what was in force when it began is no news, and its
+    /// topics are theirs.
+    pub(crate) fn follows(&mut self, before: Extras) {
+        let state = &mut self.state;
+        let own = std::mem::replace(&mut state.extras, before);
+        state.is_first = false;
+        state.extras.unfinished = state.extras.unfinished.take().or(own.unfinished);
+        let topics = &mut state.extras.topics;
+        let places = own.topics.into_iter().map(|topic| {
+            let known = topics.iter().position(|it| it.name == topic.name && it.schema == topic.schema);
+            match known.and_then(|at| Some((at, topics.get_mut(at)?))) {
+                Some((at, known)) => {
+                    known.messages += topic.messages;
+                    at
+                }
+                None => {
+                    topics.push(topic);
+                    topics.len() - 1
+                }
+            }
+        });
+        let places: Vec<_> = places.collect();
+        let channels = state.channels.values_mut().filter_map(|lane| match &mut lane.what {
+            What::Counted(topic) => Some(topic),
+            What::Frames { .. } | What::InForce | What::Notes | What::Foreign(_) => None,
+        });
+        for topic in channels.chain(state.counted.values_mut()) {
+            *topic = places.get(*topic).copied().unwrap_or_default();
+        }
+    }
+
+    /// Whether nothing more comes. Reads on up to the next message, which [`McapReader::next`] then gives out.
+    pub(crate) fn is_at_its_end(&mut self) -> Result<bool, Fault> {
+        if self.first.is_none() {
+            self.first = self.advance()?.map(Ok);
+        }
+        Ok(self.first.is_none())
     }
 
     /// The next entry, or message of another topic where these are wanted. Never panics.
@@ -231,6 +273,7 @@ impl State {
             knows_files: false,
             any_frame: false,
             others,
+            is_first: true,
         }
     }
 
@@ -245,8 +288,8 @@ impl State {
 
     fn cut_off(&mut self, read: u64) {
         self.place = Place::Over;
-        self.extras.unfinished =
-            Some(format!("it has no end: after {read} bytes it was cut off, or never finished"));
+        let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
+        self.extras.unfinished.get_or_insert_with(why);
     }
 
     /// Takes the attachments and metadata of a file that can be gone through without reading all of it.
@@ -295,7 +338,7 @@ impl State {
                 self.channel(id, schema, topic, encoding, &facts)?;
             }
             Raw::Message { channel, log_time, data, .. } => {
-                let wanted = self.is_wanted(channel, log_time, data)?;
+                let wanted = self.is_wanted(channel, data)?;
                 return Ok(wanted.then_some(Wanted { channel, log_time, in_chunk }));
             }
             Raw::Attachment { name, data, .. } => {
@@ -314,7 +357,7 @@ impl State {
     }
 
     /// Takes a message, if nobody else wants it.
-    fn is_wanted(&mut self, channel: u16, log_time: u64, data: &[u8]) -> Result<bool, Fault> {
+    fn is_wanted(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
         let lane = self.channels.get(&channel);
         let lane =
             lane.ok_or_else(|| damaged(format!("a message belongs to channel {channel}, which it has not")))?;
@@ -325,14 +368,19 @@ impl State {
                 }
                 Ok(self.others)
             }
+            What::InForce if !self.is_first => Ok(false),
             What::InForce => {
-                let time = Timestamp { nanos: log_time, nine_digits: true };
+                let frame = |data| {
+                    let time = Timestamp { nanos: CanFrame::stamp(data)?, nine_digits: true };
+                    CanFrame::decode(data, time)
+                };
                 let CanFrame(record) = within(data, LONGEST_FRAME)
-                    .and_then(|data| CanFrame::decode(data, time).map_err(|error| error.to_string()))
+                    .and_then(|data| frame(data).map_err(|error| error.to_string()))
                     .map_err(|why| damaged(format!("a message of {}: {why}", lane.topic)))?;
-                let (bus, frame) = (record.interface, record.frame);
+                let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
+                let (frame, nanos) = (record.frame, record.time.nanos);
                 self.keep(bus.len() + ENTRY, |extras| {
-                    extras.in_force.push(InForce { bus: bus.to_owned(), frame, nanos: log_time });
+                    extras.in_force.push(InForce { bus: bus.to_owned(), own, frame, nanos });
                 });
                 Ok(false)
             }

@@ -235,7 +235,11 @@ fn force_steps(force: &Force, first: u64) -> String {
 }
 
 fn origin(origin: &Origin, first: u64) -> String {
-    let at = |nanos: u64| seconds(nanos.saturating_sub(first));
+    let at = |nanos: u64| match nanos.checked_sub(first) {
+        Some(after) => seconds(after),
+        // In an earlier part of the recording.
+        None => format!("-{}", seconds(first - nanos)),
+    };
     match *origin {
         Origin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
         Origin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),

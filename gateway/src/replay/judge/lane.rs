@@ -3,13 +3,21 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Heard, Heartbeat, Message, NetworkPage, State as Flags};
+use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
 use protocol::packet::{Epoch, WORDS};
 
+use super::WINDOW;
 use super::sums::{Sums, Trees};
 use super::tally::Lacking;
 use crate::replay::difference::What;
+use crate::replay::state::State;
 use crate::replay::survey::Cell as Surveyed;
+use crate::replay::touched::Touched;
+
+/// Unanswered requests of a cell that are remembered.
+const ASKED: usize = 256;
+/// What was asked within so many joints of the end may be answered after it.
+const AT_THE_END: u64 = 8;
 
 /// A cell as it is on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
@@ -78,12 +86,37 @@ pub(super) struct Round {
     pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were asked last.
     pub(super) asked_as: Epoch,
+    /// How often they were.
+    pub(super) asked: u32,
+    /// Who is touched at these joints and at the ones before, by what the recording says that was sent.
+    pub(super) touched: [Touched; 2],
+    /// Whether a pass begins with them.
+    pub(super) is_first: bool,
 }
 
 impl Round {
     pub(super) fn new(epoch: Epoch, nanos: u64) -> Self {
-        let (fate, asked_as) = (Fate::Waiting, epoch);
-        Self { epoch, nanos, fate, replies: BTreeMap::new(), sums: Both::default(), asked_as }
+        Self {
+            epoch,
+            nanos,
+            fate: Fate::Waiting,
+            replies: BTreeMap::new(),
+            sums: Both::default(),
+            asked_as: epoch,
+            asked: 0,
+            touched: [Touched::default(); 2],
+            is_first: false,
+        }
+    }
+
+    /// Whether something touches a cell at these joints, if that is known.
+    pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
+        self.touched.last().and_then(|touched| touched.is(cell))
+    }
+
+    /// Whether a cell that takes these joints has anything to say: a torque, or the end of what it felt before.
+    pub(super) fn may_answer(&self, cell: CellId) -> bool {
+        self.touched.iter().any(|touched| touched.is(cell) == Some(true))
     }
 }
 
@@ -93,6 +126,8 @@ pub(super) struct Excuse {
     pub(super) cell: Surveyed,
     /// It said the end of a contact earlier now, because it took joints that it had not taken then.
     pub(super) ended_earlier: bool,
+    /// Whether its last recorded torque was no end of a contact; none when it has said none yet.
+    pub(super) speaks: Option<bool>,
 }
 
 /// Recorded answers to `configure`, and those that came now, as far as they are not compared yet.
@@ -100,7 +135,18 @@ pub(super) struct Excuse {
 pub(super) struct Answers {
     /// With the number of rounds before it.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
+    /// What was asked in the recording and not answered yet.
+    asked: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
+}
+
+/// A recorded `configure`.
+#[derive(Clone, Copy, Debug)]
+struct Question {
+    tag: u8,
+    /// Rounds before it, and when the last of them was.
+    round: u64,
+    nanos: u64,
 }
 
 /// One bus.
@@ -124,9 +170,17 @@ pub(super) struct Lane {
     pub(super) speaking: BTreeSet<CellId>,
     /// Whether somebody had cells say what they feel without being asked: then that comes at times of their own.
     pub(super) senses: bool,
-    /// Cells that had taken no joints when they last told their counters in the capture, with the epoch that they say
-    /// until they have: it is of no joints.
-    pub(super) untouched: BTreeMap<CellId, Epoch>,
+    /// Cells that had taken no joints when they last told their counters, with the epoch that they say until they have:
+    /// it is of no joints.
+    pub(super) untouched: Both<BTreeMap<CellId, Epoch>>,
+    /// What holds at the last recorded joints, and who is touched at them.
+    state: State,
+    touched: Touched,
+    /// The number of the first round of this pass.
+    first_round: u64,
+    /// Whether something was said before it, and the last joints of that time.
+    pub(super) begins_later: bool,
+    earlier: Option<Epoch>,
     /// Rounds that were announced.
     pub(super) sent: u64,
     /// The round after which the capture has no more joints.
@@ -136,7 +190,7 @@ pub(super) struct Lane {
 
 impl Lane {
     pub(super) fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
-        let excuse = |(node, cell)| (node, Excuse { cell, ended_earlier: false });
+        let excuse = |(node, cell)| (node, Excuse { cell, ended_earlier: false, speaks: None });
         Self {
             name,
             roll: BTreeMap::new(),
@@ -150,7 +204,12 @@ impl Lane {
             answers: BTreeMap::new(),
             speaking: BTreeSet::new(),
             senses: false,
-            untouched: BTreeMap::new(),
+            untouched: Both::default(),
+            state: State::default(),
+            touched: Touched::default(),
+            first_round: 0,
+            begins_later: false,
+            earlier: None,
             sent: 0,
             last_round: None,
             is_down: false,
@@ -174,28 +233,80 @@ impl Lane {
         }
     }
 
-    /// Takes in what a message of the capture tells of whether its cell has taken any joints yet.
-    pub(super) fn record_first_joints(&mut self, message: &Message) {
-        if let Message::Torque { from, .. } = *message {
-            self.untouched.remove(&from);
+    /// Takes in that the capture begins anew.
+    pub(super) fn begin(&mut self) {
+        self.recorded.fill(None);
+        (self.state, self.touched) = (State::default(), Touched::default());
+        (self.first_round, self.begins_later, self.earlier) = (self.rounds_so_far(), false, None);
+    }
+
+    fn rounds_so_far(&self) -> u64 {
+        self.base + self.rounds.len() as u64
+    }
+
+    /// Takes in that joints stood on the bus in the capture; returns the number of their round, if they will be sent.
+    pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
+        let number = self.rounds_so_far();
+        let is_first = number == self.first_round;
+        if is_first {
+            self.earlier = self.state.last_epoch();
         }
-        let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return };
-        match page {
-            NetworkPage::Heard(Heard { joints: 0, joints_late: 0, .. }) => {
-                self.untouched.insert(cell, epoch);
-            }
-            NetworkPage::Heard(_) => {
-                self.untouched.remove(&cell);
-            }
-            NetworkPage::Heartbeat(_)
-            | NetworkPage::Tree(_)
-            | NetworkPage::Refused(_)
-            | NetworkPage::Ports(_) => {
-                if self.untouched.get(&cell).is_some_and(|said| *said != epoch) {
-                    self.untouched.remove(&cell);
+        let before = self.take_joints(epoch);
+        if is_sent {
+            let touched = [before, self.touched];
+            self.rounds.push_back(Round { touched, is_first, ..Round::new(epoch, nanos) });
+        } else {
+            self.begins_later |= is_first;
+        }
+        let round = is_sent.then_some(number);
+        *self.recorded.get_mut(usize::from(epoch.0))? = round;
+        round
+    }
+
+    fn take_joints(&mut self, epoch: Epoch) -> Touched {
+        self.state.take(&Message::Joints { epoch, joints: Joints::default() });
+        std::mem::replace(&mut self.touched, self.state.touched())
+    }
+
+    /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
+    pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
+        self.begins_later |= !is_in_part && self.rounds_so_far() == self.first_round;
+        if let Message::Joints { epoch, .. } = *message {
+            self.take_joints(epoch);
+        } else {
+            self.state.take(message);
+        }
+        if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
+            let round = self.rounds_so_far();
+            let nanos = self.rounds.back().map_or(0, |round| round.nanos);
+            for cell in self.excuses.keys().filter(|cell| to.names(**cell)) {
+                let asked = &mut self.answers.entry(*cell).or_default().asked;
+                if asked.len() == ASKED {
+                    asked.pop_front();
                 }
+                asked.push_back(Question { tag, round, nanos });
             }
         }
+    }
+
+    /// Whether a reply of this epoch, which no joints of the part have had yet, answers joints from before it.
+    pub(super) fn is_earlier(&self, epoch: Epoch) -> bool {
+        let rounds = self.rounds_so_far() - self.first_round;
+        let last = if rounds == 0 { self.state.last_epoch() } else { self.earlier };
+        self.begins_later && rounds < WINDOW && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
+    }
+
+    /// Takes in a recorded answer to `configure`; whether what it answers stands in the part.
+    pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
+        let rounds = self.rounds_so_far();
+        let answers = self.answers.entry(from).or_default();
+        match answers.asked.iter().position(|asked| asked.tag == tag) {
+            Some(at) => drop(answers.asked.remove(at)),
+            None if self.begins_later => return false,
+            None => {}
+        }
+        answers.recorded.push_back((rounds, tag, answer));
+        true
     }
 
     /// Takes in where a cell's sums go, as it said in the capture. Its page tells the last joints that it has taken:
@@ -206,7 +317,7 @@ impl Lane {
         self.trees.recorded.say(cell, parent, last.map_or(next, |last| last + 1));
     }
 
-    /// The same as it says now.
+    /// Where its sums go as it says now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.asked.get(usize::from(epoch.0)).copied().flatten().and_then(|asked| asked.round);
         self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
@@ -251,14 +362,71 @@ impl Lane {
     }
 }
 
+impl Answers {
+    /// Whether the recording says why it has the question of this tag and not the answer; `rounds` are all there were.
+    pub(super) fn excuse_extra(
+        &mut self,
+        lacking: &mut Lacking,
+        excuse: Option<&mut Excuse>,
+        tag: u8,
+        rounds: u64,
+    ) -> bool {
+        let Some(Excuse { cell, .. }) = excuse else {
+            // A cell that the recording does not have.
+            lacking.silent += 1;
+            return true;
+        };
+        let Some(at) = self.asked.iter().position(|asked| asked.tag == tag) else { return false };
+        let Some(Question { round, nanos, .. }) = self.asked.remove(at) else { return false };
+        if cell.is_silent_at(nanos) {
+            lacking.silent += 1;
+        } else if round + AT_THE_END >= rounds {
+            lacking.ended += 1;
+        } else if !cell.is_counted_at(nanos) {
+            lacking.uncounted += 1;
+        } else if cell.unrecorded > 0 {
+            cell.unrecorded -= 1;
+            lacking.unrecorded += 1;
+        } else {
+            return false;
+        }
+        true
+    }
+}
+
+/// Takes in what a message tells of whether its cell has taken any joints yet.
+pub(super) fn take_first_joints(untouched: &mut BTreeMap<CellId, Epoch>, message: &Message) {
+    if let Message::Torque { from, .. } = *message {
+        untouched.remove(&from);
+    }
+    let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return };
+    match page {
+        NetworkPage::Heard(Heard { joints: 0, joints_late: 0, .. }) => {
+            untouched.insert(cell, epoch);
+        }
+        NetworkPage::Heard(_) => {
+            untouched.remove(&cell);
+        }
+        NetworkPage::Heartbeat(_)
+        | NetworkPage::Tree(_)
+        | NetworkPage::Refused(_)
+        | NetworkPage::Ports(_) => {
+            if untouched.get(&cell).is_some_and(|said| *said != epoch) {
+                untouched.remove(&cell);
+            }
+        }
+    }
+}
+
 /// Whether the recording says why it has no such reply.
 pub(super) fn excuse_extra(
     lacking: &mut Lacking,
     excuse: Option<&mut Excuse>,
-    nanos: u64,
+    (cell, round): (CellId, &Round),
     is_last: bool,
     now: [i16; WORDS],
 ) -> bool {
+    let may_answer = round.may_answer(cell);
     let Some(excuse) = excuse else {
         // A cell that the recording does not have.
         lacking.silent += 1;
@@ -268,11 +436,15 @@ pub(super) fn excuse_extra(
     if cell.measured {
         return true;
     }
-    if cell.is_silent_at(nanos) {
+    let is_counted = cell.is_counted_at(round.nanos);
+    if cell.is_silent_at(round.nanos) {
         lacking.silent += 1;
+    } else if is_last && !is_counted {
+        lacking.ended += 1;
+    } else if may_answer && !is_counted {
+        lacking.uncounted += 1;
     } else if cell.untaken > 0 {
         cell.untaken -= 1;
-        excuse.ended_earlier = now == [0; WORDS];
         lacking.untaken += 1;
     } else if cell.unrecorded > 0 {
         cell.unrecorded -= 1;
@@ -282,5 +454,7 @@ pub(super) fn excuse_extra(
     } else {
         return false;
     }
+    // Counters say how many, and not which: whatever it is that is lacking, the end may have been said later then.
+    excuse.ended_earlier = now == [0; WORDS];
     true
 }

@@ -10,11 +10,12 @@
 //! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus each
 //! for itself. Rounds of joints are judged when 100 more have been sent, or at the end.
 
+mod close;
 mod lane;
 mod sums;
 mod tally;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State as Flags};
@@ -22,9 +23,9 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
 pub use lane::Present;
-use lane::{Answers, Asked, Both, Fate, Lane, Pair, Round, excuse_extra};
+use lane::{Asked, Both, Fate, Lane, Pair, take_first_joints};
 pub use sums::Own;
-use sums::{Outcome, Side, Sum, Why, compare};
+use sums::{Side, Sum};
 pub use tally::{Lacking, Tally};
 
 use super::difference::{Difference, How, Said, What, When};
@@ -71,26 +72,21 @@ impl Judge {
     /// Takes in that the capture has joints next; returns the number of their round on their bus, if they will be
     /// sent.
     pub fn record_joints(&mut self, lane: usize, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
-        let lane = self.lanes.get_mut(lane)?;
-        let round = is_sent.then(|| {
-            lane.rounds.push_back(Round::new(epoch, nanos));
-            lane.base + lane.rounds.len() as u64 - 1
-        });
-        *lane.recorded.get_mut(usize::from(epoch.0))? = round;
-        round
+        self.lanes.get_mut(lane)?.record_joints(nanos, epoch, is_sent)
     }
 
-    /// Takes in a reply of the capture. `is_in_part` says whether it stands in the part that is replayed.
+    /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
     pub fn record(&mut self, lane: usize, message: &Message, is_in_part: bool) {
         let expects = self.expects;
         let (Some(lane), tally) = (self.lanes.get_mut(lane).filter(|_| expects), &mut self.tally) else {
             return;
         };
+        lane.record_state(message, is_in_part);
         if let (Message::Configured { from, tag, answer }, true) = (*message, is_in_part)
             && is_compared(answer)
+            && !lane.record_answer(from, tag, answer)
         {
-            let rounds = lane.base + lane.rounds.len() as u64;
-            lane.answers.entry(from).or_default().recorded.push_back((rounds, tag, answer));
+            tally.lacking.asked_earlier += 1;
         }
         match *message {
             Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Tree(tree) } => {
@@ -103,9 +99,10 @@ impl Judge {
             }
             Message::Sum { from, epoch, torque, count } => {
                 let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
-                let has_rounds = !lane.rounds.is_empty();
+                let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
                 match number.and_then(|number| lane.round(number)) {
                     Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
+                    None if is_in_part && is_earlier => tally.lacking.joints_earlier += 1,
                     None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
                     None => {}
                 }
@@ -127,19 +124,22 @@ impl Judge {
             | Message::Configured { .. }
             | Message::Stimulus { .. } => {}
         }
-        lane.record_first_joints(message);
+        take_first_joints(&mut lane.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && lane.untouched.get(&cell) == Some(&epoch) {
+        if what != What::Torque && lane.untouched.recorded.get(&cell) == Some(&epoch) {
             // Of no joints, even if joints of that epoch stood on the bus by then.
             return;
         }
         let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
         let measured = lane.excuses.get(&cell).is_some_and(|excuse| excuse.cell.measured);
-        let has_rounds = !lane.rounds.is_empty();
+        let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
         match number.and_then(|number| lane.round(number)) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
-            // Before the first joints of the part there are replies to those before it, and of sensors without any.
+            None if is_in_part && what == What::Torque && is_earlier => {
+                tally.lacking.joints_earlier += 1;
+            }
+            // Before the first joints there are replies of sensors without any.
             None if is_in_part && has_rounds && what == What::Torque => {
                 tally.lacking.joints_unrecorded += 1;
             }
@@ -149,9 +149,7 @@ impl Judge {
 
     /// Takes in that the capture begins anew: replies before its first joints answer none of the last pass.
     pub fn record_begin(&mut self) {
-        for lane in &mut self.lanes {
-            lane.recorded.fill(None);
-        }
+        self.lanes.iter_mut().for_each(Lane::begin);
     }
 
     /// Takes in that the capture has no more joints.
@@ -179,6 +177,7 @@ impl Judge {
             // Asked again, all cells say their sums again.
             round.sums.now.clear();
             round.asked_as = epoch;
+            round.asked += 1;
         }
         while self.lanes.get(lane).is_some_and(|lane| lane.base + WINDOW < number) {
             self.close_round(lane);
@@ -209,6 +208,7 @@ impl Judge {
     pub fn hear(&mut self, index: usize, message: &Message) {
         let Some(lane) = self.lanes.get_mut(index) else { return };
         lane.is_down = false;
+        take_first_joints(&mut lane.untouched.now, message);
         match *message {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
                 self.rival.get_or_insert(index);
@@ -251,6 +251,9 @@ impl Judge {
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let Some(lane) = self.lanes.get_mut(index) else { return };
+        if what != What::Torque && lane.untouched.now.get(&cell) == Some(&epoch) {
+            return;
+        }
         let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
         let Some((number, round)) =
             asked.and_then(|asked| asked.round).and_then(|number| Some((number, lane.round(number)?)))
@@ -262,7 +265,9 @@ impl Judge {
         match pair.now {
             None => pair.now = Some(words),
             // The same joints may be asked twice, and are then answered twice.
-            Some(before) if before == words || what != What::Torque => {}
+            Some(before) if before == words => {}
+            // The last word counts, as in the capture.
+            Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
                 let said = Said::Words { what, recorded: None, now: Some(words) };
@@ -393,157 +398,6 @@ impl Judge {
             When { joints, epoch: epoch.0, at_s }
         });
         self.first = Some(Difference { how, bus, cell, when, said });
-    }
-
-    fn close_round(&mut self, index: usize) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        let Some(round) = lane.rounds.pop_front() else { return };
-        let number = lane.base;
-        lane.base += 1;
-        if !self.expects || round.fate == Fate::Waiting {
-            return;
-        }
-        let is_last = lane.last_round == Some(number);
-        let at = Some((number, round.epoch, round.nanos));
-        for ((cell, what), &Pair { recorded, now }) in &round.replies {
-            let (cell, what) = (*cell, *what);
-            let Some(lane) = self.lanes.get_mut(index) else { return };
-            let excuse = lane.excuses.get_mut(&cell);
-            let said = Said::Words { what, recorded, now };
-            let how = match (recorded, now) {
-                (None, None) => continue,
-                (Some(recorded), Some(now)) => {
-                    if let (Some(excuse), What::Torque) = (excuse, what) {
-                        excuse.ended_earlier = false;
-                    }
-                    if recorded == now {
-                        self.tally.equal += 1;
-                        continue;
-                    }
-                    self.tally.different += 1;
-                    How::Different
-                }
-                (Some(_), None) if what != What::Torque && lane.senses => {
-                    self.tally.lacking.sensed_otherwise += 1;
-                    continue;
-                }
-                (Some(_), None) if round.fate == Fate::Unsent => {
-                    self.tally.not_asked += 1;
-                    How::Missing
-                }
-                (Some(recorded), None) => {
-                    let is_end = what == What::Torque && recorded == [0; WORDS];
-                    if let Some(excuse) = excuse.filter(|excuse| is_end && excuse.ended_earlier) {
-                        excuse.ended_earlier = false;
-                        self.tally.lacking.said_later += 1;
-                        continue;
-                    }
-                    self.tally.missing += 1;
-                    How::Missing
-                }
-                // Reports may be asked for by this replay.
-                (None, Some(_)) if what != What::Torque => continue,
-                (None, Some(now)) => {
-                    if excuse_extra(&mut self.tally.lacking, excuse, round.nanos, is_last, now) {
-                        continue;
-                    }
-                    self.tally.extra += 1;
-                    How::Extra
-                }
-            };
-            self.note(index, how, cell, at, said);
-        }
-        if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
-            self.close_sums(index, number, &round);
-        }
-        if let Some(lane) = self.lanes.get_mut(index) {
-            lane.trees.recorded.forget_before(number);
-            lane.trees.now.forget_before(number);
-        }
-    }
-
-    /// Compares what each cell itself put into its sums of a round.
-    fn close_sums(&mut self, index: usize, number: u64, round: &Round) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        let then = Side::new(&round.sums.recorded, &lane.trees.recorded, number);
-        let now = Side::new(&round.sums.now, &lane.trees.now, number);
-        let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
-        let is_last = lane.last_round == Some(number);
-        let mut notes = Vec::new();
-        for cell in cells {
-            let excuse = lane.excuses.get_mut(&cell);
-            let Tally { different, missing, extra, not_asked, lacking, .. } = &mut self.tally;
-            if excuse.as_ref().is_some_and(|excuse| excuse.cell.measured) {
-                lacking.measured += u64::from(round.sums.recorded.has(cell));
-                continue;
-            }
-            let (count, how) = match compare(&then, &now, cell) {
-                Outcome::Nothing => continue,
-                Outcome::Equal => {
-                    self.tally.equal += 1;
-                    self.tally.sums += 1;
-                    continue;
-                }
-                Outcome::Missing if round.fate == Fate::Unsent => (not_asked, How::Missing),
-                Outcome::LeftOut(_) if round.fate == Fate::Unsent => {
-                    *not_asked += 1;
-                    continue;
-                }
-                Outcome::LeftOut(why) => {
-                    *match why {
-                        Why::Changing => &mut lacking.parent_changing,
-                        Why::Unknown => &mut lacking.tree_unknown,
-                        Why::NotTaken => &mut lacking.sums_not_taken,
-                    } += 1;
-                    continue;
-                }
-                Outcome::Different => (different, How::Different),
-                Outcome::Missing => (missing, How::Missing),
-                // It had to go on then, or to say the end: it did not come to its slot in time.
-                Outcome::Extra if lane.speaking.contains(&cell) => {
-                    lacking.slot_missed += 1;
-                    continue;
-                }
-                // The words only say whether a contact has ended, which a sum does not tell.
-                Outcome::Extra if excuse_extra(lacking, excuse, round.nanos, is_last, [1; WORDS]) => continue,
-                Outcome::Extra => (extra, How::Extra),
-            };
-            *count += 1;
-            notes.push((how, cell, Said::Sums { recorded: then.own(cell), now: now.own(cell) }));
-        }
-        for (cell, count) in round.sums.recorded.counts() {
-            if count > 0 {
-                lane.speaking.insert(cell);
-            } else {
-                lane.speaking.remove(&cell);
-            }
-        }
-        for (how, cell, said) in notes {
-            self.note(index, how, cell, Some((number, round.epoch, round.nanos)), said);
-        }
-    }
-
-    /// Compares the answers to `configure`, in their order.
-    fn close_answers(&mut self, index: usize) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        for (cell, Answers { mut recorded, mut now }) in std::mem::take(&mut lane.answers) {
-            loop {
-                let recorded = recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
-                let now = now.pop_front();
-                let (count, how) = match (recorded, now) {
-                    (None, None) => break,
-                    (Some(recorded), Some(now)) if recorded == now => {
-                        self.tally.equal += 1;
-                        continue;
-                    }
-                    (Some(_), Some(_)) => (&mut self.tally.different, How::Different),
-                    (Some(_), None) => (&mut self.tally.missing, How::Missing),
-                    (None, Some(_)) => (&mut self.tally.extra, How::Extra),
-                };
-                *count += 1;
-                self.note(index, how, cell, None, Said::Answers { recorded, now });
-            }
-        }
     }
 }
 

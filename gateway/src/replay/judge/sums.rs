@@ -208,6 +208,15 @@ impl<'a> Side<'a> {
         Some(Own { sum, count, children, steps, cells })
     }
 
+    /// Whether what is left of a cell's sum cannot be its own, by whether it was touched: then its children were others
+    /// than their pages say. Where joints were asked again, sums of two times may be mixed too.
+    pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
+        self.own(cell).is_some_and(|own| {
+            let adds = own.cells == 0 && !own.is_nothing();
+            is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
+        })
+    }
+
     /// Whether a cell feels something itself.
     pub(super) fn feels(&self, cell: CellId) -> bool {
         self.own(cell).is_some_and(|own| own.cells > 0)

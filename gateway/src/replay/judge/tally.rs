@@ -30,12 +30,19 @@ pub struct Lacking {
     pub untaken: u64,
     /// The cell sent more packets than were recorded, by its own counters.
     pub unrecorded: u64,
-    /// The last joints of the recording: it ended before they were answered.
+    /// The last joints, or the last `configure`, of the recording: it ended before they were answered.
     pub ended: u64,
     /// The end of a contact, said later because the cell did not take the joints at which it was.
     pub said_later: u64,
+    /// Replies of touched cells, at joints for which no counters say how many the cell took: in a part of a recording
+    /// before the first report and after the last one.
+    pub uncounted: u64,
     /// Recorded replies whose joints were not recorded.
     pub joints_unrecorded: u64,
+    /// Recorded replies whose joints stood on the bus before the part began.
+    pub joints_earlier: u64,
+    /// Recorded answers to `configure` that was said before the part began.
+    pub asked_earlier: u64,
     /// Recorded replies of cells that measured: what they felt was not recorded.
     pub measured: u64,
     /// What cells felt, said without being asked at another time than now.

@@ -57,8 +57,10 @@ fn judged(recording: &[Message], now: &[Message]) -> Judge {
     }
     survey.finish();
     let cells = survey.buses[0].cells.clone();
-    judge.lanes[0].excuses =
-        cells.into_iter().map(|(node, cell)| (node, Excuse { cell, ended_earlier: false })).collect();
+    judge.lanes[0].excuses = cells
+        .into_iter()
+        .map(|(node, cell)| (node, Excuse { cell, ended_earlier: false, speaks: None }))
+        .collect();
     judge.mute(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {

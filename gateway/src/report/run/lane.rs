@@ -7,6 +7,7 @@ use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
 use super::{COLUMNS, GRAIN_S};
+use crate::capture::InForce;
 use crate::decode::{Decoded, Decoder};
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
@@ -117,14 +118,21 @@ impl Lane {
     }
 
     /// A frame that was on the bus before the recording began, and still says what holds.
-    pub(super) fn in_force(&mut self, nanos: u64, frame: &protocol::can::Frame) {
-        let own = matches!(
-            self.decoder.decode(Micros(nanos / 1_000), &self.name, frame),
-            Decoded::Message(
-                Message::Joints { .. } | Message::Stimulus { .. } | Message::Halt | Message::Resume
-            )
-        );
-        self.table.handle_frame(Micros(nanos / 1_000), own, frame, &mut |_| None);
+    pub(super) fn in_force(&mut self, before: &InForce) {
+        self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
+    }
+
+    /// The recording begins.
+    pub(super) fn begin(&mut self) {
+        self.table.begin_accounts();
+        self.open = self.table.newest().map(|(number, _, _)| Open {
+            number,
+            at: 0.0,
+            due: 0,
+            before: Account::default(),
+            errors: (0, 0.0),
+            slowest: None,
+        });
     }
 
     /// The next frame, `at` seconds after the recording's beginning.

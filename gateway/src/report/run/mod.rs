@@ -16,7 +16,7 @@ pub(crate) mod messages;
 mod motion;
 mod page;
 
-use std::path::Path;
+use std::path::PathBuf;
 
 use protocol::skin::{Bus, Skin};
 use protocol::wire_time::BitRatesError;
@@ -76,6 +76,8 @@ pub struct Report {
     pub page: Page,
     /// A sentence, when the recording is cut off or damaged.
     pub missing: Option<String>,
+    /// What the recording is called.
+    pub name: String,
 }
 
 /// How a report is asked for.
@@ -97,23 +99,26 @@ impl Options {
     }
 }
 
-/// Reads a recording and says what it holds.
+/// Reads a recording, or the parts of one, and says what it holds.
 ///
 /// # Errors
 /// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
-pub fn report(path: &Path, options: &Options) -> Result<Report, ReportError> {
-    let (run, broken) = read(path, options)?;
+pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
+    let (run, broken) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
-    Ok(Report { page, missing })
+    Ok(Report { page, missing, name: run.name })
 }
 
 /// Reads it all; also why it has no proper end, if it has none.
-fn read(path: &Path, options: &Options) -> Result<(Run, Option<String>), ReportError> {
-    let name = path.display().to_string();
-    let mut items = Items::open(path)?;
+fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
+    let mut items = Items::open_all(paths)?;
+    let name = items.name().to_owned();
+    let bytes =
+        |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
+    let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
     if items.format() == Format::Candump {
-        let empty = path.metadata().is_ok_and(|about| about.is_file() && about.len() == 0);
+        let empty = bytes == Some(0);
         return Err(if empty {
             ReportError::Foreign { name, what: "it is empty".to_owned() }
         } else {
@@ -121,7 +126,7 @@ fn read(path: &Path, options: &Options) -> Result<(Run, Option<String>), ReportE
         });
     }
     // What stands before the first message is known when it is open.
-    let mut run = Run::begin(&name, items.extras(), options)?;
+    let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
     let damaged = loop {
         match items.next() {
             Ok(Some(item)) => run.take(&item),
@@ -175,7 +180,7 @@ struct Run {
 }
 
 impl Run {
-    fn begin(name: &str, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
+    fn begin(name: &str, bytes: u64, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
         let Some(skin) = extras.skin() else {
             let why = extras.unfinished.as_ref().map_or_else(String::new, |why| format!(" ({why})"));
@@ -190,14 +195,15 @@ impl Run {
         for before in &extras.in_force {
             shadow.in_force(&before.bus, before.nanos, &before.frame);
             if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
-                lane.in_force(before.nanos, &before.frame);
+                lane.in_force(before);
             }
         }
+        lanes.iter_mut().for_each(Lane::begin);
         Ok(Self {
             topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
             motion: Motion::new(layout.joints.len()),
             name: name.to_owned(),
-            bytes: std::fs::metadata(name).map_or(0, |about| about.len()),
+            bytes,
             metadata: extras.metadata.clone(),
             skin,
             began: None,

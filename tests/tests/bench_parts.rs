@@ -1,0 +1,362 @@
+//! A recording cut anywhere: whole benches in virtual time, with cells that hang and come too late, and packets that
+//! are lost on their way to the recording. What is in force at a cut, and the frames from there
+//! on up to another one, are replayed to cells that were just started: they answer as it is recorded.
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
+
+use cell_node::node::{Flash, Identity, Node};
+use gateway::capture;
+use gateway::decode::{Decoded, Decoder};
+use gateway::explain::{Asked, Watch};
+use gateway::record::force::{InForce, Seen};
+use gateway::replay::judge::{Judge, Tally};
+use gateway::replay::reel::{Only, Reel, Role, Selection, Step};
+use gateway::replay::survey::{Part, Survey};
+use gateway::table::{Replies, Table};
+use protocol::can::{Format, Frame};
+use protocol::candump::{Direction, Record, Timestamp};
+use protocol::id::{CellId, Node as Address};
+use protocol::message::{From, Message, Request, SensorPage};
+use protocol::packet::Epoch;
+use protocol::parameters::Parameter;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skinbus_tests::bench::{Act, Bench, touch};
+use skinbus_tests::fault::{Fault, Harm, Party};
+use skinbus_tests::skins;
+
+const CELLS: u8 = 8;
+const SEEDS: u64 = 40;
+const BUS: &str = "vcan0";
+/// More epochs than half of all numbers.
+const EPOCHS: u64 = 190;
+
+/// What goes wrong while it is recorded.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Trouble {
+    None,
+    /// Cells hang for a while, torques come late, and some packets of cells are not in the recording.
+    Late,
+}
+
+/// What a recorder has of a bench in which cells are pressed and let go all the time.
+fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
+    bench.settle();
+    bench.act(Act::Say(Message::Resume));
+    bench.act(Act::Say(Message::Report));
+    bench.run(Span::from_millis(20));
+    bench.begin();
+    for epoch in 0..EPOCHS {
+        let place = rng.random_range(0..usize::from(CELLS));
+        let newtons = [0.0, 0.0, 0.05, 1.5, 4.0, 90.0][rng.random_range(0..6)];
+        let ahead = Epoch(u8::try_from((epoch + rng.random_range(0..6)) % 256).unwrap());
+        let from = if rng.random_ratio(1, 3) { From::Next } else { From::Epoch(ahead) };
+        // Of the last cells some are pressed once and for all.
+        if place < 5 || epoch % 60 == 7 {
+            bench.press_from(place, newtons, from);
+        }
+        if trouble == Trouble::Late {
+            match rng.random_range(0..40) {
+                0 => bench.act(Act::Hang(place)),
+                1..8 => (0..usize::from(CELLS)).for_each(|place| bench.act(Act::GoOn(place))),
+                11 => bench.act(Act::Say(if epoch % 2 == 0 { Message::Halt } else { Message::Resume })),
+                12 => {
+                    let page = SensorPage::Skin(touch(2.0));
+                    bench.act(Act::Inject(Message::Stimulus {
+                        to: Address::Everyone,
+                        from: From::Next,
+                        page,
+                    }));
+                }
+                13 => {
+                    let (number, words) = (Parameter::Mode.number(), [1, 0, 0, 0, 0, 0]);
+                    let to = Address::Cell(CellId::new(2).unwrap());
+                    let request = Request::Write { number, words };
+                    bench.act(Act::Inject(Message::Configure { to, tag: 9, request }));
+                }
+                14 => {
+                    let request = Request::Read { number: Parameter::Mount.number() };
+                    bench.act(Act::Inject(Message::Configure { to: Address::Everyone, tag: 7, request }));
+                }
+                _ => {}
+            }
+        }
+        if trouble == Trouble::Late && epoch == 20 {
+            bench.fault(
+                Fault::new(Harm::Delay(Span::from_millis(40)), 0.05)
+                    .of(protocol::id::Kind::Torque)
+                    .on_the_wire(),
+            );
+        }
+        bench.run_epochs(1);
+    }
+    (0..usize::from(CELLS)).for_each(|place| bench.act(Act::GoOn(place)));
+    bench.finish();
+    let is_recorded = |from: Party, rng: &mut Pcg64Mcg| {
+        trouble == Trouble::None
+            || from == Party::Gateway
+            || from == Party::Stranger
+            || !rng.random_ratio(1, 200)
+    };
+    let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| Seen {
+        at_nanos: (sent.at.0 + 1_000_000) * 1_000,
+        own: sent.from == Party::Gateway,
+        frame: sent.frame,
+    });
+    let seen = seen.collect();
+    (bench.skin, seen)
+}
+
+/// The first place from `at` on at which the recorder may begin another file, and what is in force there.
+fn cut(seen: &[Seen], at: usize) -> (usize, Vec<capture::InForce>) {
+    let mut force = InForce::default();
+    for (place, frame) in seen.iter().enumerate() {
+        if place >= at && !force.is_within_a_packet(frame.at_nanos) {
+            return (place, in_force(&force));
+        }
+        force.take(*frame);
+    }
+    (seen.len(), in_force(&force))
+}
+
+fn in_force(force: &InForce) -> Vec<capture::InForce> {
+    let frames = force.frames().into_iter();
+    let kept = |seen: Seen| capture::InForce {
+        bus: BUS.to_owned(),
+        own: seen.own,
+        frame: seen.frame,
+        nanos: seen.at_nanos,
+    };
+    frames.map(kept).collect()
+}
+
+fn record(seen: &Seen) -> Record<'static> {
+    let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
+    let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
+    Record { time, interface: BUS, frame: seen.frame, direction }
+}
+
+/// Cells that were just started, and what they say.
+struct Cells(Vec<Node>);
+
+impl Cells {
+    fn of(skin: &Skin) -> Self {
+        let format = skin.buses[0].format;
+        let started = |cell: &protocol::skin::Cell| {
+            let identity = Identity { cell: Some(cell.node), serial: cell.serial };
+            let mut node = Node::new(identity, format, &Flash::Sound(skin.parameters(cell)), true, Micros(0));
+            for _ in 0..2 {
+                node.handle_timeout(node.poll_timeout());
+                while node.poll_transmit().is_some() {}
+            }
+            node
+        };
+        Self(skin.cells.iter().map(started).collect())
+    }
+
+    /// All take a frame in time, and answer.
+    fn take(&mut self, frame: &Frame, judge: &mut Judge) {
+        for node in &mut self.0 {
+            node.handle_frame(Micros(300_000), Span(0), frame);
+            if node.poll_store().is_some() {
+                node.handle_stored(true);
+            }
+            while let Some(packet) = node.poll_transmit() {
+                judge.hear(0, &Message::decode(&packet).unwrap());
+            }
+        }
+    }
+
+    fn tell(&mut self, message: &Message, format: Format, judge: &mut Judge) {
+        message.encode().frames(format).for_each(|frame| self.take(&frame, judge));
+    }
+}
+
+/// What a replay of a part comes to, in lockstep.
+fn replayed(skin: &Skin, before: &[capture::InForce], part: &[Seen]) -> Judge {
+    let format = skin.buses[0].format;
+    let mut survey = Survey::new(Part::default());
+    survey.begin(before);
+    part.iter().for_each(|seen| survey.take(&record(seen)));
+    survey.finish();
+    let bus = &survey.buses[0];
+    let mut judge = Judge::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, true);
+    judge.record_begin();
+    bus.in_force.iter().for_each(|message| judge.record(0, message, false));
+    let selection =
+        Selection { only: Only::Inputs, pick: Default::default(), lanes: vec![Some(0)], reads: true };
+    let mut reel = Reel::new(&survey, &selection);
+    let (mut cells, mut steps) = (Cells::of(skin), Vec::new());
+    cells.tell(&Message::Report, format, &mut judge);
+    if !bus.state.is_fresh() {
+        let Step::Restore(states) = reel.restoring() else { unreachable!() };
+        for message in &states[0].1 {
+            if let Message::Joints { epoch, .. } = message {
+                judge.announce(0, None, *epoch);
+            }
+            cells.tell(message, format, &mut judge);
+        }
+    }
+    judge.mute(false);
+    for seen in part {
+        reel.take(&record(seen), &mut judge, |step| steps.push(step));
+    }
+    reel.end_pass(&mut judge, |step| steps.push(step));
+    judge.record_end();
+    for step in steps {
+        let Step::Frame(due) = step else { unreachable!() };
+        if let Role::Joints { epoch, round, .. } = due.role {
+            judge.announce(0, round, epoch);
+        }
+        cells.take(&due.frame, &mut judge);
+    }
+    judge.finish(true);
+    judge
+}
+
+/// Torques in a part.
+fn torques(part: &[Seen]) -> u64 {
+    let mut decoder = Decoder::new(None);
+    let is_torque = |seen: &&Seen| {
+        let decoded = decoder.decode(Micros(seen.at_nanos / 1_000), BUS, &seen.frame);
+        matches!(decoded, Decoded::Message(Message::Torque { .. }))
+    };
+    part.iter().filter(is_torque).count() as u64
+}
+
+#[test]
+fn a_recording_that_is_cut_anywhere_replays_from_there() {
+    let (mut equal, mut excused) = (0, 0);
+    for seed in 0..SEEDS {
+        let format = if seed % 3 == 2 { Format::Classic } else { Format::Fd };
+        let (skin, seen) = recorded(seed, format, Trouble::Late);
+        let whole = replayed(&skin, &[], &seen);
+        assert!(whole.tally().is_good(), "seed {seed}: {:#?} {:#?}", whole.tally(), whole.first());
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        for _ in 0..12 {
+            let (from, before) = cut(&seen, rng.random_range(0..seen.len() - 50));
+            let to = rng.random_range(from + 40..=seen.len());
+            let part = &seen[from..to];
+            let judge = replayed(&skin, &before, part);
+            let Tally { lacking, .. } = *judge.tally();
+            assert!(
+                judge.tally().is_good(),
+                "seed {seed}, {from} to {to} of {}: {:#?} {:#?}",
+                seen.len(),
+                judge.tally(),
+                judge.first()
+            );
+            // Each recorded torque is compared, or it is said why not.
+            let apart = lacking.joints_earlier + lacking.joints_unrecorded + lacking.said_later;
+            assert!(judge.tally().equal + apart >= torques(part), "{:#?}", judge.tally());
+            equal += judge.tally().equal;
+            excused += apart + lacking.uncounted + lacking.untaken + lacking.unrecorded;
+        }
+    }
+    assert!(
+        equal > 20 * SEEDS * 12 && excused > 0 && excused < equal / 4,
+        "{equal} equal, {excused} excused"
+    );
+}
+
+#[test]
+fn where_nothing_was_lost_or_late_nothing_is_excused() {
+    for seed in 100..112 {
+        let format = if seed % 2 == 0 { Format::Classic } else { Format::Fd };
+        let (skin, seen) = recorded(seed, format, Trouble::None);
+        for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
+            let (from, before) = cut(&seen, at);
+            // Up to the next joints: all that was asked is answered.
+            let is_joints = |seen: &&Seen| seen.frame.raw_id() == 1;
+            let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
+            let to = if at % 2 == 0 { seen.len() } else { (from + 400).min(last) };
+            let judge = replayed(&skin, &before, &seen[from..to]);
+            let tally = judge.tally();
+            assert!(tally.is_good(), "seed {seed}, {from} to {to}: {tally:#?} {:#?}", judge.first());
+            let mut lacking = tally.lacking;
+            assert!(
+                lacking.ended <= u64::from(CELLS) && lacking.joints_earlier <= u64::from(CELLS),
+                "{lacking:#?}"
+            );
+            (lacking.ended, lacking.joints_earlier) = (0, 0);
+            assert_eq!(lacking, Default::default(), "seed {seed}, {from} to {to}");
+        }
+    }
+}
+
+#[test]
+fn a_word_that_is_another_one_is_found_in_every_part() {
+    let (skin, mut seen) = recorded(7, Format::Fd, Trouble::Late);
+    let mut found = 0;
+    for at in (200..seen.len() - 200).step_by(97) {
+        let is_torque = |seen: &Seen| {
+            let packet = protocol::packet::Packet::from_fd(&seen.frame).ok()?;
+            let Ok(Message::Torque { torque, .. }) = Message::decode(&packet) else { return None };
+            (torque[0].to_bits() != 0).then_some(packet)
+        };
+        let Some((place, mut packet)) =
+            seen.iter().enumerate().skip(at + 60).find_map(|(place, seen)| Some((place, is_torque(seen)?)))
+        else {
+            continue;
+        };
+        let (from, before) = cut(&seen, at);
+        packet.words[0] += 1;
+        let kept = seen[place].frame;
+        seen[place].frame = packet.frames(Format::Fd).next().unwrap();
+        let judge = replayed(&skin, &before, &seen[from..]);
+        seen[place].frame = kept;
+        // Unless its joints came before the part.
+        let tally = judge.tally();
+        assert!(tally.different <= 1 && tally.missing + tally.extra == 0, "{tally:#?}");
+        found += tally.different;
+    }
+    assert!(found >= 8, "{found}");
+}
+
+#[test]
+fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
+    for seed in 200..210 {
+        let (skin, seen) = recorded(seed, Format::Fd, Trouble::None);
+        let frames_of = |from: usize, before: &[capture::InForce], asked: Asked| {
+            let (mut watch, mut decoder) = (Watch::new(&skin, asked), Decoder::new(None));
+            for kept in before {
+                if let Decoded::Message(message) =
+                    decoder.decode(Micros(kept.nanos / 1_000), BUS, &kept.frame)
+                {
+                    watch.begin(kept.nanos, BUS, &message);
+                }
+            }
+            for seen in &seen[from..] {
+                let decoded = decoder.decode(Micros(seen.at_nanos / 1_000), BUS, &seen.frame);
+                let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
+                watch.take(seen.at_nanos, BUS, message);
+            }
+            watch.moments().unwrap().remove(0).unwrap()
+        };
+        let (from, before) = cut(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
+        let asked = |epoch| Asked { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
+        for epoch in [160, 172, 185] {
+            let (whole, part) = (frames_of(0, &[], asked(epoch)), frames_of(from, &before, asked(epoch)));
+            assert_eq!(whole.at_ns, part.at_ns);
+            for (whole, part) in whole.cells.iter().zip(&part.cells) {
+                let felt = |cell: &gateway::explain::CellMoment| cell.felt.map(|(skin, _)| skin);
+                assert_eq!((felt(whole), whole.test_mode), (felt(part), part.test_mode), "epoch {epoch}");
+            }
+        }
+        let mut table = Table::new(&skin, 0);
+        let take = |table: &mut Table, own, nanos, frame: &Frame| {
+            table.handle_frame(Micros(nanos / 1_000), own, frame, &mut |_| None);
+        };
+        before.iter().for_each(|kept| take(&mut table, kept.own, kept.nanos, &kept.frame));
+        table.begin_accounts();
+        seen[from..].iter().for_each(|seen| take(&mut table, seen.own, seen.at_nanos, &seen.frame));
+        table.finish();
+        let all = Replies::total(table.cells().iter().map(|cell| cell.replies));
+        let lost: u64 = table.cells().iter().map(|cell| cell.uplink.lost).sum();
+        assert_eq!((all.missing, all.late, lost), (0, 0, 0), "seed {seed}: {all:#?}");
+        assert!(all.due > 50 && all.in_time == all.due, "{all:#?}");
+    }
+}
