@@ -100,15 +100,17 @@ impl Summary {
         self
     }
 
-    /// What is to be said of its end, a line each, the most important one last; nothing when all is well.
+    /// What is to be said of its end, a line each and the reason of its exit code last; nothing when all is well.
     #[must_use]
     pub fn complaints(&self) -> Vec<String> {
-        let lost = self.lost_buses().filter(|lost| self.failure.as_ref() != Some(lost));
+        // A run that failed has said which bus was lost.
+        let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
+        let lost = self.lost_buses().filter(|_| came_to_its_end);
         let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
             let Halted { at_s, epoch, reason, .. } = halted;
             format!(
-                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary has the ticks \
-                 before it"
+                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary FILE keeps \
+                 the ticks before it"
             )
         });
         [lost, halted, self.failure.clone()].into_iter().flatten().collect()

@@ -175,7 +175,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
     says("recover run.mcap.part -o there.mcap --force", 0);
     assert_eq!(messages(&fs::read(path("there.mcap")).unwrap()).len(), 40);
-    let itself = "gateway: -o whole.mcap is the recording itself: name another file";
+    let itself = "gateway: -o whole.mcap is a file that this command reads: name another file";
     assert_eq!(says("recover whole.mcap -o whole.mcap --force", 2), itself);
     assert!(
         says("recover a.zip", 1)

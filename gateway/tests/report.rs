@@ -72,7 +72,7 @@ fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_rea
     let exists = "-o run.html: it exists: name another file, or overwrite it with --force";
     assert_eq!(refuses(&folder, "run.mcap", 2), exists);
     let itself = refuses(&folder, "run.mcap -o run.mcap --force", 2);
-    assert_eq!(itself, "-o run.mcap is the recording itself: name another file");
+    assert_eq!(itself, "-o run.mcap is a file that this command reads: name another file");
     let rate = refuses(&folder, "run.mcap -o new.html --nominal fast", 2);
     assert!(rate.contains("--nominal") && rate.contains("not a bit rate"), "{rate}");
     assert_eq!(fs::read_to_string(folder.path().join("run.html")).unwrap(), "mine");

@@ -112,7 +112,12 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         ("shadow x.zip", 2, "gateway: x.zip is "),
         ("shadow .", 2, "gateway: . is a directory"),
         ("shadow nowhere", 2, "gateway: there is no file nowhere, and as a bus: "),
-        ("shadow run.log notes.txt", 2, "gateway: run.log, notes.txt: one file alone"),
+        ("shadow run.log notes.txt", 2, "gateway: run.log is no part of a recording: "),
+        (
+            "shadow run.log vcan0",
+            2,
+            "gateway: run.log, vcan0: one file, the parts of one recording, or buses",
+        ),
         ("shadow run.log --duration 3", 2, "gateway: --duration is for live buses"),
         ("shadow run.log --nominal 2M", 2, "gateway: nominal bit rate 2000000 bit/s: CAN allows"),
         ("shadow run.log --data 9M", 2, "gateway: data bit rate 9000000 bit/s: CAN FD allows"),

@@ -60,12 +60,15 @@ fn kill_again_and_again(seed: u64, times_killed: u32) -> Vec<f64> {
     older
 }
 
-/// `SKINBUS_KILLS` says how many in each of two threads.
+/// `SKINBUS_KILLS=50` kills more often.
 #[test]
 fn a_log_survives_its_writer_being_killed_at_any_moment() {
-    let kills = std::env::var("SKINBUS_KILLS").map_or(3, |kills| kills.parse().unwrap());
-    let threads: Vec<_> =
-        (0..2).map(|seed| std::thread::spawn(move || kill_again_and_again(seed, kills))).collect();
+    let kills: u32 = std::env::var("SKINBUS_KILLS").map_or(6, |kills| kills.parse().unwrap());
+    let threads: Vec<_> = [kills / 2, kills.div_ceil(2)]
+        .into_iter()
+        .zip(0..)
+        .map(|(kills, seed)| std::thread::spawn(move || kill_again_and_again(seed, kills)))
+        .collect();
     let mut older: Vec<_> = threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect();
     older.sort_by(f64::total_cmp);
     let [median, greatest] = [older[older.len() / 2], older[older.len() - 1]];
@@ -186,6 +189,33 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
         "gateway: -o results: there is something in it: name another folder, or overwrite files in it with --force"
     );
     assert_eq!(names(&place.path("results")), ["notes.txt"]);
+}
+
+#[test]
+fn no_command_overwrites_what_it_reads_whatever_it_is_told() {
+    let place = Place::new();
+    place.pressed();
+    place.write("in.log", "(1.000000) vcan0 123#11\n");
+    place.start("gateway", "convert in.log in.mcap").end().well();
+    let read = |name| fs::read(place.path(name)).unwrap();
+    let names = ["skin.toml", "scenario.toml", "in.log", "in.mcap"];
+    let before = names.map(read);
+    let run = "run skin.toml --scenario scenario.toml --bus-kind embedded --duration 0.1";
+    for (option, words, name) in [
+        ("--summary ", format!("{run} --summary"), "skin.toml"),
+        ("--candump ", format!("{run} --candump"), "./scenario.toml"),
+        ("--summary ", "replay in.mcap --bus-kind embedded --summary".to_owned(), "in.mcap"),
+        ("--summary ", "replay in.mcap --expect --spawn --skin skin.toml --summary".to_owned(), "skin.toml"),
+        ("", "convert in.log".to_owned(), "in.log"),
+        ("-o ", "recover in.mcap -o".to_owned(), "in.mcap"),
+        ("-o ", "report in.mcap -o".to_owned(), "in.mcap"),
+        ("-o ", "dbc skin.toml -o".to_owned(), "skin.toml"),
+    ] {
+        let ended = place.start("gateway", &format!("{words} {name} --force")).end();
+        let why = "is a file that this command reads: name another file";
+        assert_eq!(ended.refusal(2), format!("gateway: {option}{name} {why}"), "{words}");
+    }
+    assert!(names.map(read) == before);
 }
 
 #[test]

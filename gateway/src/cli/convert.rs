@@ -17,7 +17,7 @@ use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 
 use super::input::captures;
-use super::output::{Force, note, refused};
+use super::output::{Force, apart, note, refused};
 
 /// Lines that cannot be read and are named; further ones are counted.
 const NAMED: u64 = 100;
@@ -80,6 +80,7 @@ impl Convert {
         }
         let to = self.to.display();
         if !is_standard(&self.to) {
+            apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
             self.force.check("", &self.to)?;
         }
         let size = size(&self.from);

@@ -8,7 +8,7 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 
-use super::output::Force;
+use super::output::{Force, apart};
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
@@ -40,6 +40,7 @@ pub(crate) struct Dbc {
 impl Dbc {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
+        apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
         let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
         let bus = match (&self.bus, skin.buses.as_slice()) {

@@ -53,8 +53,35 @@ fn named(option: &str, path: &Path) -> String {
     format!("{option} {}", path.display()).trim_start().to_owned()
 }
 
+/// Sees that each file that is written, by its option, is a file of its own, and none that the command reads: `--force`
+/// does not mean that one.
+pub(crate) fn apart<'a>(
+    written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
+    read: impl IntoIterator<Item = &'a Path>,
+) -> Result<(), Failure> {
+    // Two names may be one terminal.
+    let is_stream = |path: &Path| fs::metadata(path).is_ok_and(|about| !about.is_file() && !about.is_dir());
+    let read: Vec<_> = read.into_iter().map(place).collect();
+    let mut before = Vec::new();
+    for (option, path) in written {
+        let Some(path) = path.filter(|path| !is_stream(path)) else { continue };
+        let there = place(path);
+        if read.contains(&there) {
+            let name = named(option, path);
+            return Err(Failure::usage(format!(
+                "{name} is a file that this command reads: name another file"
+            )));
+        }
+        if let Some((other, _)) = before.iter().find(|(_, place)| *place == there) {
+            return Err(Failure::usage(format!("{option} and {other} name the same file: name two")));
+        }
+        before.push((option, there));
+    }
+    Ok(())
+}
+
 /// Where a name leads: two names of one file are the same, whether it is there or not.
-pub(crate) fn place(path: &Path) -> PathBuf {
+fn place(path: &Path) -> PathBuf {
     let folder =
         path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let inside = || Some(fs::canonicalize(folder).ok()?.join(path.file_name()?));

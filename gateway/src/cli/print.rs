@@ -60,12 +60,12 @@ impl Rows {
 }
 
 fn rows(summary: &Summary) -> Rows {
-    let ended = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
-        Some(halted) => format!("halted at {:.3} s", halted.at_s),
-        None => summary.outcome.to_string(),
+    let cells = format!("{} cells, {:.1} s", summary.cells, summary.duration_s);
+    let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
+        Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
+        None => (format!("{cells}, {}", summary.outcome), String::new()),
     };
-    let cells = format!("{} cells, {:.1} s, {ended}", summary.cells, summary.duration_s);
-    let mut rows = Rows::new([summary.skin.clone(), cells, String::new()]);
+    let mut rows = Rows::new([summary.skin.clone(), cells, ended]);
     halts(&mut rows, summary);
     accuracy(&mut rows, summary);
     control(&mut rows, summary);

@@ -8,7 +8,7 @@ use gateway::record::recover::RecoverError;
 use gateway::record::{names, repair};
 use protocol::usage::{Failure, print};
 
-use super::output::{Force, place};
+use super::output::{Force, apart};
 
 /// Make a recording whole that ends in the middle
 ///
@@ -36,9 +36,7 @@ impl Recover {
         }
         let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
         let out = output.display();
-        if place(&output) == place(&self.file) {
-            return Err(Failure::usage(format!("-o {out} is the recording itself: name another file")));
-        }
+        apart([("-o", Some(output.as_path()))], [self.file.as_path()])?;
         self.force.check("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {

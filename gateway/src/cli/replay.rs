@@ -16,7 +16,7 @@ use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
-use super::output::{self, Force};
+use super::output::{self, Force, apart};
 use super::print::Rows;
 
 /// Bytes for frames that wait: all cells may answer a report at once.
@@ -155,6 +155,8 @@ fn speed(text: &str) -> Result<f64, String> {
 impl Replay {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let options = self.options()?;
+        let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
+        apart([("--summary", self.summary.as_deref())], read)?;
         // Before the replay: nobody wants to hear after an hour that there is nowhere to write.
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
         let failure = |error: RunError| Failure::with_code(error.exit_code(), error);

@@ -10,7 +10,7 @@ use gateway::report::{figure::Page, page, svg};
 use protocol::usage::{Failure, print};
 use protocol::wire_time::bit_rate;
 
-use super::output::{Force, note, place};
+use super::output::{Force, apart, note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -80,12 +80,7 @@ impl Report {
 
     /// What is there is not overwritten unless that is asked for.
     fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
-        let name = path.display();
-        if self.files.iter().any(|file| place(file) == place(path)) {
-            return Err(Failure::usage(format!(
-                "{option} {name} is the recording itself: name another file"
-            )));
-        }
+        apart([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
         self.force.check(option, path)
     }
 }

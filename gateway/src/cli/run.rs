@@ -22,7 +22,7 @@ use protocol::usage::{Failure, quoted};
 use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::buses::Buses;
-use super::output::{self, Force, note, place};
+use super::output::{self, Force, apart, note};
 use super::print;
 use super::programs::Programs;
 
@@ -232,7 +232,7 @@ impl Demo {
         let candump = Some(Candump { path, numbered });
         let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
         options.record = recording.options(candump, &options.skin, texts.0, texts.1)?;
-        bench(&options, summary.as_deref(), recording.force)
+        bench(&options, summary.as_deref(), recording.force, &[])
     }
 }
 
@@ -247,6 +247,7 @@ impl Run {
             (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
             _ => Scenario::idle(IDLE),
         };
+        let read: Vec<_> = [Some(self.skin.clone()), self.scenario.clone()].into_iter().flatten().collect();
         // What can be read once only is read by the cells from memory.
         let (_file, skin_file) = if self.skin.is_file() {
             (None, self.skin)
@@ -268,7 +269,7 @@ impl Run {
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;
-        bench(&options, summary.as_deref(), recording.force)
+        bench(&options, summary.as_deref(), recording.force, &read)
     }
 }
 
@@ -296,16 +297,18 @@ impl Common {
     }
 }
 
-fn bench(options: &Options, summary_file: Option<&Path>, force: Force) -> Result<(), Failure> {
-    let recorded = [
+fn bench(
+    options: &Options,
+    summary_file: Option<&Path>,
+    force: Force,
+    read: &[PathBuf],
+) -> Result<(), Failure> {
+    let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
         ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
+        ("--summary", summary_file),
     ];
-    let same =
-        |path: Option<&Path>| path.zip(summary_file).is_some_and(|(one, other)| place(one) == place(other));
-    if let Some((option, _)) = recorded.iter().find(|(_, path)| same(*path)) {
-        return Err(Failure::usage(format!("--summary and {option} name the same file: name two")));
-    }
+    apart(written, read.iter().map(PathBuf::as_path))?;
     // Before the run: nobody wants to hear after an hour that there is nowhere to write.
     let json = summary_file.map(|path| force.create("--summary", path)).transpose()?;
     // What it says of its own end is not lost with the program.

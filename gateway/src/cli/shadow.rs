@@ -113,6 +113,7 @@ impl ShadowCommand {
         let files = self.sources.iter().filter(|source| is_file(source)).count();
         let name =
             self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
+        let mut title = name.clone();
         let (mut shadow, taken) = match self.sources.as_slice() {
             sources if files == sources.len() => {
                 if self.duration.is_some() {
@@ -127,6 +128,7 @@ impl ShadowCommand {
                     )));
                 }
                 let reader = captures(sources, |file| Box::new(file))?;
+                reader.name().clone_into(&mut title);
                 let mut shadow = self.shadow(skin.or_else(|| attached(reader.name(), &reader)))?;
                 for before in &reader.extras().in_force {
                     shadow.in_force(&before.bus, before.nanos, &before.frame);
@@ -156,7 +158,7 @@ impl ShadowCommand {
             }
         }
         if !self.json && report.frames > 0 {
-            print(&show::text(&name, taken.what, taken.missing, &report))?;
+            print(&show::text(&title, taken.what, taken.missing, &report))?;
         }
         taken.ended.map_or(Ok(()), Err)
     }

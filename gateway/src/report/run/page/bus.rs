@@ -220,7 +220,7 @@ impl Draft<'_> {
                     wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
         let assumed = self.run.lanes.iter().any(|lane| !lane.rates.is_chosen);
         let assumed = assumed.then(|| {
-            "The skin has no bit rates for every bus, so common ones are taken and not judged.".to_owned()
+            "The skin has no bit rates for every bus, so common ones are shown, for information.".to_owned()
         });
         Section {
             name: "load".to_owned(),
