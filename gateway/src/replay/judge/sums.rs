@@ -149,6 +149,8 @@ pub(super) struct Side<'a> {
     sums: &'a Sums,
     children: BTreeMap<u8, Vec<CellId>>,
     affected: BTreeSet<CellId>,
+    /// Of cells that changed it: all parents that are remembered.
+    parents: BTreeMap<CellId, BTreeSet<u8>>,
     /// Whether it is known of all whose children they are.
     is_known: bool,
 }
@@ -185,7 +187,9 @@ impl<'a> Side<'a> {
             }
         }
         let is_known = sums.cells().all(|cell| trees.parent(cell, round).is_some());
-        Self { sums, children, affected: trees.affected(round), is_known }
+        let parents = trees.0.iter().filter(|(_, steps)| steps.len() > 1);
+        let parents = parents.map(|(cell, steps)| (*cell, steps.iter().filter_map(|it| it.parent).collect()));
+        Self { sums, children, affected: trees.affected(round), parents: parents.collect(), is_known }
     }
 
     fn children(&self, cell: CellId) -> &[CellId] {
@@ -236,6 +240,31 @@ impl<'a> Side<'a> {
         adds_up && !self.children(cell).iter().any(silent)
     }
 
+    /// Whether what a cell said has more in it than on the other side, and that is the sum of a cell which is or was its
+    /// child, but by its page is not in this epoch: pages come after the change that they tell of. It may be in no other
+    /// sum then.
+    fn holds_a_mover(&self, cell: CellId, other: &Self) -> bool {
+        let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
+        let Some((own, its)) = own_of(cell) else { return false };
+        let adds = |sum: &Sum| {
+            let words = own.steps.iter().zip(&its.steps).zip(sum.torque);
+            let mut words =
+                words.filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - exact(word)?));
+            own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.abs() <= 1)
+        };
+        let is_elsewhere = |mover: &CellId| {
+            let parent = self.children.iter().find(|(_, children)| children.contains(mover));
+            let parent = parent.and_then(|(parent, _)| CellId::new(i64::from(*parent)).ok());
+            parent.and_then(own_of).is_some_and(|(own, its)| own.cells >= its.cells)
+        };
+        self.parents.iter().any(|(mover, parents)| {
+            parents.contains(&cell.get())
+                && !self.children(cell).contains(mover)
+                && self.sums.0.get(mover).is_some_and(|sum| sum.count > 0 && adds(sum))
+                && !is_elsewhere(mover)
+        })
+    }
+
     /// The cells in a cell's sum, by the tree.
     fn below(&self, cell: CellId) -> BTreeSet<CellId> {
         let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
@@ -276,7 +305,13 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outc
                     (Some(own), Some(it)) => own.abs_diff(*it) <= 1,
                     (None, _) | (_, None) => alike(*sum, *other),
                 });
-            if same { Outcome::Equal } else { Outcome::Different }
+            if same {
+                Outcome::Equal
+            } else if now.holds_a_mover(cell, recorded) || recorded.holds_a_mover(cell, now) {
+                Outcome::LeftOut(Why::NotTaken)
+            } else {
+                Outcome::Different
+            }
         }
         (Some(then), None) if then.cells > 0 => Outcome::Missing,
         (None, Some(today)) if today.cells > 0 => Outcome::Extra,
@@ -386,6 +421,41 @@ mod tests {
         // Nobody knows whose child the third is.
         today.1.0.remove(&cell(3));
         assert_eq!(outcomes(&then, &today, 4), [Outcome::LeftOut(Why::Unknown); 4]);
+    }
+
+    #[test]
+    fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice() {
+        // The third goes to the second by its page, and to the first in fact.
+        let felt = vec![None, words(20), words(30), None];
+        let then = sums(&felt, &[0, 1, 1, 0]);
+        let mut today = sums(&felt, &[0, 1, 1, 0]);
+        today.1.0.remove(&cell(3));
+        let left_out = Outcome::LeftOut(Why::NotTaken);
+        for (parents, counted_twice, expected) in [
+            (&[2, 1][..], false, left_out),
+            (&[2], false, Outcome::Different),
+            (&[2, 4], false, Outcome::Different),
+            (&[2, 1], true, Outcome::Different),
+        ] {
+            let mut today = (Sums(today.0.0.clone()), Trees::default());
+            for number in 1..=4 {
+                today.1.say(cell(number), Some([0, 1, 2, 0][usize::from(number) - 1]), 0);
+            }
+            for (parent, since) in parents.iter().zip([0, 9]) {
+                today.1.say(cell(3), Some(*parent), since);
+            }
+            if counted_twice {
+                for (number, count) in [(1, 3), (2, 2)] {
+                    let sum = today.0.0.get_mut(&cell(number)).unwrap();
+                    sum.count = count;
+                    sum.torque = std::array::from_fn(|word| {
+                        let [second, third] = [1, 2].map(|at: usize| felt[at].unwrap()[word]);
+                        Q7_8::from_bits(second + third * (i16::from(count) - 1))
+                    });
+                }
+            }
+            assert_eq!(outcomes(&then, &today, 1)[0], expected, "{parents:?}, {counted_twice}");
+        }
     }
 
     #[test]
