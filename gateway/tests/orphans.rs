@@ -27,8 +27,7 @@ fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
 fn left(folder: &TempDir, name: &str) {
     let (_, mut file) = Part::create(folder.path().join(name)).unwrap();
     let there = usize::try_from(file.metadata().unwrap().len()).unwrap();
-    let inode = file.metadata().unwrap().ino();
-    let bytes = begun(FileWriter::in_file(Vec::new(), inode).unwrap());
+    let bytes = begun(FileWriter::in_file(Vec::new(), &file.metadata().unwrap()).unwrap());
     file.write_all(&bytes[there..]).unwrap();
 }
 
@@ -88,6 +87,12 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     let ours = fs::read(path("copy.mcap.part")).unwrap();
     fs::rename(path("copy.mcap.part"), away.path().join("original")).unwrap();
     fs::write(path("copy.mcap.part"), &ours).unwrap();
+    // A copy that has got the inode of the one that it was made from, which is gone.
+    left(&folder, "again.mcap");
+    let mut again = fs::read(path("again.mcap.part")).unwrap();
+    let born = again.windows(7).position(|bytes| bytes == b"born_ns").unwrap();
+    again[born + 11] = if again[born + 11] == b'1' { b'2' } else { b'1' };
+    fs::write(path("again.mcap.part"), again).unwrap();
     fs::write(path("download.mcap.part"), begun(FileWriter::new(Vec::new()).unwrap())).unwrap();
     fs::write(path("empty.mcap.part"), "").unwrap();
     fs::write(path("text.mcap.part"), "not even that").unwrap();
@@ -132,7 +137,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
         assert_eq!(lines.next(), None);
         why.split(';').next().unwrap().to_owned()
     };
-    for name in ["copy", "download", "empty", "text"] {
+    for name in ["again", "copy", "download", "empty", "text"] {
         assert_eq!(reason(name), "no run of this program has begun it here");
     }
     for name in ["folder", "pipe", "socket"] {
@@ -141,7 +146,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     assert_eq!(["link", "lost"].map(reason), ["it is a symlink", "it is a symlink"]);
     assert_eq!(reason("two"), "it has 2 names (hard links)");
     assert_eq!(reason("locked"), "another program is writing it");
-    assert_eq!(said.len(), 11);
+    assert_eq!(said.len(), 12);
     assert!(fs::symlink_metadata(path("pipe.mcap.part")).unwrap().file_type().is_fifo());
     // Under the name of one of them nothing is recorded.
     let (claimed, _) = claims(folder.path(), "download.mcap");

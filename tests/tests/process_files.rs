@@ -5,6 +5,7 @@
 mod process;
 
 use std::fs;
+use std::io::Read;
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -17,6 +18,8 @@ use protocol::fixed::Q1_14;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+use rustix::io::ioctl_fionread;
 use rustix::process::Signal;
 
 const RUN: &str = "run skin.toml --bus-kind embedded --scenario scenario.toml";
@@ -189,6 +192,34 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
         "gateway: -o results: there is something in it: name another folder, or overwrite files in it with --force"
     );
     assert_eq!(names(&place.path("results")), ["notes.txt"]);
+}
+
+#[test]
+fn a_log_into_a_pipe_whose_reader_stops_holds_no_run_that_is_told_to_end() {
+    let place = Place::new();
+    place.pressed();
+    let fifo = place.path("log.fifo");
+    mknodat(CWD, &fifo, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
+    let reader = fs::OpenOptions::new().read(true).write(true).open(&fifo).unwrap();
+    for (signal, summary) in [(Signal::INT, "int.json"), (Signal::TERM, "term.json")] {
+        let words = format!("{RUN} --duration 60 --quiet --candump log.fifo --summary {summary}");
+        let bench = place.start("gateway", &words);
+        // Nothing has room any more: for a second nothing came.
+        let (mut there, mut same) = (0, 0);
+        until("a full pipe", || {
+            let now = ioctl_fionread(&reader).unwrap();
+            same = if now == there && now > 20_000 { same + 1 } else { 0 };
+            there = now;
+            (same > 200).then_some(())
+        });
+        bench.signal(signal);
+        let ended = bench.end();
+        assert_eq!(ended.code(), Some(1), "{ended:#?}");
+        place.is_left_clean();
+        assert!(place.path(summary).exists());
+        let mut taken = vec![0; ioctl_fionread(&reader).unwrap().try_into().unwrap()];
+        (&reader).read_exact(&mut taken).unwrap();
+    }
 }
 
 #[test]

@@ -3,9 +3,10 @@
 //! The only place, beside [`super::recover`], that knows the crate `mcap` and the settings that a recording needs.
 
 use std::collections::BTreeMap;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Seek, Write};
 use std::os::unix::fs::MetadataExt;
+use std::time::UNIX_EPOCH;
 
 use mcap::records::{MessageHeader, op};
 use mcap::write::{Metadata, NoSeek};
@@ -37,15 +38,24 @@ pub fn options() -> WriteOptions {
 const MARK: &str = "recorder";
 /// The fact that says it.
 const INODE: &str = "inode";
+const BORN: &str = "born_ns";
 /// Who writes.
 const PROGRAM: &str = "skinbus ";
+
+/// What tells a file from a copy of it: its inode, and since inodes are used again, when it was made, where the file
+/// system knows that.
+fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
+    let born = about.created().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
+    let born = born.map(|born| (BORN.to_owned(), born.as_nanos().to_string()));
+    [(INODE.to_owned(), about.ino().to_string())].into_iter().chain(born).collect()
+}
 
 /// What a recording's file begins with: that it is ours, and not a copy of ours.
 ///
 /// # Errors
 /// Never, into memory.
-pub fn mark(inode: u64) -> io::Result<Vec<u8>> {
-    let mut writer = FileWriter::in_file(Vec::new(), inode)?;
+pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
+    let mut writer = FileWriter::in_file(Vec::new(), about)?;
     writer.flush()?;
     Ok(writer.into_inner())
 }
@@ -55,7 +65,7 @@ pub fn mark(inode: u64) -> io::Result<Vec<u8>> {
 /// # Errors
 /// When it cannot be read.
 pub fn is_marked(file: &mut File) -> io::Result<bool> {
-    let inode = file.metadata()?.ino().to_string();
+    let wanted = identity(&file.metadata()?);
     file.rewind()?;
     let mut from = Source::new(file, 0);
     if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
@@ -69,7 +79,9 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
         return Ok(false);
     }
     Ok(match parse(op::METADATA, from.body()) {
-        Ok(Record::Metadata { name, facts }) => name == MARK && facts.get(INODE) == Some(&inode),
+        Ok(Record::Metadata { name, facts }) => {
+            name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value))
+        }
         _ => false,
     })
 }
@@ -117,9 +129,9 @@ impl<W: Write> FileWriter<W> {
     ///
     /// # Errors
     /// See above.
-    pub fn in_file(out: W, inode: u64) -> io::Result<Self> {
+    pub fn in_file(out: W, about: &fs::Metadata) -> io::Result<Self> {
         let mut writer = Self::new(out)?;
-        writer.metadata(MARK, &BTreeMap::from([(INODE.to_owned(), inode.to_string())]))?;
+        writer.metadata(MARK, &identity(about))?;
         Ok(writer)
     }
 

@@ -135,6 +135,10 @@ impl Part {
 /// Why a recording cannot begin under a name.
 fn why_taken(path: &Path) -> String {
     let name = path.display();
+    // A pipe is not opened: whoever waits at its other end would take that for a reader.
+    if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
+        return format!("{name} is there and is no regular file: move it away, or record to another name");
+    }
     match opened(path) {
         Ok(file) if !is_held(&file) => format!(
             "{name} is there, and no run that was killed has left it: move it away, or record to another name"
@@ -168,8 +172,8 @@ fn named(path: &Path) -> io::Result<File> {
 /// Holds a file, and makes it ours for whoever finds it later.
 fn claim(file: &mut File) -> io::Result<()> {
     hold(file)?;
-    let inode = file.metadata()?.ino();
-    file.write_all(&file::mark(inode)?)
+    let about = file.metadata()?;
+    file.write_all(&file::mark(&about)?)
 }
 
 fn identity(about: &fs::Metadata) -> (u64, u64) {

@@ -224,7 +224,10 @@ impl<W: Write> Copy<W> {
         }
         chunk.rewind();
         while let Some((code, body)) = chunk.next() {
-            self.record(code, body)?;
+            // Nothing else belongs into a chunk.
+            if matches!(code, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
+                self.record(code, body)?;
+            }
         }
         Ok(())
     }

@@ -7,7 +7,6 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -241,9 +240,9 @@ impl<T> Series<T> {
         topics: impl FnOnce(&mut Writer) -> io::Result<T>,
     ) -> io::Result<Open<T>> {
         let begin = || {
-            let inode = file.metadata()?.ino();
+            let about = file.metadata()?;
             let (sink, gauge) = Sink::new(file, &folder_of(&part.path))?;
-            let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), inode)?;
+            let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), &about)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
             writer.flush()?;

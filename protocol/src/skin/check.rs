@@ -17,6 +17,8 @@ type Checked<T> = Result<T, Fault>;
 
 /// How far a quaternion's length may be from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
+/// Buses of a skin.
+const BUSES: usize = 64;
 /// Metres that words in Q1.14 can hold, less some steps for what a chain of roundings adds.
 const REACH: f64 = 2.0 - 1e-3;
 
@@ -221,6 +223,10 @@ fn contact(at: &[Step], raw: raw::Contact, base: Contact) -> Checked<Contact> {
 fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
     if raw.is_empty() {
         return Err(Fault::new(&[Key("bus")], "[]", "at least one bus is needed"));
+    }
+    if raw.len() > BUSES {
+        let why = format!("a skin has at most {BUSES} buses");
+        return Err(Fault::new(&[Key("bus")], format!("{} buses", raw.len()), why));
     }
     let mut seen = HashSet::new();
     raw.iter()

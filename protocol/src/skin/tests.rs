@@ -326,3 +326,17 @@ fn thresholds_of_events_have_defaults_and_fit_their_words() {
          `acceleration_g`, `hysteresis`"
     );
 }
+
+#[test]
+fn a_skin_has_at_most_64_buses() {
+    let (head, cells) = GOOD.split_once("[controller]").unwrap();
+    let with = |buses: usize| {
+        let more: String = (1..buses)
+            .map(|at| format!("[[bus]]\nname = \"vcan{at}\"\nreply = \"torque\"\nformat = \"fd\"\n\n"))
+            .collect();
+        Skin::parse("skin.toml", &format!("{head}{more}[controller]{cells}"))
+    };
+    assert_eq!(with(64).unwrap().buses.len(), 64);
+    let error = with(65).unwrap_err().to_string();
+    assert!(error.contains("65 buses") && error.contains("a skin has at most 64 buses"), "{error}");
+}

@@ -176,7 +176,7 @@ impl Lane {
         };
         let took = now.since(opened).0;
         latency.greatest = latency.greatest.max(took);
-        latency.sum += took;
+        latency.sum = latency.sum.saturating_add(took);
         latency.count += 1;
         if let Some(open) = &mut self.open {
             open.slowest = open.slowest.max(Some(took));

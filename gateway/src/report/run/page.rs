@@ -117,7 +117,7 @@ impl Draft<'_> {
         if motion.seconds() > 0.0 {
             let hertz =
                 |count: u64, seconds: f64| Quantity::new(count.saturating_sub(1) as f64 / seconds, "Hz");
-            let loop_hz = hertz(motion.ticks + motion.unrecorded, motion.seconds());
+            let loop_hz = hertz(motion.ticks.saturating_add(motion.unrecorded), motion.seconds());
             findings
                 .push(Finding::told("control loop", loop_hz).beside(Quantity::new(PAPER_CONTROL_HZ, "Hz")));
             let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);

@@ -6,6 +6,7 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use protocol::stop::Stoppable;
 use rustix::fs::{Access, FlockOperation, OFlags, access, flock};
 
 use super::target::{Target, exists, folder_of, open_stream, part_of, sync_folder, with_remedy};
@@ -28,7 +29,7 @@ enum State {
     /// Another file, which is overwritten with the first line; held until then, and afterwards.
     Old(File),
     /// What is no regular file has no length and no lock.
-    Stream(File),
+    Stream(Stoppable<File>),
 }
 
 impl LogFile {
@@ -38,7 +39,7 @@ impl LogFile {
     /// When it cannot be written, and what to do.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let state = match Target::of(path, force) {
-            Ok(Target::Stream) => State::Stream(open_stream(path, stopped)?),
+            Ok(Target::Stream) => State::Stream(Stoppable::new(open_stream(path, stopped)?)),
             Ok(Target::New) => State::Ours(begin(path)?),
             Ok(Target::Old) => {
                 // A link that took its place meanwhile is not followed.
@@ -109,8 +110,10 @@ impl LogFile {
         if let State::Old(_) = &self.state {
             self.state = State::Ours(self.take_place()?);
         }
-        let (State::Ours(file) | State::Old(file) | State::Stream(file)) = &mut self.state;
-        let written = file.write_all(lines.as_bytes());
+        let written = match &mut self.state {
+            State::Ours(file) | State::Old(file) => file.write_all(lines.as_bytes()),
+            State::Stream(stream) => stream.write_all(lines.as_bytes()),
+        };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
             // A part of a line would be no line. If that fails too, nothing more can be done.
