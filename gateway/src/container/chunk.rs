@@ -13,7 +13,7 @@ const FREE_BYTES: u64 = 256 << 20;
 /// What may come out of a byte of the file, besides.
 const BYTES_A_BYTE: u64 = 1_000;
 /// Records that may come out of a file's chunks in all, whatever its length.
-const FREE_RECORDS: u64 = 1 << 18;
+const FREE_RECORDS: u64 = 1 << 17;
 /// Records that may come out of a byte of the file, besides; each should cost its entry in an index, 16 bytes.
 const RECORDS_A_BYTE: u64 = 1;
 /// Bytes of a record in a chunk beside its own.
