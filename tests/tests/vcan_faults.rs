@@ -276,7 +276,8 @@ fn a_gateway_after_one_that_was_killed_goes_on_with_the_next_epoch_on_cells_that
     place.guest().waits_for_epoch(20);
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
-    assert_eq!(place.files(), ["candump.log", "scenario.toml", "skin.toml"], "nothing half done is left");
+    let left = ["candump.log", "run.log", "scenario.toml", "skin.toml"];
+    assert_eq!(place.files(), left, "its log is there, and nothing half done");
     place.bench(3.0, "--no-spawn").end().well();
     let summary = place.summary();
     summary.adds_up();
