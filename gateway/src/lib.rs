@@ -25,6 +25,7 @@ pub mod ros2;
 pub mod run;
 pub mod scenario;
 pub mod shadow;
+pub mod signals;
 mod stimuli;
 pub mod summary;
 pub mod table;

@@ -4,26 +4,23 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::os::fd::AsFd;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use gateway::capture::Reader;
+use gateway::signals::caught;
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use signal_hook::consts::{SIGINT, SIGTERM};
 
 /// How long a signal to end may wait, when nothing comes.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
 
 /// A flag that SIGINT and SIGTERM set.
 pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
-    let stopped = Arc::clone(stop::flag());
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stopped))
-            .map_err(|error| Failure::run(format!("cannot catch signal {signal}: {error}")))?;
-    }
-    Ok(stopped)
+    caught(&[SIGINT, SIGTERM]).map_err(Failure::run)
 }
 
 /// Opens a capture, standard input or the parts of a recording, so that its reader can be told to stop. Signals are caught
@@ -32,10 +29,11 @@ pub(crate) fn captures(
     sources: &[PathBuf],
     through: impl Fn(Interruptible) -> Box<dyn Read + Send> + Send + 'static,
 ) -> Result<Reader, Failure> {
+    let flag = OnceLock::new();
     let interruptible = move |file| {
-        // Where signals cannot be caught they end the program at once.
-        let stopped = stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
-        through(Interruptible { file, stopped })
+        // Once, however many parts there are. Where signals cannot be caught they end the program at once.
+        let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
+        through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     if let [one] = sources
         && one.as_os_str() == "-"

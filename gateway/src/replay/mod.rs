@@ -39,13 +39,13 @@ use std::time::Duration;
 use hdrhistogram::Histogram;
 use protocol::bus::Kinds;
 use protocol::id::CellId;
-use protocol::stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
 use crate::decode::pick::Pick;
 use crate::decode::stats::BUSES;
 use crate::run::{RunError, realtime};
+use crate::signals::caught;
 use crate::summary::histogram;
 use judge::Judge;
 use player::Pace;
@@ -130,11 +130,7 @@ pub fn replay(options: &Options) -> Result<Summary, RunError> {
     let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
     let wearing = wearing.transpose()?;
     // Until now there was nothing that had to be put in order at an end.
-    let signalled = Arc::clone(stop::flag());
-    for signal in [SIGHUP, SIGINT, SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&signalled))
-            .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
-    }
+    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::Failed)?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;

@@ -13,7 +13,6 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Reply;
-use protocol::stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, ServedBus, open_or_serve, program};
@@ -33,6 +32,7 @@ use crate::record::series::Head;
 use crate::record::{Mcap, Outputs, Recorder, facts};
 use crate::robot::SimulatedArm;
 use crate::scenario::FaultKind;
+use crate::signals::caught;
 use crate::summary::{Quantiles, histogram};
 use crate::table::{Notice, Table};
 
@@ -91,11 +91,7 @@ pub(super) struct Bench<'a> {
 pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     refuse(options)?;
-    let signalled = Arc::clone(stop::flag());
-    for signal in [SIGHUP, SIGINT, SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&signalled))
-            .map_err(|error| RunError::Failed(format!("cannot catch signal {signal}: {error}")))?;
-    }
+    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::Failed)?;
     // A file that may have no more bytes is an error like others, and no end.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|error| RunError::Failed(format!("cannot catch signal {SIGXFSZ}: {error}")))?;
