@@ -35,8 +35,10 @@ fn place() -> TempDir {
 }
 
 fn start(folder: &Path, line: &str, stdout: Stdio) -> Child {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
-    command.args(line.split(' ')).current_dir(folder).env("SKINBUS_DIR", folder.join("bus"));
+    // A shell starts what it puts in the background with SIGINT ignored, and children inherit that.
+    let mut command = Command::new("env");
+    command.args(["--default-signal=INT,TERM", env!("CARGO_BIN_EXE_gateway")]).args(line.split(' '));
+    command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus"));
     command.stdin(Stdio::null()).stdout(stdout).stderr(Stdio::null()).spawn().unwrap()
 }
 
