@@ -11,11 +11,11 @@ use std::time::{Duration, Instant};
 
 use criterion::{BenchmarkId, Criterion};
 use gateway::controller::Kinesthetic;
+use gateway::cycle::turn::{Line, Shared, Timed, Turn};
 use gateway::cycle::{Cycle, Tick};
 use gateway::generate::{Wanted, generate};
 use gateway::robot::SimulatedArm;
 use gateway::run::realtime;
-use gateway::run::turn::{Line, Shared, Timed, Turn};
 use gateway::scenario::{Mode, ModeChange, Scenario};
 use gateway::table::{Snapshot, Sums};
 use protocol::fixed::{Q1_14, Q5_10};

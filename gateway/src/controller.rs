@@ -9,15 +9,11 @@
 //! scenario that do not listen to torques. [`crate::external::External`] asks another program.
 
 use core::f64::consts::TAU;
-use std::path::Path;
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
-
-use crate::external::{External, SocketError};
-use crate::scenario::{Motion, MotionKind};
 
 /// What a controller is told in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -83,26 +79,6 @@ pub trait Controller: Send {
     }
 }
 
-/// What moves the robot in this motion of a scenario: hold, sine, or the skin's controller.
-///
-/// # Errors
-/// When the skin's controller is another program, and there is no socket to listen on for it.
-pub fn of_motion(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
-    let start = motion.start_rad;
-    Ok(match (motion.kind, &skin.controller.kind) {
-        (MotionKind::Hold, _) => Box::new(Hold::new(skin, start)),
-        (MotionKind::Sine { amplitude_rad, period_s }, _) => {
-            Box::new(Sine::new(skin, start, amplitude_rad, period_s))
-        }
-        (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
-            Box::new(Kinesthetic::with(skin, inertia, damping))
-        }
-        (MotionKind::Kinesthetic, ControllerKind::External { socket }) => {
-            Box::new(External::listen(Path::new(socket), skin)?)
-        }
-    })
-}
-
 /// `M q'' + D q' = tau`, joint by joint.
 ///
 /// It has no state of its own: it starts from the velocity that the robot reports, so that a joint
@@ -135,7 +111,7 @@ impl Kinesthetic {
         }
     }
 
-    fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
+    pub(crate) fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
         let tick = 1.0 / skin.timing.control_hz;
         let mut joints = [Admittance::default(); MAX_JOINTS];
         let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed_rad_s);
@@ -311,20 +287,6 @@ mod tests {
         // The position is a sum of the velocities at the ticks' ends: at most a tick ahead.
         let exact = 0.5 * (0.5 - 0.25 * (1.0 - (-2.0_f64).exp()));
         assert!((arm.positions()[0] - exact).abs() < wanted * TICK);
-    }
-
-    #[test]
-    fn the_scenario_says_who_moves_the_robot() {
-        let mut motion = Motion { start_rad: [0.25; 6], kind: MotionKind::Hold };
-        let mut step = |kind, torque| {
-            motion.kind = kind;
-            let input = Input { q: [0.25; 6], ..pushed([torque; 6]) };
-            moved(of_motion(&skin(), &motion).unwrap().step(&input))[0]
-        };
-        assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
-        assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
-        assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "gives way");
-        assert!(step(MotionKind::Sine { amplitude_rad: [0.1; 6], period_s: 4.0 }, 0.0) > 0.0);
     }
 
     #[test]

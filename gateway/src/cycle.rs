@@ -14,6 +14,7 @@
 //! unless it computes centrally beside them ([`Cycle::central`]).
 
 pub mod carried;
+pub mod turn;
 
 use protocol::fixed::Q1_14;
 use protocol::id::Command;

@@ -4,13 +4,13 @@
 
 use std::collections::BTreeMap;
 
-use hdrhistogram::Histogram;
 use protocol::id::Kind;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
 pub use self::outcome::{Halted, Outcome, TickBefore};
+use crate::quantiles::Quantiles;
 pub use crate::record::account::{Recording, Written};
 use crate::table::{Accuracy, Contributions, Errors, Event, Replies, Status, SumCounts, Table, Uplink};
 
@@ -163,44 +163,6 @@ pub struct Loop {
     pub records_lost: u64,
     /// Frames that a bus did not take.
     pub unsent: u64,
-}
-
-/// An empty histogram with three digits that grows by itself.
-#[must_use]
-#[expect(clippy::missing_panics_doc, reason = "three digits are a valid precision")]
-pub fn histogram() -> Histogram<u64> {
-    Histogram::new(3).expect("three digits are a valid precision")
-}
-
-/// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Quantiles {
-    /// Median.
-    pub p50: f64,
-    /// 90th percentile.
-    pub p90: f64,
-    /// 99th percentile.
-    pub p99: f64,
-    /// Maximum.
-    pub max: f64,
-    /// How many.
-    pub count: u64,
-}
-
-impl Quantiles {
-    /// Of a histogram that counts in units of `unit_us`.
-    #[must_use]
-    #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-    pub fn of(histogram: &Histogram<u64>, unit_us: f64) -> Self {
-        let at = |quantile| histogram.value_at_quantile(quantile) as f64 * unit_us;
-        Self {
-            p50: at(0.5),
-            p90: at(0.9),
-            p99: at(0.99),
-            max: histogram.max() as f64 * unit_us,
-            count: histogram.len(),
-        }
-    }
 }
 
 /// Some errors, in Nm.

@@ -3,7 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use gateway::central::Central;
-use gateway::controller::{Input, Step, of_motion};
+use gateway::controller::{Input, Step};
+use gateway::motion::controller_of;
 use gateway::robot::{Robot, SimulatedArm};
 use gateway::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
@@ -30,7 +31,7 @@ fn play(scenario: &str) -> Most {
     let skin = Skin::parse("ur5-253.toml", include_str!("../examples/ur5-253.toml")).unwrap();
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
     let start = scenario.motion.start_rad;
-    let mut controller = of_motion(&skin, &scenario.motion).unwrap();
+    let mut controller = controller_of(&skin, &scenario.motion).unwrap();
     let central = Central::new(&skin);
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);

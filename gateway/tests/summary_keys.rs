@@ -3,9 +3,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use gateway::quantiles::{Quantiles, histogram};
 use gateway::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Quantiles,
-    Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Written, histogram,
+    AccuracySummary, BusSummary, ErrorsSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording,
+    RepliesSummary, Summary, SumsSummary, TickBefore, Written,
 };
 use gateway::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;

@@ -11,12 +11,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use gateway::controller::Kinesthetic;
+use gateway::cycle::turn::{Line, Shared, Turn};
 use gateway::cycle::{Cycle, Tick};
 use gateway::generate::{Wanted, generate};
 use gateway::robot::SimulatedArm;
 use gateway::run::link::Link;
 use gateway::run::realtime;
-use gateway::run::turn::{Line, Shared, Turn};
 use gateway::scenario::{Mode, ModeChange, Scenario};
 use gateway::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};

@@ -2,9 +2,9 @@
 
 use std::collections::VecDeque;
 
-use gateway::controller;
 use gateway::cycle::carried::Heard;
 use gateway::cycle::{Cycle, Record, Tick};
+use gateway::motion::controller_of;
 use gateway::robot::SimulatedArm;
 use gateway::scenario::{Scenario, Touches};
 use gateway::table::{Notice, Snapshot, Table};
@@ -55,7 +55,7 @@ impl Gateway {
     #[must_use]
     pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
         let table = Table::new(skin, 0);
-        let controller = controller::of_motion(skin, &scenario.motion).expect("a controller of our own");
+        let controller = controller_of(skin, &scenario.motion).expect("a controller of our own");
         let robot = SimulatedArm::new(skin, scenario.motion.start_rad);
         Self {
             snapshot: table.snapshot().clone(),

@@ -11,7 +11,7 @@ use clap::{Args, ValueEnum};
 use gateway::capture::convert::{ConvertError, Converted, Output, convert};
 use gateway::capture::log::{self, Style};
 use gateway::capture::{Format, ORIGIN, Reader};
-use gateway::run::file::WholeFile;
+use gateway::files::WholeFile;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;

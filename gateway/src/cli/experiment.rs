@@ -14,11 +14,11 @@ use clap::Args;
 use gateway::experiment::arm::Reply;
 use gateway::experiment::moving::Run;
 use gateway::experiment::{Effort, Experiment as Named, Lab, Session, files};
+use gateway::quantiles::Quantiles;
 use gateway::record::facts;
 use gateway::report::figure::{Finding, Page, Section, Verdict};
 use gateway::report::{page, svg};
 use gateway::run::realtime;
-use gateway::summary::Quantiles;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::{Failure, print, quoted};
 

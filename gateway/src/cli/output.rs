@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gateway::run::file::{self, WholeFile};
+use gateway::files::{WholeFile, check};
 use protocol::stop::Stoppable;
 use protocol::usage::Failure;
 
@@ -27,7 +27,7 @@ impl Force {
 
     /// Sees that a file may be written, long before it is.
     pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
-        file::check(path, self.force).map_err(|error| refused(option, path, &error))
+        check(path, self.force).map_err(|error| refused(option, path, &error))
     }
 
     /// Writes a whole file that an option names, or leaves what was there.

@@ -4,7 +4,8 @@ use std::fmt::Display;
 
 use comfy_table::{ColumnConstraint, ContentArrangement, Table, presets};
 use gateway::paper;
-use gateway::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Quantiles, Summary};
+use gateway::quantiles::Quantiles;
+use gateway::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Summary};
 use protocol::usage::{Failure, print};
 
 /// A space before a name that stays when the name takes two lines.

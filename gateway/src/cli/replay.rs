@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use gateway::decode::pick::{self, Pick, Wanted};
+use gateway::quantiles::Quantiles;
 use gateway::replay::player::Pace;
 use gateway::replay::reel::Only as What;
 use gateway::replay::report::{Expect, Summary};
 use gateway::replay::survey::Part;
 use gateway::replay::{Options, Spawn, replay};
 use gateway::run::RunError;
-use gateway::summary::Quantiles;
 use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};

@@ -12,10 +12,10 @@ use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
 use crate::controller::{Controller, Input, Kinesthetic, Step};
+use crate::cycle::turn::{Line, Shared, Timed, Turn};
 use crate::cycle::{Cycle, Tick};
 use crate::generate::{GenerateError, Wanted, generate};
 use crate::robot::SimulatedArm;
-use crate::run::turn::{Line, Shared, Timed, Turn};
 use crate::scenario::{Mode, ModeChange, Scenario, contact_words};
 use crate::table::{Snapshot, Table};
 

@@ -10,7 +10,7 @@ use rustix::thread::ClockId;
 use rustix::time::{clock_getres, clock_gettime};
 
 use crate::decode::parameter::Words;
-use crate::summary::Quantiles;
+use crate::quantiles::Quantiles;
 
 /// Facts by name.
 pub type Facts = BTreeMap<String, String>;

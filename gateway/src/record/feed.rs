@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex};
 use protocol::message::SkinSensors;
 
 use super::force::Seen;
+use crate::cycle::turn::Timed;
 use crate::run::receiver::View;
-use crate::run::turn::Timed;
 use crate::table::Status;
 
 /// Frames of a bus that may wait: more than a second of a full bus.

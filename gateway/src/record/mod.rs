@@ -10,6 +10,7 @@
 //! missing. Nothing that happens to a file ends the run. `docs/recording.md` has the topics.
 
 pub mod account;
+pub(crate) mod backlog;
 pub mod facts;
 pub mod feed;
 pub mod file;
@@ -37,7 +38,7 @@ use series::{Attached, Head, Series, Split};
 use text::Text;
 use topics::Topics;
 
-use crate::run::file::check_regular;
+use crate::files::check_regular;
 
 /// What topics of frames begin with; the bus' name follows.
 pub const TOPIC_OF_BUS: &str = "/can/";

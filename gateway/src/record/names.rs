@@ -19,7 +19,7 @@ use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, flock, linkat, open
 
 use super::file;
 use super::sink::folder_of;
-use crate::run::file::{rename, with_remedy};
+use crate::files::{rename, with_remedy};
 
 /// What a file is called in addition until it is whole.
 const PART: &str = "part";

@@ -9,7 +9,7 @@ use rustix::fs::{Gid, fchown};
 
 use super::names::{self, Found};
 use super::recover::{RecoverError, Recovered, recover};
-use crate::run::file::WholeFile;
+use crate::files::WholeFile;
 
 /// Names that are tried for a new file, when somebody else takes one after the other.
 const NAMES: u32 = 100;

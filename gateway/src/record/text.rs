@@ -9,7 +9,7 @@ use protocol::candump::{Record, Timestamp, write_record};
 use super::Candump;
 use super::account::Written;
 use super::force::Seen;
-use crate::run::file::LogFile;
+use crate::files::LogFile;
 
 /// Bytes that are written together.
 const PIECE: usize = 64 << 10;

@@ -11,6 +11,7 @@ use protocol::parameters::MAX_JOINTS;
 use rustix::time::{ClockId, clock_gettime};
 
 use super::account::{Recording, Written};
+use super::backlog;
 use super::facts::realtime_minus_monotonic;
 use super::feed::{Captured, FRAMES, Feed, Lane};
 use super::force::InForce;
@@ -20,10 +21,9 @@ use super::text::Text;
 use super::topics::Topics;
 use super::{Outputs, Stop};
 use crate::capture::{Note, NoteKind};
+use crate::files::sync;
 use crate::ros2::skin::Felt;
 use crate::ros2::standard::{Diagnosis, Level, Point};
-use crate::run::backlog;
-use crate::run::file::sync;
 
 /// The thread's rhythm.
 const LOOK: Duration = Duration::from_millis(10);

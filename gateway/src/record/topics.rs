@@ -15,10 +15,10 @@ use super::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
 use crate::capture::Note;
 use crate::controller::BadCycle;
 use crate::cycle::Halt;
+use crate::cycle::turn::Timed;
 use crate::ros2::messages::{CanFrame, CaptureNote};
 use crate::ros2::skin::{Felt, LoopTiming, PatchState, Torques};
 use crate::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
-use crate::run::turn::Timed;
 use crate::table::Status;
 
 /// What positions of points are relative to.

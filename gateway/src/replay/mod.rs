@@ -19,7 +19,6 @@ mod feed;
 mod hall;
 pub mod judge;
 mod live;
-pub mod order;
 pub mod player;
 pub mod reel;
 pub mod report;
@@ -44,9 +43,9 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
 use crate::decode::pick::Pick;
 use crate::decode::stats::BUSES;
+use crate::quantiles::histogram;
 use crate::run::{RunError, realtime};
 use crate::signals::caught;
-use crate::summary::histogram;
 use judge::Judge;
 use player::Pace;
 use reel::Only;
@@ -225,7 +224,7 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, S
     if let Some(what) = &reader.extras().unfinished {
         teller.say(&format!("{name}: {what}"));
     }
-    if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > order::WINDOW_NS) {
+    if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > crate::order::WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         teller.say(&format!(
             "{name}: times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \

@@ -14,7 +14,7 @@ use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::reel::{Due, Role, Step};
-use crate::summary::histogram;
+use crate::quantiles::histogram;
 
 /// From the decision to begin to the first frame, in ns.
 const LEAD_NS: u64 = 1_000_000;

@@ -15,11 +15,11 @@ use protocol::packet::{Epoch, data_id};
 use protocol::time::Micros;
 
 use super::judge::Judge;
-use super::order::{Order, Ordered};
 use super::survey::{Survey, is_input, is_joints};
 use crate::decode::pick::Pick;
 use crate::decode::settle::Settler;
 use crate::decode::{Decoded, Fault};
+use crate::order::{Order, Ordered};
 
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;

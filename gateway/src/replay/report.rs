@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::difference::{Difference, How, When};
 use super::judge::{Lacking, Tally};
 use super::player::LaneTally;
-use crate::summary::Quantiles;
+use crate::quantiles::Quantiles;
 
 /// A whole replay.
 #[derive(Clone, Debug, Serialize)]

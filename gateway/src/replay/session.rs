@@ -23,9 +23,9 @@ use super::start::{self, Buses, Checks, Routes, rival};
 use super::survey::{Known, Survey};
 use super::teller::Teller;
 use super::{Options, ear};
+use crate::quantiles::Quantiles;
 use crate::run::RunError;
 use crate::run::realtime::{self, Granted};
-use crate::summary::Quantiles;
 
 /// The main thread's rhythm.
 const LOOK: Duration = Duration::from_millis(20);

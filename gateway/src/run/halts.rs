@@ -7,9 +7,9 @@ use std::collections::VecDeque;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use super::turn::Timed;
 use crate::cycle::Halt;
 use crate::cycle::carried::bit;
+use crate::cycle::turn::Timed;
 use crate::summary::{Halted, TickBefore};
 
 /// Ticks that are kept: 0.4 s at 500 Hz.

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use hdrhistogram::Histogram;
 
 use super::halts::Halts;
-use super::turn::Timed;
-use crate::summary::{Quantiles, histogram};
+use crate::cycle::turn::Timed;
+use crate::quantiles::{Quantiles, histogram};
 
 /// What the loop's records add up to.
 #[derive(Debug)]

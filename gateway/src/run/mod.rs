@@ -11,8 +11,6 @@
 //!       └─ progress line, summary              recorder: what all of them hand over, into files
 //! ```
 
-pub(crate) mod backlog;
-pub mod file;
 mod halts;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
@@ -27,7 +25,6 @@ pub mod receiver;
 pub mod roots;
 mod start;
 mod switching;
-pub mod turn;
 mod usage;
 mod watch;
 

@@ -10,9 +10,9 @@ use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{ClockId, clock_nanosleep_absolute};
 use rustix::time::{Timespec, clock_gettime};
 
-use super::turn::{Shared, Turn};
 use crate::cycle::Tick;
-use crate::summary::histogram;
+use crate::cycle::turn::{Shared, Turn};
+use crate::quantiles::histogram;
 
 /// The loop's priority: above ordinary threads, below the kernel's own.
 const PRIORITY: i32 = 40;

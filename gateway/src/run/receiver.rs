@@ -14,7 +14,7 @@ use protocol::time::Micros;
 
 use super::link::{Ear, Outages};
 use super::roots::Roots;
-use super::turn::Shared;
+use crate::cycle::turn::Shared;
 use crate::network::check::Seen as SeenCell;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;

@@ -21,11 +21,13 @@ use super::network::Network;
 use super::progress::say;
 use super::receiver::{CellView, Left, News, Receiver, View};
 use super::roots::{Ears, Roots};
-use super::turn::{Line, Shared, Timed};
-use super::{Options, RunError, backlog, realtime};
-use crate::controller;
+use super::{Options, RunError, realtime};
 use crate::cycle::Cycle;
+use crate::cycle::turn::{Line, Shared, Timed};
+use crate::motion::controller_of;
+use crate::quantiles::{Quantiles, histogram};
 use crate::record::account::Recording;
+use crate::record::backlog;
 use crate::record::feed::{self, Feed, Unrecorded};
 use crate::record::layout::Layout;
 use crate::record::series::Head;
@@ -33,7 +35,6 @@ use crate::record::{Mcap, Outputs, Recorder, facts};
 use crate::robot::SimulatedArm;
 use crate::scenario::FaultKind;
 use crate::signals::caught;
-use crate::summary::{Quantiles, histogram};
 use crate::table::{Notice, Table};
 
 /// How long stimuli and commands may wait for a full bus; the loop's own frames never wait.
@@ -159,7 +160,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
 /// The loop's state, by the scenario's motion.
 fn cycle(options: &Options) -> Result<Cycle, RunError> {
     let (skin, motion) = (&options.skin, options.scenario.motion);
-    let controller = controller::of_motion(skin, &motion).map_err(|error| {
+    let controller = controller_of(skin, &motion).map_err(|error| {
         // Its cause says why the system refuses.
         let cause = error.source().map(|cause| format!(": {cause}")).unwrap_or_default();
         RunError::Usage(format!("{error}{cause}"))

@@ -23,13 +23,15 @@ use super::realtime::{self, Granted};
 use super::receiver::{Left, News, View};
 use super::start::{Bench, Lane};
 use super::switching::Told;
-use super::turn::{Timed, Turn};
-use super::{RunError, backlog, usage};
+use super::{RunError, usage};
+use crate::cycle::turn::{Timed, Turn};
+use crate::quantiles::Quantiles;
 use crate::record::Recorder;
 use crate::record::account::Recording;
+use crate::record::backlog;
 use crate::scenario::{FaultKind, Stimulus, Touches};
 use crate::summary::{
-    AccuracySummary, BusSummary, Loop, NetworkSummary, OutagesSummary, Outcome, Processor, Quantiles, Summary,
+    AccuracySummary, BusSummary, Loop, NetworkSummary, OutagesSummary, Outcome, Processor, Summary,
 };
 use crate::table::{Accuracy, Notice, Said};
 

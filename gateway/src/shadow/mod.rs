@@ -32,7 +32,7 @@ use crate::fit::verdict::Answer;
 use lane::{Known, Lane};
 use told::Told;
 
-pub use crate::replay::order::{WINDOW_FRAMES, WINDOW_NS};
+pub use crate::order::{WINDOW_FRAMES, WINDOW_NS};
 pub use answering::Answering;
 pub use lane::GREATEST_QUEUE;
 pub use phase::PAUSE_NS;

@@ -32,7 +32,7 @@ use protocol::time::{Micros, Span};
 
 use crate::central::Central;
 use crate::network::check::Seen;
-use crate::summary::histogram;
+use crate::quantiles::histogram;
 use cell::Speaker;
 use switched::Switched;
 use trunk::{Expected, Sum, Taken, Trunk};

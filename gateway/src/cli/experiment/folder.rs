@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use gateway::run::file::rename;
+use gateway::files::rename;
 use protocol::usage::Failure;
 
 use crate::cli::output::Force;

@@ -4,9 +4,9 @@ use hdrhistogram::Histogram;
 
 use super::messages::{Joints, Torques};
 use super::{COLUMNS, GRAIN_S};
+use crate::quantiles::histogram;
 use crate::report::thin::Thinned;
 use crate::ros2::skin::LoopTiming;
-use crate::summary::histogram;
 
 /// Changes of the loop that are named.
 const TURNS: usize = 12;

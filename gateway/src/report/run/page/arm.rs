@@ -4,9 +4,9 @@ use protocol::packet::WORDS;
 
 use super::Draft;
 use crate::paper;
+use crate::quantiles::Quantiles;
 use crate::report::figure::{Axis, Figure, Mark, On, Section, Series, Shape, Size, Table, number};
 use crate::report::thin::Thinned;
-use crate::summary::Quantiles;
 use crate::table::{Accuracy, Errors};
 
 impl Draft<'_> {

@@ -3,12 +3,12 @@
 use super::super::lane::{Lane, Latency};
 use super::Draft;
 use crate::fit::verdict::{Answer, percent};
+use crate::quantiles::Quantiles;
 use crate::report::figure::{
     Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
 };
 use crate::report::thin::{Binned, Thinned};
 use crate::shadow::BusShadow;
-use crate::summary::Quantiles;
 use crate::table::{Cell, Event, Uplink};
 
 /// Cells in the table of the worst.

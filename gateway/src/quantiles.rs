@@ -1,0 +1,42 @@
+//! Distributions of times, and the quantiles that are said of them.
+
+use hdrhistogram::Histogram;
+use serde::Serialize;
+
+/// An empty histogram with three digits that grows by itself.
+#[must_use]
+#[expect(clippy::missing_panics_doc, reason = "three digits are a valid precision")]
+pub fn histogram() -> Histogram<u64> {
+    Histogram::new(3).expect("three digits are a valid precision")
+}
+
+/// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Quantiles {
+    /// Median.
+    pub p50: f64,
+    /// 90th percentile.
+    pub p90: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Maximum.
+    pub max: f64,
+    /// How many.
+    pub count: u64,
+}
+
+impl Quantiles {
+    /// Of a histogram that counts in units of `unit_us`.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+    pub fn of(histogram: &Histogram<u64>, unit_us: f64) -> Self {
+        let at = |quantile| histogram.value_at_quantile(quantile) as f64 * unit_us;
+        Self {
+            p50: at(0.5),
+            p90: at(0.9),
+            p99: at(0.99),
+            max: histogram.max() as f64 * unit_us,
+            count: histogram.len(),
+        }
+    }
+}
