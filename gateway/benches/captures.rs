@@ -8,8 +8,8 @@ use std::hint::black_box;
 use std::time::Duration;
 
 use criterion::{Criterion, Throughput};
-use gateway::capture::{Entry, Reader};
 use protocol::candump::write_record;
+use trace::capture::{Entry, Reader};
 
 const LINES: u64 = 20_000;
 

@@ -10,8 +10,8 @@ use std::process::{Command, exit};
 use std::time::{Duration, Instant};
 
 use criterion::{Criterion, Throughput};
-use gateway::generate::{Wanted, generate};
-use gateway::table::Table;
+use model::generate::{Wanted, generate};
+use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q3_12};

@@ -17,20 +17,20 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use gateway::central::Central;
-use gateway::record::feed::{self, Feed};
-use gateway::record::file::FileWriter;
-use gateway::record::force::Seen;
-use gateway::record::layout::Layout;
-use gateway::record::series::{Head, Split};
-use gateway::record::{Mcap, Options, Outputs};
-use gateway::ros2::messages::CanFrame;
+use bench::record::feed::{self, Feed};
+use bench::record::force::Seen;
+use bench::record::{Mcap, Options, Outputs};
+use model::central::Central;
 use protocol::can::Format;
 use protocol::candump::{self, Direction, Line, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
+use trace::recording::file::FileWriter;
+use trace::recording::layout::Layout;
+use trace::recording::series::{Head, Split};
+use trace::ros2::messages::CanFrame;
 
 const SKIN: &str = include_str!("ur5-253.toml");
 /// How long frames are pushed.

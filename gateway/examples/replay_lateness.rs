@@ -7,10 +7,10 @@
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use gateway::replay::player::Pace;
-use gateway::replay::reel::Only;
-use gateway::replay::survey::Part;
-use gateway::replay::{Options, replay};
+use bench::replay::player::Pace;
+use bench::replay::reel::Only;
+use bench::replay::survey::Part;
+use bench::replay::{Options, replay};
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Kinds, Options as BusOptions};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
@@ -43,7 +43,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             files: vec![file.clone()],
             kinds: Kinds::all(kind),
             only: Only::All,
-            pick: gateway::decode::pick::Pick::default(),
+            pick: model::decode::pick::Pick::default(),
             buses: Vec::new(),
             map: Vec::new(),
             part: Part::default(),

@@ -1,9 +1,100 @@
-//! `gateway`: the bench's command line.
+//! `gateway`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes are 0 (done),
+//! 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
 
-mod cli;
+mod ack;
+mod buses;
+mod cells;
+mod commission;
+mod convert;
+mod dbc;
+mod dump;
+mod experiment;
+mod explain;
+mod fit;
+mod frame;
+mod input;
+mod output;
+mod print;
+mod programs;
+mod recover;
+mod replay;
+mod report;
+mod run;
+mod sensing;
+mod shadow;
+mod skin;
 
 use std::process::ExitCode;
 
+use clap::error::ErrorKind;
+use clap::{Parser, Subcommand};
+use protocol::usage::{Failure, end, one_line};
+
+/// Bridges a robot skin's bus to a control loop.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.\n\nExample:\n  gateway demo"
+)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(run::Demo),
+    Run(run::Run),
+    Recover(recover::Recover),
+    Dump(dump::Dump),
+    Convert(convert::Convert),
+    Replay(replay::Replay),
+    Report(report::Report),
+    Frame(frame::Frame),
+    Commission(commission::Commission),
+    Cells(cells::Cells),
+    Ack(ack::Ack),
+    Sensing(sensing::Sensing),
+    Skin(skin::Skin),
+    Dbc(dbc::Dbc),
+    Explain(explain::Explain),
+    Shadow(shadow::ShadowCommand),
+    Fit(fit::Fit),
+    Experiment(experiment::Experiment),
+}
+
+impl Command {
+    fn run(self) -> Result<(), Failure> {
+        match self {
+            Self::Demo(command) => command.run(),
+            Self::Run(command) => command.run(),
+            Self::Recover(command) => command.run(),
+            Self::Dump(command) => command.run(),
+            Self::Convert(command) => command.run(),
+            Self::Replay(command) => command.run(),
+            Self::Report(command) => command.run(),
+            Self::Frame(command) => command.run(),
+            Self::Commission(command) => command.run(),
+            Self::Cells(command) => command.run(),
+            Self::Ack(command) => command.run(),
+            Self::Sensing(command) => command.run(),
+            Self::Skin(command) => command.run(),
+            Self::Dbc(command) => command.run(),
+            Self::Explain(command) => command.run(),
+            Self::Shadow(command) => command.run(),
+            Self::Fit(command) => command.run(),
+            Self::Experiment(command) => command.run(),
+        }
+    }
+}
+
 fn main() -> ExitCode {
-    cli::main()
+    let done = match Arguments::try_parse() {
+        Ok(arguments) => arguments.command.run(),
+        // Help and version, which are asked for, are printed as they are.
+        Err(asked) if !asked.use_stderr() => asked.exit(),
+        Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
+        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
+    };
+    end("gateway", done)
 }

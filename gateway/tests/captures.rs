@@ -6,14 +6,14 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Cursor;
 
-use gateway::capture::convert::{Converted, Output, convert};
-use gateway::capture::log::{LONGEST, Style};
-use gateway::capture::{CaptureError, Entry, Format, Note, NoteKind, Reader};
-use gateway::record::file::FileWriter;
-use gateway::ros2::messages::{CanFrame, CaptureNote};
 use proptest::prelude::*;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
 use protocol::candump::{Direction, Record, Timestamp, write_record};
+use trace::capture::convert::{Converted, Output, convert};
+use trace::capture::log::{LONGEST, Style};
+use trace::capture::{CaptureError, Entry, Format, Note, NoteKind, Reader};
+use trace::recording::file::FileWriter;
+use trace::ros2::messages::{CanFrame, CaptureNote};
 
 const CORPUS: &[u8] = include_bytes!("../../protocol/tests/golden/candump_corpus.log");
 const NANOS: u64 = 1_700_000_000_000_000_000;
@@ -263,7 +263,7 @@ fn of_a_damaged_recording_nothing_is_believed_from_the_damage_on() {
     assert!(silent < tried / 4 && partly > tried / 4, "{silent} and {partly} of {tried}");
 }
 
-fn of<'a>(topics: &'a [gateway::capture::Topic], name: &str) -> Option<&'a gateway::capture::Topic> {
+fn of<'a>(topics: &'a [trace::capture::Topic], name: &str) -> Option<&'a trace::capture::Topic> {
     topics.iter().find(|topic| topic.name == name)
 }
 
@@ -284,9 +284,9 @@ fn what_else_a_recording_has_is_named_and_counted() {
     file.write(&mut can, NANOS, &CanFrame(record)).unwrap();
     file.write(&mut notes, NANOS, &CaptureNote(Cow::Borrowed(&note))).unwrap();
     for time in 0..3 {
-        let diagnostics = gateway::ros2::standard::Diagnostics { nanos: time, parts: &[] };
+        let diagnostics = trace::ros2::standard::Diagnostics { nanos: time, parts: &[] };
         let mut channel =
-            file.channel::<gateway::ros2::standard::Diagnostics<'_>>("/diagnostics", &[]).unwrap();
+            file.channel::<trace::ros2::standard::Diagnostics<'_>>("/diagnostics", &[]).unwrap();
         file.write(&mut channel, time, &diagnostics).unwrap();
     }
     file.finish().unwrap();

@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use gateway::scenario::Scenario;
+use model::scenario::Scenario;
 use protocol::skin::{ControllerKind, Skin};
 
 const SKIN_MD: &str = include_str!("../../docs/skin.md");

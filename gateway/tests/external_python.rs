@@ -5,8 +5,8 @@ use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use gateway::controller::{Controller, Input, Step};
-use gateway::external::External;
+use control::controller::{Controller, Input, Step};
+use control::external::External;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 

@@ -6,8 +6,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gateway::record::file::FileWriter;
-use gateway::ros2::messages::CanFrame;
 use protocol::can::Format;
 use protocol::candump::{Direction, Record, Timestamp, write_record};
 use protocol::fixed::{Q1_14, Q3_12};
@@ -16,6 +14,8 @@ use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPag
 use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;
 use tempfile::TempDir;
+use trace::recording::file::FileWriter;
+use trace::ros2::messages::CanFrame;
 
 /// The paper's arm.
 const ARM: &str = include_str!("../examples/ur5-253.toml");

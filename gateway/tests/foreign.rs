@@ -8,9 +8,9 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use gateway::decode::settle::Settler;
-use gateway::decode::stats::{Report, Stats};
-use gateway::decode::{Decoded, Foreign};
+use analysis::stats::{Report, Stats};
+use model::decode::settle::Settler;
+use model::decode::{Decoded, Foreign};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::Q3_12;

@@ -7,12 +7,12 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use gateway::record::file::FileWriter;
-use gateway::record::names::Part;
-use gateway::record::{Mcap, Options, Outputs};
-use gateway::ros2::standard::JointState;
+use bench::record::{Mcap, Options, Outputs};
 use rustix::fs::{FlockOperation, Mode, flock};
 use tempfile::TempDir;
+use trace::recording::file::FileWriter;
+use trace::recording::names::Part;
+use trace::ros2::standard::JointState;
 
 /// What a writer that is still at it has in its file.
 fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
@@ -35,7 +35,7 @@ fn left(folder: &TempDir, name: &str) {
 fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     let mcap = Mcap {
         path: folder.join(name),
-        split: gateway::record::series::Split::default(),
+        split: trace::recording::series::Split::default(),
         attachments: Vec::new(),
         command_line: Vec::new(),
     };

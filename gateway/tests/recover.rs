@@ -6,14 +6,14 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use gateway::record::file::FileWriter;
-use gateway::record::recover::{RecoverError, Recovered, recover};
-use gateway::ros2::messages::CanFrame;
-use gateway::ros2::standard::JointState;
 use mcap::MessageStream;
 use mcap::read::{Summary, attachment, metadata};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
+use trace::recording::file::FileWriter;
+use trace::recording::recover::{RecoverError, Recovered, recover};
+use trace::ros2::messages::CanFrame;
+use trace::ros2::standard::JointState;
 
 /// Messages of two topics in five chunks, a file and facts.
 fn recording() -> Vec<u8> {

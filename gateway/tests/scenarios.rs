@@ -2,11 +2,11 @@
 //! computation as the skin.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use gateway::central::Central;
-use gateway::controller::{Input, Step};
-use gateway::motion::controller_of;
-use gateway::robot::{Robot, SimulatedArm};
-use gateway::scenario::{Scenario, Touches};
+use control::controller::{Input, Step};
+use control::motion::controller_of;
+use control::robot::{Robot, SimulatedArm};
+use model::central::Central;
+use model::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
 use protocol::message::SkinSensors;
 use protocol::skin::Skin;

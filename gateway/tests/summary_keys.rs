@@ -3,12 +3,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use gateway::quantiles::{Quantiles, histogram};
-use gateway::summary::{
+use bench::summary::{
     AccuracySummary, BusSummary, ErrorsSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording,
     RepliesSummary, Summary, SumsSummary, TickBefore, Written,
 };
-use gateway::table::{Accuracy, Event, Status, Table};
+use model::quantiles::{Quantiles, histogram};
+use model::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};

@@ -10,15 +10,15 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gateway::controller::Kinesthetic;
-use gateway::cycle::turn::{Line, Shared, Turn};
-use gateway::cycle::{Cycle, Tick};
-use gateway::generate::{Wanted, generate};
-use gateway::robot::SimulatedArm;
-use gateway::run::link::Link;
-use gateway::run::realtime;
-use gateway::scenario::{Mode, ModeChange, Scenario};
-use gateway::table::Table;
+use bench::run::link::Link;
+use bench::run::realtime;
+use control::controller::Kinesthetic;
+use control::cycle::turn::{Line, Shared, Turn};
+use control::cycle::{Cycle, Tick};
+use control::robot::SimulatedArm;
+use model::generate::{Wanted, generate};
+use model::scenario::{Mode, ModeChange, Scenario};
+use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};
 use protocol::can::Frame;
 use protocol::packet::{Epoch, WORDS};
@@ -57,7 +57,7 @@ fn skin(cells: usize) -> Skin {
 }
 
 /// A loop over one bus, in one mode; its records pile up in a queue that is large enough.
-fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<gateway::table::Snapshot>, Table) {
+fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table) {
     let (turn, input, table, _) = turn_of(skin, mode);
     (turn, input, table)
 }
@@ -66,7 +66,7 @@ fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<gateway::table::
 fn turn_of(
     skin: &Skin,
     mode: Mode,
-) -> (Turn, triple_buffer::Input<gateway::table::Snapshot>, Table, Arc<AtomicBool>) {
+) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table, Arc<AtomicBool>) {
     let table = Table::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, _) = rtrb::RingBuffer::new(4_096);

@@ -1,6 +1,6 @@
 //! What must be true of every run, whatever was broken.
 
-use gateway::table::{Event, Replies, Uplink};
+use model::table::{Event, Replies, Uplink};
 use protocol::can::Format;
 use protocol::id::Kind;
 

@@ -14,9 +14,9 @@
 
 use std::collections::HashMap;
 
+use analysis::bus_model::Attempt;
 use cell_node::node::{Flash, Identity};
-use gateway::bus_model::Attempt;
-use gateway::scenario::{Scenario, contact_words};
+use model::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;
 use protocol::message::{From, Message, SkinSensors};

@@ -2,12 +2,12 @@
 
 use std::collections::VecDeque;
 
-use gateway::cycle::carried::Heard;
-use gateway::cycle::{Cycle, Record, Tick};
-use gateway::motion::controller_of;
-use gateway::robot::SimulatedArm;
-use gateway::scenario::{Scenario, Touches};
-use gateway::table::{Notice, Snapshot, Table};
+use control::cycle::carried::Heard;
+use control::cycle::{Cycle, Record, Tick};
+use control::motion::controller_of;
+use control::robot::SimulatedArm;
+use model::scenario::{Scenario, Touches};
+use model::table::{Notice, Snapshot, Table};
 use protocol::can::Frame;
 use protocol::id::{CellId, Command, Node};
 use protocol::message::{From, Message, SensorPage, SkinSensors};

@@ -5,7 +5,7 @@
 //!                  +-- Bench: one queue of events, one clock that only moves when told to --+
 //!                  |                                                                         |
 //!   cell_node::Node ──> packets ──> [ wire: one total order ] ──> [ each receiver: delay ] ──┼─> Node
-//!   gateway::Cycle  ──> joints  ──>   Faults hit everybody          Faults hit one of them   ├─> Table
+//!   control::Cycle  ──> joints  ──>   Faults hit everybody          Faults hit one of them   ├─> Table
 //!   a stranger      ──> anything                                                             |
 //!                  +--------------------------------------------------- Witness looks on ---+
 //! ```

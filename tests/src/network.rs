@@ -18,7 +18,7 @@ use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
 use cell_node::node::{Flash, Identity, Node};
 use cell_node::sum::Words;
-use gateway::network::Uplinks;
+use model::network::Uplinks;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use protocol::id::CellId;

@@ -2,7 +2,7 @@
 //! whom they were sent and when each cell was switched on. What the real one makes of the same frames
 //! must agree with it, whatever was broken.
 
-use gateway::table::{Notice, Sums};
+use model::table::{Notice, Sums};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};

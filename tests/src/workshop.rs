@@ -2,8 +2,8 @@
 //! chance, and a hand that switches cells, and the commissioning, off and on.
 
 use cell_node::node::{Flash, Identity, Node};
-use gateway::commission::{Commission, Report, Wish};
-use gateway::decode::{Decoded, Decoder};
+use model::commission::{Commission, Report, Wish};
+use model::decode::{Decoded, Decoder};
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;
 use protocol::message::Message;

@@ -2,8 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
-use gateway::shadow::{BusShadow, Options, Shaded, Shadow};
-use gateway::table::Replies;
+use analysis::shadow::{BusShadow, Options, Shaded, Shadow};
+use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id};
 use protocol::message::From;

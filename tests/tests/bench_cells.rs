@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::node::{CLAIM, Flash, HEARTBEAT, Identity, PENDING};
-use gateway::table::{DEAD_AFTER, Event, Notice, Replies, Status};
+use model::table::{DEAD_AFTER, Event, Notice, Replies, Status};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::{Message, State};
@@ -359,7 +359,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
 #[test]
 fn a_damaged_flash_is_said_and_nothing_is_due() {
     let skin = skins::arm(2, Format::Fd);
-    let mut bench = Bench::with(&skin, &gateway::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
+    let mut bench = Bench::with(&skin, &model::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
     bench.seats[0].flash = Flash::Damaged;
     bench.run(Span::from_millis(1_000));
     bench.begin();

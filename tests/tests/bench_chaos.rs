@@ -8,7 +8,7 @@
     reason = "a test may stop, and say where"
 )]
 
-use gateway::table::{Event, Uplink};
+use model::table::{Event, Uplink};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::Message;

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::node::{Flash, Identity};
-use gateway::commission::{Outcome, Reason, Report, Trouble, Wish};
+use model::commission::{Outcome, Reason, Report, Trouble, Wish};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{Kind, Node};

@@ -3,8 +3,8 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use gateway::decode::{Decoded, Decoder};
-use gateway::explain::{Asked, Explanation, Origin, Verdict, Watch, explain};
+use analysis::explain::{Asked, Explanation, Origin, Verdict, Watch, explain};
+use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::From;

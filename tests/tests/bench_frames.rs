@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use gateway::table::{Event, Notice, Replies, Uplink};
+use model::table::{Event, Notice, Replies, Uplink};
 use protocol::can::Format;
 use protocol::fixed::Q1_14;
 use protocol::id::{Kind, Node};
@@ -263,7 +263,7 @@ fn neither_the_order_of_starts_nor_that_of_replies_changes_a_single_torque() {
     let run = |seed: u64| {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
         let starts: Vec<u64> = (0..6).map(|_| dice.random_range(0..400_000)).collect();
-        let idle = gateway::scenario::Scenario::idle(Span(0));
+        let idle = model::scenario::Scenario::idle(Span(0));
         let mut bench = Bench::with(&skin, &idle, seed, |place| Micros(starts[place]));
         for seat in &mut bench.seats {
             // Within a tick, or the arm, which gives way to the sum, would move differently.

@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use gateway::controller::BadCycle;
-use gateway::cycle::Halt;
-use gateway::table::Replies;
+use control::controller::BadCycle;
+use control::cycle::Halt;
+use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::{Message, State};

@@ -3,15 +3,14 @@
 //! on up to another one, are replayed to cells that were just started: they answer as it is recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
+use analysis::explain::{Asked, Watch};
+use bench::record::force::{InForce, Seen};
+use bench::replay::judge::{Judge, Tally};
+use bench::replay::reel::{Only, Reel, Role, Selection, Step};
+use bench::replay::survey::{Part, Survey};
 use cell_node::node::{Flash, Identity, Node};
-use gateway::capture;
-use gateway::decode::{Decoded, Decoder};
-use gateway::explain::{Asked, Watch};
-use gateway::record::force::{InForce, Seen};
-use gateway::replay::judge::{Judge, Tally};
-use gateway::replay::reel::{Only, Reel, Role, Selection, Step};
-use gateway::replay::survey::{Part, Survey};
-use gateway::table::{Replies, Table};
+use model::decode::{Decoded, Decoder};
+use model::table::{Replies, Table};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::{CellId, Node as Address};
@@ -25,6 +24,7 @@ use rand_pcg::Pcg64Mcg;
 use skinbus_tests::bench::{Act, Bench, touch};
 use skinbus_tests::fault::{Fault, Harm, Party};
 use skinbus_tests::skins;
+use trace::capture;
 
 const CELLS: u8 = 8;
 const SEEDS: u64 = 40;
@@ -342,7 +342,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             let (whole, part) = (frames_of(0, &[], asked(epoch)), frames_of(from, &before, asked(epoch)));
             assert_eq!(whole.at_ns, part.at_ns);
             for (whole, part) in whole.cells.iter().zip(&part.cells) {
-                let felt = |cell: &gateway::explain::CellMoment| cell.felt.map(|(skin, _)| skin);
+                let felt = |cell: &analysis::explain::CellMoment| cell.felt.map(|(skin, _)| skin);
                 assert_eq!((felt(whole), whole.test_mode), (felt(part), part.test_mode), "epoch {epoch}");
             }
         }

@@ -8,9 +8,9 @@
     reason = "a test may stop"
 )]
 
+use bench::replay::state::State;
 use cell_node::node::{Flash, Identity, Node};
-use gateway::generate::{Wanted, generate};
-use gateway::replay::state::State;
+use model::generate::{Wanted, generate};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};

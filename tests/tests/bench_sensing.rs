@@ -10,7 +10,7 @@
 
 use std::collections::BTreeMap;
 
-use gateway::scenario::Scenario;
+use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};

@@ -2,8 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use gateway::scenario::Scenario;
-use gateway::table::{Event, Replies, Status, Uplink};
+use model::scenario::Scenario;
+use model::table::{Event, Replies, Status, Uplink};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::From;

@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use gateway::experiment::tree::{Came, Tree};
+use paper::tree::{Came, Tree};
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
 use protocol::packet::WORDS;

@@ -4,7 +4,7 @@
 
 mod process;
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use process::log::Log;
 use process::vcan::tool;
 use process::{PRESSED, Place, whole};

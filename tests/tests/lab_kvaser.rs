@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use gateway::generate::{Format as Generated, Wanted, generate};
+use model::generate::{Format as Generated, Wanted, generate};
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, by_identifier, command, frames_of, tool};
 use process::{PATIENCE, Place, Running, Summary, until};
@@ -378,7 +378,7 @@ fn wires_are_not_simulated_on_a_real_bus() {
     let controllers = Controllers::up();
     assert!(!open("can0", &options(&[])).unwrap().is_virtual().unwrap());
     let place = Place::new();
-    let (reply, format) = (gateway::generate::Reply::Sum, Generated::Classic);
+    let (reply, format) = (model::generate::Reply::Sum, Generated::Classic);
     let text = generate(&Wanted { cells: CELLS, reply, format, ..Wanted::default() }).unwrap();
     place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
     let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");

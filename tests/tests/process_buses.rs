@@ -4,7 +4,7 @@
 
 mod process;
 
-use gateway::generate::{Format as Wire, Reply, Wanted, generate};
+use model::generate::{Format as Wire, Reply, Wanted, generate};
 use process::buses::{carries, mixed_skin};
 use process::guest::Guest;
 use process::{PRESSED, Place, Running, signal, skin_of, until};

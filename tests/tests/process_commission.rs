@@ -8,7 +8,7 @@ use std::fs;
 
 use cell_node::flash;
 use cell_node::node::Identity;
-use gateway::generate::{Format, Reply, Wanted, generate};
+use model::generate::{Format, Reply, Wanted, generate};
 use process::{Ended, Place, Running, skin, skin_of, until};
 use protocol::id::CellId;
 use protocol::parameters::Parameters;

@@ -10,7 +10,6 @@ use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use gateway::capture::{Entry, Reader};
 use process::log::Log;
 use process::{Place, Running, Summary, names, skin, until};
 use protocol::can::Format;
@@ -21,6 +20,7 @@ use rand::{RngExt, SeedableRng};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::io::ioctl_fionread;
 use rustix::process::Signal;
+use trace::capture::{Entry, Reader};
 
 const RUN: &str = "run skin.toml --bus-kind embedded --scenario scenario.toml";
 

@@ -119,7 +119,7 @@ fn without_any_controller_a_run_that_comes_to_its_end_was_halted() {
 #[test]
 fn a_lost_bus_that_halts_is_told_with_its_name_and_the_halt_has_the_exit_code() {
     let place = Place::new();
-    let skin = process::skin_of(8, 2, gateway::generate::Format::Fd);
+    let skin = process::skin_of(8, 2, model::generate::Format::Fd);
     // A bus that only this machine is late for is not lost.
     let safety = "[safety]\nlost_bus = \"halt\"\nhold_epochs = 100\nbad_cycles = 100\n\n[controller]";
     place.write("skin.toml", &skin.replacen("[controller]", safety, 1));

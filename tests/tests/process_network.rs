@@ -15,9 +15,9 @@ use std::time::{Duration, Instant};
 
 use cell_node::flash;
 use cell_node::node::Identity;
-use gateway::decode::Decoded;
-use gateway::generate::{Format as Wanted, Reply, generate};
-use gateway::network::Uplinks;
+use model::decode::Decoded;
+use model::generate::{Format as Wanted, Reply, generate};
+use model::network::Uplinks;
 use process::guest::Guest;
 use process::{PATIENCE, Place, Running, names, until};
 use protocol::bus::Inbox;
@@ -42,7 +42,7 @@ const UNCONFIGURED: u16 = 0;
 /// A skin of cells that answer with sums.
 fn sums(place: &Place, cells: u8, format: Wanted) -> Skin {
     let cells = usize::from(cells);
-    let wanted = gateway::generate::Wanted { cells, reply: Reply::Sum, format, ..Default::default() };
+    let wanted = model::generate::Wanted { cells, reply: Reply::Sum, format, ..Default::default() };
     place.write("skin.toml", &generate(&wanted).unwrap());
     Skin::read(&place.path("skin.toml")).unwrap()
 }

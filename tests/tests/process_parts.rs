@@ -7,8 +7,8 @@ mod process;
 use std::fs;
 use std::time::Duration;
 
-use gateway::generate::{Format, Reply, Wanted, generate};
-use gateway::report::run::{Options, report};
+use analysis::report::run::{Options, report};
+use model::generate::{Format, Reply, Wanted, generate};
 use process::replay::{TOUCHED, says_everything};
 use process::{Place, skin_of, until};
 use rustix::process::Signal;

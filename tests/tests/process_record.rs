@@ -10,8 +10,8 @@ use std::fs;
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use gateway::dbc;
-use gateway::generate::Format;
+use analysis::dbc;
+use model::generate::Format;
 use process::{PRESSED, Place, Summary, example, skin_of, until};
 use protocol::skin::Skin;
 use rand::{RngExt, SeedableRng};

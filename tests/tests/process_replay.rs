@@ -8,7 +8,7 @@ use std::cell::Cell as Counter;
 use std::fs;
 use std::time::Duration;
 
-use gateway::generate::{self, Format};
+use model::generate::{self, Format};
 use process::replay::{Replayed, TOUCHED, cell, changed, is_torque, without};
 use process::{Place, Running, example, skin_of, until};
 use protocol::id::Node;

@@ -9,8 +9,8 @@ mod recorded;
 
 use std::fs;
 
-use gateway::report::figure::{Figure, Page, Table, number};
-use gateway::report::run::{Options, report};
+use analysis::report::figure::{Figure, Page, Table, number};
+use analysis::report::run::{Options, report};
 use process::{PRESSED, Place, names};
 use recorded::Recorded;
 use serde_json::Value;

@@ -5,7 +5,7 @@ mod process;
 
 use std::fs;
 
-use gateway::generate;
+use model::generate;
 use process::log::{Log, same_torques};
 use process::{PRESSED, Place, Summary, example, skin_of, until};
 use protocol::can::Format;

@@ -10,11 +10,11 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use gateway::capture::{Entry, NoteKind, Reader};
 use process::program;
 use protocol::can::{FD_FORMAT, Format};
 use protocol::candump::{Direction, Record};
 use tempfile::TempDir;
+use trace::capture::{Entry, NoteKind, Reader};
 
 /// Frames of every kind that all tools read, on two buses, in candump's words.
 const PORTABLE: &str = "\

@@ -4,7 +4,7 @@
 
 mod process;
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use process::Place;
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, frames_of, same_by_sender};

@@ -5,7 +5,7 @@
 
 mod process;
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use process::buses::{carries, mixed_skin};
 use process::guest::Guest;
 use process::vcan::{Vcan, tool};

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::time::Duration;
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use process::Place;
 use process::replay::{Replayed, says_everything};
 use process::vcan::{Candump, Vcan0, tool};

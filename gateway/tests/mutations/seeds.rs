@@ -3,14 +3,6 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-use gateway::capture::Reader;
-use gateway::capture::convert::{Output, convert};
-use gateway::capture::log::Style;
-use gateway::ros2::Message;
-use gateway::ros2::cdr::Writer as Cdr;
-use gateway::ros2::messages::{CanFrame, CaptureNote};
-use gateway::ros2::skin::{LoopTiming, Torques};
-use gateway::ros2::standard::JointState;
 use mcap::records::MessageHeader;
 use mcap::write::{Metadata, NoSeek};
 use mcap::{Attachment, Compression, WriteOptions, Writer};
@@ -20,6 +12,14 @@ use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message as Packet};
 use protocol::packet::Epoch;
+use trace::capture::Reader;
+use trace::capture::convert::{Output, convert};
+use trace::capture::log::Style;
+use trace::ros2::Message;
+use trace::ros2::cdr::Writer as Cdr;
+use trace::ros2::messages::{CanFrame, CaptureNote};
+use trace::ros2::skin::{LoopTiming, Torques};
+use trace::ros2::standard::JointState;
 
 use crate::mutate::{chunk, record, string};
 
@@ -54,7 +54,7 @@ pub(crate) fn all(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
 fn converted(log: &str) -> Vec<u8> {
     let mut out = Vec::new();
     let mut from = Reader::from_read("log", std::io::Cursor::new(log.to_owned().into_bytes())).unwrap();
-    let mut to = Output::new(&mut out, gateway::capture::Format::Mcap, Style::default()).unwrap();
+    let mut to = Output::new(&mut out, trace::capture::Format::Mcap, Style::default()).unwrap();
     convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
     drop(to);
@@ -150,8 +150,8 @@ fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
             }
         }
     }
-    let note = gateway::capture::Note {
-        kind: gateway::capture::NoteKind::Dropped(12),
+    let note = trace::capture::Note {
+        kind: trace::capture::NoteKind::Dropped(12),
         nanos: BEGAN,
         interface: "vcan0",
         line: 0,

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use gateway::decode::{Decoded, Decoder};
+use model::decode::{Decoded, Decoder};
 use protocol::bus::{Bus, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;

@@ -29,8 +29,8 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use gateway::generate::{Format, Wanted, generate};
 use guest::Guest;
+use model::generate::{Format, Wanted, generate};
 use protocol::bus::BusKind;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;

@@ -10,9 +10,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use gateway::generate::{Wanted, generate};
 use mcap::read::{Summary, attachment, metadata};
 use mcap::{MessageStream, Schema};
+use model::generate::{Wanted, generate};
 use protocol::candump::{Line, parse};
 use serde_json::{Map, Value, json};
 

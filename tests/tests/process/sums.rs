@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use gateway::generate::{Reply, Wanted, generate};
+use model::generate::{Reply, Wanted, generate};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};

@@ -9,7 +9,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use protocol::can::Frame;
 use protocol::candump::{Line, parse, parse_frame};
 use protocol::id::{Id, Kind};

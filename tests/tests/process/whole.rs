@@ -3,7 +3,7 @@
 use std::fs;
 use std::time::Duration;
 
-use gateway::generate::{Wanted, generate};
+use model::generate::{Wanted, generate};
 use protocol::can::Frame;
 use protocol::id::{Id, Kind};
 

@@ -1,0 +1,524 @@
+//! The text as another parser reads it, against the protocol's own encoding.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use can_dbc::{AttributeValue, ByteOrder, Dbc, MessageId, MultiplexIndicator, ValueDescription, ValueType};
+use proptest::prelude::*;
+use protocol::fixed::{Q, Q1_14};
+use protocol::message::{Answer, From, Message, NetworkPage, Request, SensorPage, State};
+use protocol::packet::{Epoch, Packet, WORDS};
+use protocol::parameters::Parameter;
+
+use super::*;
+use model::generate::{self, Wanted};
+
+/// A skin with cells 1 to 254 on its one bus.
+fn full() -> Skin {
+    let wanted = Wanted { cells: 254, ..Wanted::default() };
+    Skin::parse("full.toml", &generate::generate(&wanted).unwrap()).unwrap()
+}
+
+fn parsed(skin: &Skin, bus: usize) -> Dbc {
+    Dbc::try_from(dbc(skin, bus).as_str()).unwrap()
+}
+
+/// What a frame says by the DBC alone: the message's name, and each signal that is there with its value.
+fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; 16]) -> (String, BTreeMap<String, f64>) {
+    let whole = u128::from_le_bytes(*bytes);
+    let raw = |signal: &can_dbc::Signal| {
+        assert_eq!(signal.byte_order, ByteOrder::LittleEndian);
+        let bits = (whole >> signal.start_bit) & ((1 << signal.size) - 1);
+        let bits = i64::try_from(bits).unwrap();
+        let negative = signal.value_type == ValueType::Signed && bits >> (signal.size - 1) == 1;
+        if negative { bits - (1 << signal.size) } else { bits }
+    };
+    let switch =
+        dbc.signals.iter().find(|signal| signal.multiplexer_indicator == MultiplexIndicator::Multiplexor);
+    let page = switch.map(&raw);
+    let mut values = BTreeMap::new();
+    for signal in &dbc.signals {
+        let there = match signal.multiplexer_indicator {
+            MultiplexIndicator::Plain | MultiplexIndicator::Multiplexor => true,
+            MultiplexIndicator::MultiplexedSignal(on) => page == Some(i64::try_from(on).unwrap()),
+            MultiplexIndicator::MultiplexorAndMultiplexedSignal(_) => panic!("one level only"),
+        };
+        if there {
+            #[expect(clippy::cast_precision_loss, reason = "at most 32 bits")]
+            let value = raw(signal) as f64 * signal.factor + signal.offset;
+            assert!(values.insert(signal.name.clone(), value).is_none(), "{} twice", signal.name);
+        }
+    }
+    (dbc.name.clone(), values)
+}
+
+/// What a message says, by names and in units, as the protocol's own types have it.
+#[derive(Default)]
+struct Said(BTreeMap<String, f64>);
+
+impl Said {
+    fn put(&mut self, name: impl Into<String>, value: impl Into<f64>) {
+        assert!(self.0.insert(name.into(), value.into()).is_none());
+    }
+
+    fn each<T>(&mut self, names: [&str; WORDS], values: [T; WORDS], value: impl Fn(T) -> f64) {
+        for (name, of) in names.into_iter().zip(values) {
+            self.put(name, value(of));
+        }
+    }
+
+    fn state(&mut self, state: State) {
+        for (bit, name) in State::NAMES {
+            self.put(format!("state_{}", name.replace('-', "_")), u8::from(state.has(bit)));
+        }
+        self.put("state_joint", state.joint());
+        self.put("state_version", state.version());
+    }
+
+    fn felt(&mut self, page: SensorPage) {
+        match page {
+            SensorPage::Skin(skin) => {
+                self.put("page", 0);
+                for (index, contact) in (1..).zip(skin.contact) {
+                    self.put(format!("contact_{index}"), contact.to_f64());
+                }
+                self.put("proximity", skin.proximity.to_f64());
+                self.put("temperature_1", skin.temperature[0].to_f64());
+                self.put("temperature_2", skin.temperature[1].to_f64());
+            }
+            SensorPage::Acceleration(xyz) => {
+                self.put("page", 1);
+                for (axis, value) in ["x", "y", "z"].into_iter().zip(xyz) {
+                    self.put(format!("acceleration_{axis}"), value.to_f64());
+                }
+            }
+        }
+    }
+
+    fn parameter(&mut self, number: u8, words: [i16; WORDS]) {
+        self.put("parameter", number);
+        let unsigned = words.map(i16::cast_unsigned);
+        let q14 = |index: usize| Q1_14::from_bits(words[index]);
+        let newtons = |index: usize| Q::<10>::from_bits(words[index]).to_f64();
+        match Parameter::from_number(number) {
+            None => {}
+            Some(Parameter::Identity) => {
+                self.put("serial", u32::from(unsigned[0]) + (u32::from(unsigned[1]) << 16));
+                self.put("version", unsigned[2]);
+                self.put("configuration", unsigned[3]);
+                self.state(State(unsigned[4]));
+            }
+            Some(Parameter::Mount) => {
+                self.put("mount_joint", words[0]);
+                self.put("mount_joints", words[1]);
+            }
+            Some(Parameter::Pose) => {
+                let names = ["pose_x", "pose_y", "pose_z", "normal_x", "normal_y", "normal_z"];
+                self.each(names, words.map(Q1_14::from_bits), Q::to_f64);
+            }
+            Some(Parameter::Contact) => {
+                self.put("alpha_c", Q::<12>::from_bits(words[0]).to_f64());
+                self.put("alpha_p", newtons(1));
+                self.put("contact_threshold", newtons(2));
+                self.put("proximity_threshold", q14(3).to_f64());
+                self.put("force_threshold", newtons(4));
+            }
+            Some(Parameter::Timing) => self.put("period", unsigned[0]),
+            Some(Parameter::Mode) => self.put("mode", words[0]),
+            Some(Parameter::Reply) => {
+                self.put("reply", words[0]);
+                self.put("reply_slot", unsigned[1]);
+                self.put("reply_deepest", words[2]);
+                self.put("reply_carry", words[3]);
+            }
+            Some(Parameter::Sensing) => {
+                self.put("sensing", words[0]);
+                self.put("sensing_period", unsigned[1]);
+            }
+            Some(Parameter::Events) => {
+                self.put("events_contact", newtons(0));
+                self.put("events_proximity", q14(1).to_f64());
+                self.put("events_temperature", Q::<6>::from_bits(words[2]).to_f64());
+                self.put("events_acceleration", Q::<12>::from_bits(words[3]).to_f64());
+                self.put("events_hysteresis", q14(4).to_f64());
+            }
+            Some(Parameter::Cuts) => {
+                for port in 0..5 {
+                    self.put(format!("cut_port_{port}"), words[0] >> port & 1);
+                }
+            }
+            Some(Parameter::Row(row)) => {
+                let row = row + 1;
+                self.put(format!("row{row}_a"), q14(0).to_f64());
+                self.put(format!("row{row}_d"), q14(1).to_f64());
+                self.put(format!("row{row}_alpha"), q14(2).to_radians());
+                self.put(format!("row{row}_theta_offset"), q14(3).to_radians());
+            }
+            Some(Parameter::Commit) => self.put("commit_hash", unsigned[0]),
+        }
+    }
+}
+
+/// The name of a message and what it says; `None` for values that no encoding has.
+fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
+    let mut said = Said::default();
+    let crc = u16::from_le_bytes(packet.encode()[14..].try_into().unwrap());
+    said.put("crc", crc);
+    let numbered = |name: &str| std::array::from_fn::<_, WORDS, _>(|index| format!("{name}_{}", index + 1));
+    let name = match *message {
+        Message::Halt => "halt".to_owned(),
+        Message::Sync => "sync".to_owned(),
+        Message::Resume => "resume".to_owned(),
+        Message::Report => "report".to_owned(),
+        Message::Joints { epoch, joints } => {
+            said.put("epoch", epoch.0);
+            said.put("count", joints.in_use);
+            said.each(
+                numbered("position").each_ref().map(String::as_str),
+                joints.positions,
+                Q1_14::to_radians,
+            );
+            "joints".to_owned()
+        }
+        Message::Sum { from, epoch, torque, count } => {
+            said.put("epoch", epoch.0);
+            said.put("count", count);
+            said.each(numbered("sum").each_ref().map(String::as_str), torque, Q::to_f64);
+            format!("sum_{from}")
+        }
+        Message::Torque { from, epoch, torque } => {
+            said.put("epoch", epoch.0);
+            said.put("count", 1);
+            said.each(numbered("torque").each_ref().map(String::as_str), torque, Q::to_f64);
+            format!("torque_{from}")
+        }
+        Message::Sensors { from, epoch, page } => {
+            said.put("epoch", epoch.0);
+            said.felt(page);
+            format!("sensors_{from}")
+        }
+        Message::Network { from, epoch, page } => {
+            said.put("epoch", epoch.0);
+            match page {
+                NetworkPage::Heartbeat(heartbeat) => {
+                    said.put("page", 0);
+                    said.put("serial", heartbeat.serial);
+                    said.put("configuration", heartbeat.configuration);
+                    said.put("sent", heartbeat.sent);
+                    said.put("rejected", heartbeat.rejected);
+                    said.state(heartbeat.state);
+                }
+                NetworkPage::Heard(heard) => {
+                    said.put("page", 1);
+                    said.put("heard_joints", heard.joints);
+                    said.put("heard_joints_skipped", heard.joints_late);
+                    said.put("heard_joints_repeated", heard.joints_repeated);
+                    said.put("heard_stimuli", heard.stimuli);
+                    said.put("heard_stimuli_late", heard.stimuli_late);
+                    said.put("heard_torques", heard.torques);
+                }
+                NetworkPage::Refused(refused) => {
+                    said.put("page", 2);
+                    said.put("refused_length", refused.length);
+                    said.put("refused_crc", refused.crc);
+                    said.put("refused_foreign", refused.foreign);
+                    said.put("refused_meaning", refused.meaning);
+                    said.put("refused_incomplete", refused.incomplete);
+                    said.put("refused_stimuli", refused.stimuli);
+                }
+                NetworkPage::Tree(tree) => {
+                    said.put("page", 3);
+                    said.put("parent", tree.parent.unwrap_or(255));
+                    said.put("up", tree.up);
+                    said.put("depth", tree.depth);
+                    said.put("round", tree.round);
+                    for port in 0..4 {
+                        said.put(format!("child_at_{port}"), tree.children >> port & 1);
+                    }
+                    for port in 0..5 {
+                        said.put(format!("port_{port}_works"), tree.works >> port & 1);
+                    }
+                    said.put("sums_sent", tree.sent);
+                    said.put("sums_taken", tree.taken);
+                    said.put("sums_dropped", tree.dropped);
+                }
+                NetworkPage::Ports(ports) => {
+                    said.put("page", 4);
+                    for (index, port) in ports.ports.into_iter().enumerate() {
+                        said.put(format!("port_{index}_leads_to"), port.number);
+                        said.put(format!("port_{index}_leads_to_port"), port.port);
+                        said.put(format!("port_{index}_hears"), u8::from(port.hears));
+                        said.put(format!("port_{index}_both_ways"), u8::from(port.works));
+                        said.put(format!("port_{index}_other_version"), u8::from(port.other_version));
+                    }
+                    said.put("parent_changes", ports.changes);
+                }
+            }
+            format!("network_{from}")
+        }
+        Message::Configure { to, tag, request } => {
+            said.put("tag", tag);
+            let (number, words) = match request {
+                Request::Read { number } => (number, [0; WORDS]),
+                Request::Write { number, words } => (number, words),
+            };
+            said.put("write", u8::from(matches!(request, Request::Write { .. })));
+            said.parameter(number, words);
+            format!("configure_{to}")
+        }
+        Message::Configured { from, tag, answer } => {
+            said.put("tag", tag);
+            match answer {
+                Answer::Value { number, written, words } => {
+                    said.put("written", u8::from(written));
+                    said.parameter(number, words);
+                }
+                Answer::Refused { number, reason } => {
+                    said.put("written", 0);
+                    said.put("parameter", 126);
+                    said.put("refused_parameter", number);
+                    said.put("refused_reason", reason);
+                }
+            }
+            format!("configured_{from}")
+        }
+        Message::Stimulus { to, from, page } => {
+            said.put("epoch", if let From::Epoch(epoch) = from { epoch.0 } else { 0 });
+            said.put("from_next", u8::from(from == From::Next));
+            said.felt(page);
+            format!("stimulus_{to}")
+        }
+    };
+    (name, said.0)
+}
+
+/// Every message of the DBC by its identifier.
+fn by_id(dbc: &Dbc) -> BTreeMap<u16, &can_dbc::Message> {
+    let id = |message: &can_dbc::Message| match message.id {
+        MessageId::Standard(id) => id,
+        MessageId::Extended(id) => panic!("{id:X} has 29 bits"),
+    };
+    let all: BTreeMap<_, _> = dbc.messages.iter().map(|message| (id(message), message)).collect();
+    assert_eq!(all.len(), dbc.messages.len(), "no identifier twice");
+    all
+}
+
+#[test]
+fn every_message_says_through_the_dbc_what_the_protocol_says() {
+    let dbc = parsed(&full(), 0);
+    let messages = by_id(&dbc);
+    let mut met: BTreeSet<(u16, String)> = BTreeSet::new();
+    let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 17, 18, 19, 20, 21, 99, 126, 127];
+    let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]).chain([10, 200, 255]);
+    // The joints have one identifier of 2048, and are to be met as surely as the cells.
+    let node = prop_oneof![1 => Just(1_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
+    let cases = (
+        (0_u16..8, node).prop_map(|(kind, node)| kind << 8 | node),
+        any::<[i16; WORDS]>(),
+        any::<u8>(),
+        proptest::sample::select(counts.collect::<Vec<_>>()),
+    );
+    let config = ProptestConfig { cases: 40_000, failure_persistence: None, ..ProptestConfig::default() };
+    let met = std::cell::RefCell::new(&mut met);
+    proptest!(config, |((id, words, epoch, count) in cases)| {
+        let packet = Packet { id: Id::from_bits(id), words, epoch: Epoch(epoch), count };
+        let Ok(message) = Message::decode(&packet) else { return Ok(()) };
+        let packet = message.encode();
+        let (name, expected) = by_protocol(&message, &packet);
+        let (named, found) = by_dbc(messages[&id], &packet.encode());
+        prop_assert_eq!(named, name);
+        prop_assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
+        for (signal, value) in &found {
+            // Angles go through pi in another order.
+            prop_assert!((value - expected[signal]).abs() < 1e-15, "{}: {} and {}", signal, value, expected[signal]);
+            met.borrow_mut().insert((id >> 8, signal.clone()));
+        }
+    });
+    let there: BTreeSet<_> = messages
+        .iter()
+        .flat_map(|(id, message)| message.signals.iter().map(move |signal| (id >> 8, signal.name.clone())))
+        .collect();
+    let met = met.into_inner();
+    assert_eq!(there.difference(met).collect::<Vec<_>>(), Vec::<&(u16, String)>::new(), "never compared");
+}
+
+#[test]
+fn every_identifier_of_the_bus_is_there_and_no_other() {
+    let dbc = parsed(&full(), 0);
+    let messages = by_id(&dbc);
+    for id in 0..0x800 {
+        let packet = |count| Packet { id: Id::from_bits(id), words: [0; WORDS], epoch: Epoch(0), count };
+        let said = (0..=1).any(|count| Message::decode(&packet(count)).is_ok());
+        assert_eq!(messages.contains_key(&id), said, "{id:03X}");
+    }
+    for message in messages.values() {
+        assert_eq!(message.size, 16, "{}", message.name);
+    }
+    let names: BTreeSet<_> = dbc.messages.iter().map(|message| &message.name).collect();
+    assert_eq!(names.len(), dbc.messages.len(), "no name twice");
+}
+
+#[test]
+fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
+    let dbc = parsed(&model::testing::skin(), 0);
+    let names: Vec<_> = dbc.nodes.iter().map(|node| node.0.as_str()).collect();
+    assert_eq!(names, ["gateway", "cell_1"]);
+    let messages: Vec<_> = dbc
+        .messages
+        .iter()
+        .map(|message| {
+            let receivers: BTreeSet<_> =
+                message.signals.iter().flat_map(|signal| &signal.receivers).collect();
+            let receivers: Vec<_> = receivers.into_iter().map(String::as_str).collect();
+            (message.name.as_str(), message.transmitter.as_deref().unwrap_or("-"), receivers.join(" "))
+        })
+        .collect();
+    let expected = [
+        // Nobody whom the skin names hears another gateway: can-dbc gives nobody for that.
+        ("halt", "gateway", "cell_1"),
+        ("joints", "gateway", "cell_1"),
+        ("sync", "gateway", "cell_1"),
+        ("resume", "gateway", "cell_1"),
+        ("report", "gateway", "cell_1"),
+        ("sum_1", "cell_1", "gateway"),
+        ("torque_1", "cell_1", "gateway"),
+        ("sensors_1", "cell_1", "gateway"),
+        ("network_gateway", "gateway", ""),
+        ("network_1", "cell_1", "gateway"),
+        ("configure_1", "gateway", "cell_1"),
+        ("configure_everyone", "gateway", "cell_1"),
+        ("configured_1", "cell_1", "gateway"),
+        ("stimulus_1", "gateway", "cell_1"),
+        ("stimulus_everyone", "gateway", "cell_1"),
+    ];
+    assert_eq!(messages, expected.map(|(name, from, to)| (name, from, to.to_owned())));
+}
+
+#[test]
+fn words_have_names_units_and_ranges() {
+    let dbc = parsed(&model::testing::skin(), 0);
+    let signal = |id: u16, name: &str| {
+        let signal = dbc.signal_by_name(MessageId::Standard(id), name).unwrap();
+        let names = dbc.value_descriptions.iter().find_map(|described| {
+            let ValueDescription::Signal {
+                message_id: MessageId::Standard(of),
+                name: signal,
+                value_descriptions,
+            } = described
+            else {
+                return None;
+            };
+            let names =
+                || value_descriptions.iter().map(|value| (value.id, value.description.as_str())).collect();
+            (*of == id && signal == name).then(names)
+        });
+        let limit = |value: can_dbc::NumericValue| match value {
+            can_dbc::NumericValue::Uint(value) => value.to_string(),
+            can_dbc::NumericValue::Int(value) => value.to_string(),
+            can_dbc::NumericValue::Double(value) => value.to_string(),
+        };
+        let range = format!("{} to {} {}", limit(signal.min), limit(signal.max), signal.unit);
+        (range, names.unwrap_or_else(Vec::new))
+    };
+    let saturated = vec![(32_767, "saturated"), (-32_768, "saturated")];
+    assert_eq!(signal(0x201, "torque_6"), ("-8 to 7.999755859375 Nm".to_owned(), saturated.clone()));
+    assert_eq!(signal(0x101, "sum_1"), ("-128 to 127.99609375 Nm".to_owned(), saturated));
+    let angle = "-3.141592653589793 to 3.1414967797905504 rad";
+    assert_eq!(signal(0x001, "position_1"), (angle.to_owned(), vec![]));
+    assert_eq!(signal(0x001, "count"), ("1 to 6 ".to_owned(), vec![]));
+    assert_eq!(signal(0x301, "proximity"), ("0 to 1 ".to_owned(), vec![]));
+    assert_eq!(signal(0x301, "temperature_2"), ("-512 to 511.984375 degC".to_owned(), vec![]));
+    assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
+    assert_eq!(signal(0x701, "from_next").1, [(0, "from this epoch on"), (1, "from the next joints on")]);
+    assert_eq!(signal(0x501, "parameter").1.len(), 17);
+    assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "no way up")]));
+    assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
+    let refusal = signal(0x601, "parameter").1;
+    assert_eq!(refusal.last(), Some(&(126, "refusal")));
+    assert_eq!(signal(0x601, "refused_reason").1[6], (16, "the hash is not that of the staged copy"));
+}
+
+#[test]
+fn frames_are_fd_with_their_rhythm_and_bit_rates_where_they_are_known() {
+    let text = model::testing::SKIN.replace("\"fd\"", "\"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000");
+    let skin = Skin::parse("rates.toml", &text).unwrap();
+    let dbc = parsed(&skin, 0);
+    let of = |name: &str, id: u16| {
+        let values = dbc.attribute_values_message.iter();
+        let mut values =
+            values.filter(|value| value.name == name && value.message_id == MessageId::Standard(id));
+        let value = values.next().map(|value| value.value.clone());
+        assert_eq!(values.next(), None);
+        value
+    };
+    let number = |value| Some(AttributeValue::Uint(value));
+    for message in &dbc.messages {
+        let MessageId::Standard(id) = message.id else { panic!("29 bits") };
+        assert_eq!((of("VFrameFormat", id), of("CANFD_BRS", id)), (number(14), number(1)));
+    }
+    assert_eq!((of("GenMsgCycleTime", 0x001), of("GenMsgSendType", 0x001)), (number(16), number(1)));
+    assert_eq!((of("GenMsgCycleTime", 0x201), of("GenMsgSendType", 0x201)), (number(16), number(2)));
+    assert_eq!((of("GenMsgCycleTime", 0x401), of("GenMsgSendType", 0x401)), (number(250), number(1)));
+    assert_eq!((of("GenMsgCycleTime", 0x501), of("GenMsgSendType", 0x501)), (None, None));
+    let whole: BTreeMap<_, _> = dbc
+        .attribute_values_database
+        .iter()
+        .map(|value| (value.name.as_str(), value.value.clone()))
+        .collect();
+    assert_eq!(whole["DBName"], AttributeValue::String("vcan0".to_owned()));
+    assert_eq!(whole["Baudrate"], AttributeValue::Uint(1_000_000));
+    assert_eq!(whole["BaudrateCANFD"], AttributeValue::Uint(5_000_000));
+}
+
+#[test]
+fn what_the_file_and_its_nodes_are_stands_in_comments() {
+    let skin = model::testing::skin();
+    let dbc = parsed(&skin, 0);
+    let hash = skin.parameters(&skin.cells[0]).hash();
+    let serial = skin.cells[0].serial;
+    let cell = dbc.comments.iter().find_map(|comment| {
+        if let can_dbc::Comment::Node { name, comment } = comment {
+            Some((name.as_str(), comment))
+        } else {
+            None
+        }
+    });
+    let expected = format!("Serial number {serial}, moved by joint 3, configuration hash {hash:04X}.");
+    assert_eq!(cell, Some(("cell_1", &expected)));
+    let whole = dbc.comments.iter().find_map(|comment| {
+        if let can_dbc::Comment::Plain { comment } = comment { Some(comment) } else { None }
+    });
+    let begin = "Skin bare, bus vcan0, protocol version 1. A packet is one CAN FD frame";
+    assert!(whole.unwrap().starts_with(begin), "{whole:?}");
+    for message in &dbc.messages {
+        assert!(
+            dbc.message_comment(message.id).is_some_and(|comment| comment.ends_with('.')),
+            "{}",
+            message.name
+        );
+    }
+}
+
+#[test]
+fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
+    let wanted = Wanted { cells: 20, buses: 2, ..Wanted::default() };
+    let skin = Skin::parse("two.toml", &generate::generate(&wanted).unwrap()).unwrap();
+    for bus in 0..2 {
+        let cells: BTreeSet<_> = skin.cells_of(bus).map(|cell| format!("cell_{}", cell.node)).collect();
+        let nodes: BTreeSet<_> = parsed(&skin, bus).nodes.into_iter().skip(1).map(|node| node.0).collect();
+        assert_eq!(nodes, cells);
+    }
+    assert_eq!(dbc(&skin, 2), "");
+}
+
+#[test]
+fn the_text_is_plain() {
+    // Readers differ in which bytes beyond ASCII they take, and most name no identifier beyond 32 characters.
+    let text = dbc(&full(), 0);
+    assert!(text.is_ascii());
+    let names = text
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("SG_ ").or_else(|| line.strip_prefix("BO_ ")));
+    for name in names {
+        assert!(name.split(' ').all(|word| word.len() <= 32 || word.contains(['(', '[', ','])), "{name}");
+    }
+}

@@ -1,0 +1,461 @@
+//! Why a torque is what it is: `gateway explain`.
+//!
+//! ```text
+//!   frames up to some joints ──> Watch ──> what each cell felt and answered ─┐
+//!                                                                            ├──> Explanation
+//!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ──────┘
+//! ```
+//!
+//! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of what it felt, so a word
+//! that is not the step nearest to the exact product comes of the cell's own J: [`Row::verdict`] looks for a J near
+//! the exact one that makes the very word. What a capture does not tell is named in [`Explanation::missing`] and
+//! left open.
+
+mod felt;
+mod watch;
+
+pub use felt::Origin;
+pub use watch::{Asked, CellMoment, Moment, NotFound, Watch};
+
+use protocol::fixed::{Q, Q3_12};
+use protocol::message::{SkinSensors, State};
+use protocol::packet::WORDS;
+use protocol::skin::{Cell, Reply, Skin};
+use serde::Serialize;
+
+use model::central::Central;
+
+/// The most by which the J of a cell that computes in 16 bits may err, in steps of 2^-14 m: the 5e-4 m that the
+/// kernels promise for arms of any shape.
+pub const JACOBIAN_STEPS: i64 = 8;
+
+/// One epoch, explained.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Explanation {
+    /// The joints, bus by bus.
+    pub buses: Vec<BusExplained>,
+    /// Cells that were in contact or answered, bus by bus and by number.
+    pub cells: Vec<CellExplained>,
+    /// What the skin as a whole did to each joint.
+    pub total: Vec<Total>,
+    /// What is not known, a line each.
+    pub missing: Vec<String>,
+}
+
+/// What a bus was told.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BusExplained {
+    /// Its name.
+    pub bus: String,
+    /// When the joints came.
+    pub at_ns: u64,
+    /// The words of the joints in use.
+    pub position_words: Vec<i16>,
+    /// The same in rad.
+    pub position_rad: Vec<f64>,
+    /// Whether it was halted.
+    pub halted: bool,
+}
+
+/// One cell.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CellExplained {
+    /// Its bus.
+    pub bus: String,
+    /// Its number.
+    pub node: u8,
+    /// The joint that moves it.
+    pub joint: u8,
+    /// What it felt, and what it made of it; not there when that is not known.
+    pub force: Option<Force>,
+    /// The time from the joints to its torque; not there when none came.
+    pub answered_after_ns: Option<u64>,
+    /// Joint by joint.
+    pub rows: Vec<Row>,
+}
+
+/// Algorithm 1, step by step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Force {
+    /// How it is known what it felt.
+    pub origin: Origin,
+    /// The three contact words in N.
+    pub contact_n: [f64; 3],
+    /// The proximity.
+    pub proximity: f64,
+    /// Their sum in N, F_c.
+    pub touch_n: f64,
+    /// Below this, F_c counts as none.
+    pub contact_threshold_n: f64,
+    /// Below this, the proximity counts as none.
+    pub proximity_threshold: f64,
+    /// Weight of F_c.
+    pub alpha_c: f64,
+    /// Weight of the proximity in N.
+    pub alpha_p_n: f64,
+    /// alpha_c F_c + alpha_p F_p, of what counts, in N.
+    pub fused_n: f64,
+    /// Below this, the fused force counts as none.
+    pub force_threshold_n: f64,
+    /// F_z in steps of 2^-16 N, as the cell computes with it.
+    pub force_steps: i64,
+    /// The same in N.
+    pub force_n: f64,
+}
+
+/// One joint of one cell.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// The joint, from 1.
+    pub joint: u8,
+    /// The exact J of the quantised parameters in m; not there when they are not known.
+    pub jacobian_m: Option<f64>,
+    /// J F_z in f64, in Nm.
+    pub product_nm: Option<f64>,
+    /// The nearest step of 2^-12 Nm, held within the word.
+    pub nearest_word: Option<i16>,
+    /// The word of the frame.
+    pub word: Option<i16>,
+    /// The same in Nm.
+    pub word_nm: Option<f64>,
+    /// The word less the nearest step.
+    pub difference_steps: Option<i32>,
+    /// What the difference comes of.
+    pub verdict: Verdict,
+}
+
+/// Whether a word is what it should be.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "kebab-case", tag = "is")]
+pub enum Verdict {
+    /// The step nearest to the exact product.
+    Nearest,
+    /// Beyond the word: it says *saturated*, as it must.
+    Saturated,
+    /// What 16-bit arithmetic makes of it: this J, near the exact one, gives the very word.
+    Rounded {
+        /// The J in m.
+        jacobian_m: f64,
+        /// How far it is from the exact one, in steps of 2^-14 m.
+        jacobian_steps: f64,
+    },
+    /// No J near the exact one gives this word.
+    Unexplained,
+    /// The word or what it is to be compared with is not known.
+    Open,
+}
+
+/// One joint of the whole skin.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Total {
+    /// The joint, from 1.
+    pub joint: u8,
+    /// The sum of the frames' words: steps of 2^-12 Nm.
+    pub word_steps: i64,
+    /// The same in Nm.
+    pub words_nm: f64,
+    /// The sum of the exact products of the cells that answered, in Nm.
+    pub products_nm: f64,
+    /// What the central computation gives for all that is known to be felt, in Nm.
+    pub central_nm: f64,
+    /// The same with the numbers of the skin's file, before they were made words.
+    pub unrounded_nm: f64,
+    /// Words less central, in Nm.
+    pub difference_nm: f64,
+    /// Cells with a saturated word: the sum is no better than that.
+    pub saturated: u32,
+    /// Cells of which the word or what it should be is not known: the sums do not mean the same.
+    pub open: u32,
+}
+
+/// Explains what was found, by the skin's bus.
+#[must_use]
+pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
+    let (central, unquantised) = (Central::new(skin), Central::unquantised(skin));
+    let joints = skin.robot.joints.len();
+    let mut explanation =
+        Explanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
+    let mut sums = [Sum::default(); WORDS];
+    for (index, (bus, moment)) in skin.buses.iter().zip(moments).enumerate() {
+        let name = &bus.name;
+        let Some(moment) = moment else {
+            if skin.cells_of(index).next().is_some() {
+                explanation
+                    .missing
+                    .push(format!("{name}: these joints are not in the capture; the total is without it"));
+            }
+            continue;
+        };
+        if bus.reply != Reply::Torque {
+            explanation
+                .missing
+                .push(format!("{name} answers with sums, of which no single torque can be told"));
+        }
+        let positions = moment.joints.positions;
+        let frames = [&central, &unquantised].map(|central| central.frames(&positions));
+        explanation.buses.push(BusExplained {
+            bus: name.clone(),
+            at_ns: moment.at_ns,
+            position_words: positions.iter().take(joints).map(|word| word.to_bits()).collect(),
+            position_rad: positions.iter().take(joints).map(|word| word.to_radians()).collect(),
+            halted: moment.halted,
+        });
+        let mut silent = 0;
+        let mut here: Vec<_> = skin.cells.iter().enumerate().filter(|(_, cell)| cell.bus == index).collect();
+        here.sort_unstable_by_key(|(_, cell)| cell.node);
+        for (place, cell) in here {
+            let Some(said) = moment.cells.get(cell.node.index()) else { continue };
+            let known = known(skin, name, cell, said, &mut explanation.missing);
+            let force = known.map(|(sensors, origin)| force(cell, &sensors, origin));
+            let active = force.is_some_and(|force| force.force_steps > 0);
+            if said.answer.is_none() && force.is_none() {
+                silent += u32::from(said.felt.is_none());
+            }
+            if said.answer.is_none() && !active {
+                continue;
+            }
+            if active && said.answer.is_none() {
+                let why = match said.too_late {
+                    Some(at) => too_late(at.saturating_sub(moment.at_ns)),
+                    None => silence(moment.halted, said.state).to_owned(),
+                };
+                let node = cell.node;
+                explanation.missing.push(format!(
+                    "{name} {node}: no torque of this epoch in time: {why}; the words are without it"
+                ));
+            }
+            let [[exact, unit], [unrounded, _]] =
+                [(&central, &frames[0]), (&unquantised, &frames[1])].map(|(central, frames)| {
+                    let newtons = force.map_or(0.0, |force| force.fused_or_none());
+                    [newtons, 1.0].map(|newtons| central.torque(place, frames, newtons))
+                });
+            let words = said.answer.map(|(_, words)| words);
+            let rows = (0..joints).map(|at| {
+                row(at, at < usize::from(cell.joint), force.as_ref(), &exact, &unit, words.as_ref())
+            });
+            let rows: Vec<_> = rows.collect();
+            for (at, sum) in sums.iter_mut().enumerate().take(joints) {
+                sum.open += u32::from(force.is_none() || words.is_none());
+                let of = |values: &[f64; WORDS]| values.get(at).copied().unwrap_or_default();
+                sum.central += of(&exact);
+                sum.unrounded += of(&unrounded);
+                if let Some(word) = words.and_then(|words| words.get(at).copied()) {
+                    sum.words += i64::from(word.to_bits());
+                    sum.products += of(&exact);
+                    sum.saturated += u32::from(word.is_saturated());
+                }
+            }
+            explanation.cells.push(CellExplained {
+                bus: name.clone(),
+                node: cell.node.get(),
+                joint: cell.joint,
+                force,
+                answered_after_ns: said.answer.map(|(at, _)| at.saturating_sub(moment.at_ns)),
+                rows,
+            });
+        }
+        if silent > 0 {
+            explanation.missing.push(format!(
+                "{name}: {silent} cells said nothing, and what they felt is not in the capture; they are taken as not \
+                 in contact"
+            ));
+        }
+    }
+    explanation.total = (1..).zip(sums).take(joints).map(|(joint, sum)| sum.total(joint)).collect();
+    explanation
+}
+
+#[derive(Clone, Copy, Default)]
+struct Sum {
+    words: i64,
+    products: f64,
+    central: f64,
+    unrounded: f64,
+    saturated: u32,
+    open: u32,
+}
+
+impl Sum {
+    #[expect(clippy::cast_precision_loss, reason = "254 words a bus: exact")]
+    fn total(self, joint: u8) -> Total {
+        let words_nm = self.words as f64 / 4_096.0;
+        Total {
+            joint,
+            word_steps: self.words,
+            words_nm,
+            products_nm: self.products,
+            central_nm: self.central,
+            unrounded_nm: self.unrounded,
+            difference_nm: words_nm - self.central,
+            saturated: self.saturated,
+            open: self.open,
+        }
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "to be read")]
+fn too_late(nanos: u64) -> String {
+    let ms = nanos as f64 / 1e6;
+    format!("it came {ms:.3} ms after the joints, when four more had come, and is not used")
+}
+
+/// Why a cell in contact says nothing, as far as is known.
+fn silence(halted: bool, state: Option<State>) -> &'static str {
+    let has = |bit| state.is_some_and(|state| state.has(bit));
+    if halted || has(State::HALTED) {
+        "it was halted"
+    } else if has(State::CLAIMING) {
+        "it had just started and claimed its number"
+    } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
+        "it had no configuration"
+    } else {
+        "lost, or the cell was not there"
+    }
+}
+
+/// What a cell felt, if its torque can be computed from that; else why not, when it matters.
+fn known(
+    skin: &Skin,
+    bus: &str,
+    cell: &Cell,
+    said: &CellMoment,
+    missing: &mut Vec<String>,
+) -> Option<(SkinSensors, Origin)> {
+    let node = cell.node;
+    let wanted = skin.parameters(cell).hash();
+    let answered = said.answer.is_some();
+    let touched = said.felt.is_some_and(|(sensors, _)| sensors != SkinSensors::default());
+    match said.hash {
+        Some(hash) if hash != wanted => {
+            if answered || touched {
+                missing.push(format!(
+                    "{bus} {node}: it computes with configuration {hash:04X}, the skin says {wanted:04X}: its force \
+                     and its torque cannot be computed from this skin"
+                ));
+            }
+            return None;
+        }
+        None if answered || touched => missing.push(format!(
+            "{bus} {node}: it said nothing of its configuration; taken to be the skin's, {wanted:04X}"
+        )),
+        Some(_) | None => {}
+    }
+    if answered && said.felt.is_none() {
+        let why = match said.test_mode {
+            Some(false) => "it measures, and said no sensors page of this epoch",
+            Some(true) | None => "no stimulus, start or sensors page of it came before",
+        };
+        missing.push(format!("{bus} {node}: what it felt is not in the capture: {why}"));
+    }
+    if said.repeated > 0 {
+        missing.push(format!("{bus} {node}: {} further torques of this epoch are not used", said.repeated));
+    }
+    said.felt
+}
+
+impl Force {
+    /// The fused force if it counts, in N: exact, before the cell rounds it.
+    const fn fused_or_none(&self) -> f64 {
+        if self.force_steps > 0 { self.fused_n } else { 0.0 }
+    }
+}
+
+/// Algorithm 1 in `f64`, where every word, sum and product of it is exact.
+#[expect(clippy::cast_possible_truncation, reason = "at most 2^36 steps of 2^-24: exact")]
+fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
+    let rule = &cell.contact;
+    let contact_n = sensors.contact.map(Q::to_f64);
+    let touch_n = contact_n.iter().sum();
+    let proximity = sensors.proximity.to_f64();
+    let above = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
+    let (alpha_c, alpha_p_n) = (rule.alpha_c.to_f64(), rule.alpha_p.to_f64());
+    let (contact_threshold_n, proximity_threshold) =
+        (rule.contact_threshold.to_f64(), rule.proximity_threshold.to_f64());
+    let force_threshold_n = rule.force_threshold.to_f64();
+    let fused_n =
+        alpha_c * above(touch_n, contact_threshold_n) + alpha_p_n * above(proximity, proximity_threshold);
+    let counts = above(fused_n, force_threshold_n).max(0.0);
+    let force_steps = ((counts * 16_777_216.0) as i64 + 128) >> 8;
+    Force {
+        origin,
+        contact_n,
+        proximity,
+        touch_n,
+        contact_threshold_n,
+        proximity_threshold,
+        alpha_c,
+        alpha_p_n,
+        fused_n,
+        force_threshold_n,
+        force_steps,
+        force_n: to_newtons(force_steps),
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "at most 2^28 steps")]
+fn to_newtons(steps: i64) -> f64 {
+    steps as f64 / 65_536.0
+}
+
+fn row(
+    at: usize,
+    moves: bool,
+    force: Option<&Force>,
+    exact: &[f64; WORDS],
+    unit: &[f64; WORDS],
+    words: Option<&[Q3_12; WORDS]>,
+) -> Row {
+    let joint = u8::try_from(at + 1).unwrap_or(u8::MAX);
+    let of = |values: &[f64; WORDS]| force.and_then(|_| values.get(at).copied());
+    let (jacobian_m, product_nm) = (of(unit), of(exact));
+    let nearest = product_nm.map(Q3_12::nearest);
+    let word = words.and_then(|words| words.get(at).copied());
+    let difference =
+        nearest.zip(word).map(|(nearest, word)| i32::from(word.to_bits()) - i32::from(nearest.to_bits()));
+    let verdict = match (force, jacobian_m, nearest, word) {
+        (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
+            judge(force.force_steps, jacobian, moves, nearest, word)
+        }
+        (_, _, _, _) => Verdict::Open,
+    };
+    Row {
+        joint,
+        jacobian_m,
+        product_nm,
+        nearest_word: nearest.map(Q::to_bits),
+        word: word.map(Q::to_bits),
+        word_nm: word.map(Q::to_f64),
+        difference_steps: difference,
+        verdict,
+    }
+}
+
+/// What a word that should be `nearest` comes of.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
+    reason = "J is within +-2 m: 2^15 steps"
+)]
+fn judge(force_steps: i64, jacobian_m: f64, moves: bool, nearest: Q3_12, word: Q3_12) -> Verdict {
+    if word == nearest {
+        return if word.is_saturated() { Verdict::Saturated } else { Verdict::Nearest };
+    }
+    let exact = jacobian_m * 16_384.0;
+    let middle = exact.round() as i64;
+    let mut near: Vec<i64> = (middle - JACOBIAN_STEPS - 1..=middle + JACOBIAN_STEPS + 1).collect();
+    let off = |steps: i64| steps as f64 - exact;
+    near.sort_by(|one, other| off(*one).abs().total_cmp(&off(*other).abs()));
+    let gives = |steps: i64| {
+        let held = ((steps * force_steps + (1 << 17)) >> 18).clamp(i64::from(i16::MIN), i64::from(i16::MAX));
+        held == i64::from(word.to_bits())
+    };
+    let found = near.into_iter().find(|&steps| off(steps).abs() <= JACOBIAN_STEPS as f64 && gives(steps));
+    // A joint that does not move the cell has no J that could err.
+    found.filter(|_| moves).map_or(Verdict::Unexplained, |steps| Verdict::Rounded {
+        jacobian_m: steps as f64 / 16_384.0,
+        jacobian_steps: off(steps),
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,232 @@
+//! One cell by hand, and what is found of which joints. Whole benches are explained in `tests/tests/bench_explain.rs`.
+
+use super::*;
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::{CellId, Node};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::packet::Epoch;
+
+/// The document's cell 12 on the second link of a UR5: its configuration, its joints, its touch, its torque.
+fn skin() -> Skin {
+    let cell = "node = 12\njoint = 2\nposition = [0.1, 0.05, 0.06]";
+    let text = model::testing::SKIN.replace("node = 1\njoint = 3\nposition = [0.2, 0.01, 0.15]", cell);
+    let text = text.replace("[0.7071068, 0.0, 0.0, 0.7071068]", "[-0.4472135955, 0.0, 0.0, 0.894427191]");
+    let contact =
+        "alpha_p = 0.0\ncontact_threshold_n = 0.1\nproximity_threshold = 0.05\nforce_threshold_n = 0.1";
+    let before =
+        "alpha_p = 2.0\ncontact_threshold_n = 0.1\nproximity_threshold = 0.25\nforce_threshold_n = 0.3";
+    let skin = Skin::parse("document.toml", &text.replace(before, contact)).unwrap();
+    assert_eq!(skin.parameters(&skin.cells[0]).hash(), 0x266D, "the document's configuration");
+    skin
+}
+
+fn cell() -> CellId {
+    CellId::new(12).unwrap()
+}
+
+fn joints(epoch: u8) -> Message {
+    let words: [u16; 6] = [0, 0xCF1C, 0x28BE, 0xC6F5, 0xC008, 0];
+    let positions = words.map(|word| Q1_14::from_bits(word.cast_signed()));
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } }
+}
+
+fn press(from: From, newtons: f64) -> Message {
+    let page =
+        SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() });
+    Message::Stimulus { to: Node::Cell(cell()), from, page }
+}
+
+fn torque(epoch: u8, words: [i16; 2]) -> Message {
+    let [one, two] = words.map(Q3_12::from_bits);
+    let zero = Q3_12::ZERO;
+    Message::Torque { from: cell(), epoch: Epoch(epoch), torque: [one, two, zero, zero, zero, zero] }
+}
+
+fn heartbeat(configuration: u16) -> Message {
+    let state = State::CONFIGURED.with(State::TEST_MODE, true);
+    let page = NetworkPage::Heartbeat(Heartbeat { configuration, state, sent: 7, ..Heartbeat::default() });
+    Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
+}
+
+/// What these messages, a millisecond apart, explain.
+fn explained(skin: &Skin, messages: &[Message], asked: Asked) -> Result<Explanation, NotFound> {
+    let mut watch = Watch::new(skin, asked);
+    for (at, message) in (1..).zip(messages) {
+        if watch.take(at * 1_000_000, "vcan0", Some(message)) {
+            break;
+        }
+    }
+    watch.moments().map(|moments| explain(skin, &moments))
+}
+
+fn first(epoch: u8) -> Asked {
+    Asked { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 }
+}
+
+#[test]
+fn the_worked_example_of_the_document_is_explained_step_by_step() {
+    let skin = skin();
+    let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let explanation = explained(&skin, &said, first(7)).unwrap();
+    assert_eq!(explanation.missing, Vec::<String>::new());
+    let [cell] = explanation.cells.as_slice() else { panic!("{explanation:?}") };
+    let force = cell.force.unwrap();
+    assert_eq!((force.force_steps, force.touch_n.to_bits()), (196_608, 3.0_f64.to_bits()));
+    assert_eq!(force.origin, Origin::Stimulus { at_ns: 2_000_000, from_epoch: None, late: false });
+    assert_eq!(cell.answered_after_ns, Some(1_000_000));
+    let jacobian: Vec<_> =
+        cell.rows.iter().map(|row| Q1_14::nearest(row.jacobian_m.unwrap()).to_bits()).collect();
+    assert_eq!(jacobian, [-1433, 4260, 0, 0, 0, 0]);
+    assert_eq!(cell.rows.iter().map(|row| row.word.unwrap()).collect::<Vec<_>>(), [-1075, 3195, 0, 0, 0, 0]);
+    for row in &cell.rows {
+        let off = row.product_nm.unwrap() * 4_096.0 - f64::from(row.nearest_word.unwrap());
+        assert!(off.abs() <= 0.5, "{row:?}");
+        assert!(!matches!(row.verdict, Verdict::Unexplained | Verdict::Open), "{row:?}");
+    }
+    assert_eq!(explanation.total[1].word_steps, 3195);
+}
+
+#[test]
+fn a_word_that_no_jacobian_near_makes_is_not_explained() {
+    let skin = skin();
+    let verdicts = |words| {
+        let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), torque(7, words)];
+        let explanation = explained(&skin, &said, first(7)).unwrap();
+        [0, 1].map(|at| explanation.cells[0].rows[at].verdict)
+    };
+    // 3 N and 8 steps of 2^-14 m are 6 steps of 2^-12 Nm.
+    assert!(matches!(verdicts([-1075 + 5, 3195 - 5]), [Verdict::Rounded { .. }, Verdict::Rounded { .. }]));
+    assert_eq!(verdicts([-1075 + 9, 3195 - 9]), [Verdict::Unexplained; 2]);
+    assert_eq!(verdicts([i16::MAX, -3195]), [Verdict::Unexplained; 2]);
+}
+
+#[test]
+fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
+    let skin = skin();
+    let mut wrong = torque(7, [-1075, 3195]);
+    if let Message::Torque { torque, .. } = &mut wrong {
+        torque[2] = Q3_12::from_bits(1);
+    }
+    let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), wrong];
+    let explanation = explained(&skin, &said, first(7)).unwrap();
+    assert_eq!(explanation.cells[0].rows[2].verdict, Verdict::Unexplained);
+}
+
+#[test]
+fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
+    let skin = skin();
+    let verdict = |word| {
+        let said = [heartbeat(0x266D), press(From::Next, 30.0), joints(7), torque(7, [-32_250, word])];
+        explained(&skin, &said, first(7)).unwrap().cells[0].rows[1].verdict
+    };
+    assert_eq!(verdict(i16::MAX), Verdict::Saturated);
+    assert_eq!(verdict(32_000), Verdict::Unexplained);
+}
+
+#[test]
+fn another_configuration_is_named_and_nothing_computed() {
+    let skin = skin();
+    let said = [heartbeat(0x1234), press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let explanation = explained(&skin, &said, first(7)).unwrap();
+    let expected = "vcan0 12: it computes with configuration 1234, the skin says 266D: its force and its torque cannot \
+                    be computed from this skin";
+    assert_eq!(explanation.missing, [expected]);
+    assert!(explanation.cells[0].force.is_none());
+    assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
+    // Its first word came after the torque: it was the same then.
+    let said = [press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
+    assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
+    let without = explained(&skin, &said[..3], first(7)).unwrap();
+    let expected = "vcan0 12: it said nothing of its configuration; taken to be the skin's, 266D";
+    assert_eq!(without.missing, [expected]);
+    assert!(without.cells[0].force.is_some());
+}
+
+#[test]
+fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
+    let skin = skin();
+    let measuring = {
+        let page = NetworkPage::Heartbeat(Heartbeat {
+            configuration: 0x266D,
+            state: State::CONFIGURED,
+            sent: 7,
+            ..Heartbeat::default()
+        });
+        Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
+    };
+    let page = |epoch| {
+        let skin = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
+        Message::Sensors { from: cell(), epoch: Epoch(epoch), page: SensorPage::Skin(skin) }
+    };
+    // A stimulus is refused by a cell that measures.
+    let said = [measuring, press(From::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
+    let explanation = explained(&skin, &said, first(7)).unwrap();
+    let expected =
+        "vcan0 12: what it felt is not in the capture: it measures, and said no sensors page of this epoch";
+    assert_eq!(explanation.missing, [expected]);
+    let told = [&said[..], &[page(7)]].concat();
+    let explanation = explained(&skin, &told, first(7)).unwrap();
+    assert_eq!(explanation.missing, Vec::<String>::new());
+    assert_eq!(explanation.cells[0].force.unwrap().force_steps, 196_608);
+}
+
+#[test]
+fn joints_are_found_by_epoch_time_and_occurrence() {
+    let skin = skin();
+    let said: Vec<_> = (0..=255).chain(0..=20).map(joints).collect();
+    let at = |asked: Asked| {
+        explained(&skin, &said, asked).map(|explanation| explanation.buses[0].at_ns / 1_000_000)
+    };
+    assert_eq!(at(first(7)), Ok(8));
+    assert_eq!(at(Asked { occurrence: 2, ..first(7) }), Ok(264));
+    assert_eq!(at(Asked { from_ns: 100_000_000, ..first(7) }), Ok(264));
+    let error = at(Asked { occurrence: 2, ..first(21) }).unwrap_err().to_string();
+    let expected = "there are no joints of epoch 21 for the 2. time; there are 277 joints in a row, from epoch 0 at \
+                    0.000 s to epoch 20 at 0.276 s";
+    assert_eq!(error, expected);
+}
+
+#[test]
+fn what_is_not_there_is_named_with_what_is() {
+    let skin = skin();
+    let said = [joints(1), joints(2), joints(9)];
+    let error = explained(&skin, &said, first(5)).unwrap_err().to_string();
+    let expected = "there are no joints of epoch 5; there are 2 joints in a row, from epoch 1 at 0.000 s to epoch 2 at \
+                    0.001 s; those of epoch 9 at 0.002 s";
+    assert_eq!(error, expected);
+    let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
+    assert_eq!(error, "there are no joints on vcan0, and cells answer nothing else");
+    let mut watch = Watch::new(&skin, first(5));
+    watch.take(0, "can7", None);
+    let error = watch.moments().unwrap_err().to_string();
+    assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
+    // Memory is bounded whatever comes.
+    let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
+    let error = explained(&skin, &said, Asked { occurrence: 9, ..first(5) }).unwrap_err().to_string();
+    assert!(error.ends_with("; 192 further rows"), "{error}");
+}
+
+#[test]
+fn joints_that_a_cell_drops_are_none() {
+    let skin = skin();
+    let again = [joints(7), joints(7), joints(8), joints(7)];
+    let explanation = explained(&skin, &again, Asked { occurrence: 2, ..first(7) }).unwrap();
+    assert_eq!(explanation.buses[0].at_ns, 4_000_000, "the second of them was repeated");
+}
+
+#[test]
+fn a_torque_after_four_more_joints_is_named_and_not_used() {
+    let skin = skin();
+    let said = |more: u8| {
+        let mut said = vec![heartbeat(0x266D), press(From::Next, 1.0), joints(7)];
+        said.extend((8..8 + more).map(joints));
+        said.push(torque(7, [-1075, 3195]));
+        said
+    };
+    let in_time = explained(&skin, &said(3), first(7)).unwrap();
+    assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
+    let late = explained(&skin, &said(4), first(7)).unwrap();
+    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, when four more had \
+                    come, and is not used; the words are without it";
+    assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
+}

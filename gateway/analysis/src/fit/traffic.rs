@@ -1,0 +1,307 @@
+//! What of the traffic on a bench's bus a real bus carries too, and what only a bench sends.
+//!
+//! A real bus carries joints, answers, sensors, heartbeats, the tree's messages, commands and configuration. Only a bench
+//! sends stimuli, sync and report with their answers, and what stands for wires between cells.
+
+use protocol::can::{Format, Frame};
+use protocol::id::{CellId, Id, Node};
+use protocol::message::{Message, NetworkPage, SensorPage, State};
+use protocol::packet::{Epoch, Half, Packet, Paired, data_id};
+use protocol::time::Micros;
+use serde::Serialize;
+
+use model::decode::wired;
+
+/// Identifiers of 11 bits.
+const IDS: usize = 0x800;
+
+/// What only a bench sends.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Bench {
+    /// What a cell shall feel.
+    Stimulus,
+    /// Sync, and the heartbeats that answer it.
+    Sync,
+    /// Report, and the pages that answer it.
+    Report,
+    /// What stands for a wire between cells.
+    Wire,
+}
+
+/// Frames that only a bench sends.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct BenchFrames {
+    /// Stimuli.
+    pub stimuli: u64,
+    /// Sync and its answers.
+    pub syncs: u64,
+    /// Report and its answers.
+    pub reports: u64,
+    /// Simulated wires.
+    pub wires: u64,
+}
+
+impl BenchFrames {
+    /// Counts so many more.
+    pub const fn count(&mut self, what: Bench, frames: u64) {
+        match what {
+            Bench::Stimulus => self.stimuli += frames,
+            Bench::Sync => self.syncs += frames,
+            Bench::Report => self.reports += frames,
+            Bench::Wire => self.wires += frames,
+        }
+    }
+
+    /// All of them.
+    #[must_use]
+    pub const fn total(&self) -> u64 {
+        self.stimuli + self.syncs + self.reports + self.wires
+    }
+}
+
+/// What a frame says about the course of a run.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Says {
+    /// Nothing.
+    Other,
+    /// Joints.
+    Joints(Epoch),
+    /// A torque or a sum, for these joints.
+    Answer(Epoch),
+    /// Cells stop answering.
+    Halt,
+    /// They go on.
+    Resume,
+    /// Something that is said before the first joints: numbers are claimed, parameters written or read, a report is asked for.
+    Preparation,
+}
+
+/// A frame, sorted.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Sorted {
+    /// What it says.
+    pub says: Says,
+    /// Set when only a bench sends it.
+    pub bench: Option<Bench>,
+    /// Which cell sent it, where it ends a packet.
+    pub from: Option<CellId>,
+    /// Whether it ends a packet of two classic frames: all this holds of the one before it under its identifier too.
+    pub ends_pair: bool,
+}
+
+impl Sorted {
+    const OTHER: Self = Self { says: Says::Other, bench: None, from: None, ends_pair: false };
+}
+
+/// The frames of one bus as they come, however long that lasts.
+#[derive(Debug, Default)]
+pub struct Traffic {
+    /// Frames of sound packets, and 11-bit data frames that were none.
+    ours: u64,
+    others: u64,
+    /// By identifier.
+    halves: Vec<Half>,
+    /// By cell: what it owes the bench.
+    owed: Vec<Owed>,
+}
+
+/// What a cell still answers to sync and report.
+#[derive(Clone, Copy, Debug, Default)]
+struct Owed {
+    heartbeat: bool,
+    /// Pages of the report: sensors 0, sensors 1, tree.
+    pages: [bool; 3],
+}
+
+impl Traffic {
+    /// Whether most of what could be packets of this project's protocol were; chance makes one frame in 65 536 a packet.
+    #[must_use]
+    pub const fn is_ours(&self) -> bool {
+        self.ours > self.others
+    }
+
+    /// Takes the next frame. On a bus of another protocol nothing is a bench's. Never panics.
+    pub fn sort(&mut self, nanos: u64, frame: &Frame) -> Sorted {
+        let Ok(id) = data_id(frame) else {
+            let bench = wired(frame).map(|_| Bench::Wire);
+            return Sorted { bench, ..Sorted::OTHER };
+        };
+        let Some((packet, ends_pair)) = self.packet(nanos, id, frame) else { return Sorted::OTHER };
+        match Message::decode(&packet) {
+            Ok(message) if self.is_ours() => {
+                Sorted { ends_pair, from: id.sender(), ..self.message(&message) }
+            }
+            _ => Sorted::OTHER,
+        }
+    }
+
+    /// The packet that is whole with this frame.
+    fn packet(&mut self, nanos: u64, id: Id, frame: &Frame) -> Option<(Packet, bool)> {
+        if frame.format() == Format::Fd {
+            let packet = Packet::from_fd(frame).ok();
+            *(if packet.is_some() { &mut self.ours } else { &mut self.others }) += 1;
+            return Some((packet?, false));
+        }
+        if self.halves.is_empty() {
+            self.halves.resize(IDS, Half::NONE);
+        }
+        let half = self.halves.get_mut(usize::from(id.to_bits()))?;
+        match half.push(Micros(nanos / 1_000), id, frame.data()) {
+            Ok(Paired::Whole(packet)) => {
+                self.ours += 2;
+                Some((packet, true))
+            }
+            Ok(Paired::Waiting) => None,
+            Ok(Paired::Incomplete) | Err(_) => {
+                self.others += 1;
+                None
+            }
+        }
+    }
+
+    fn message(&mut self, message: &Message) -> Sorted {
+        let says = |says| Sorted { says, ..Sorted::OTHER };
+        let bench = |bench| Sorted { bench: Some(bench), ..Sorted::OTHER };
+        match message {
+            Message::Joints { epoch, .. } => says(Says::Joints(*epoch)),
+            Message::Torque { epoch, .. } | Message::Sum { epoch, .. } => says(Says::Answer(*epoch)),
+            Message::Halt => says(Says::Halt),
+            Message::Resume => says(Says::Resume),
+            Message::Configure { .. } | Message::Configured { .. } => says(Says::Preparation),
+            Message::Stimulus { .. } => bench(Bench::Stimulus),
+            Message::Sync => {
+                self.all_owe(|owed| owed.heartbeat = true);
+                bench(Bench::Sync)
+            }
+            Message::Report => Sorted { says: Says::Preparation, ..bench(Bench::Report) },
+            Message::Sensors { from, page, .. } => {
+                let page = match page {
+                    SensorPage::Skin(_) => 0,
+                    SensorPage::Acceleration(_) => 1,
+                };
+                self.page(*from, page)
+            }
+            Message::Network { from, page, .. } => {
+                let Node::Cell(from) = from else { return Sorted::OTHER };
+                match page {
+                    NetworkPage::Heartbeat(heartbeat) if heartbeat.state.has(State::CLAIMING) => {
+                        // It leaves sync and report unanswered.
+                        self.owed(*from).map(std::mem::take);
+                        says(Says::Preparation)
+                    }
+                    NetworkPage::Heartbeat(_) => {
+                        let owed = self.owed(*from).map(std::mem::take).unwrap_or_default();
+                        if owed.heartbeat { bench(Bench::Sync) } else { Sorted::OTHER }
+                    }
+                    // Nothing but a report makes a cell send these; the others of it follow.
+                    NetworkPage::Heard(_) | NetworkPage::Refused(_) => {
+                        self.owed(*from).into_iter().for_each(|owed| owed.pages = [true; 3]);
+                        bench(Bench::Report)
+                    }
+                    NetworkPage::Ports(_) => bench(Bench::Report),
+                    NetworkPage::Tree(_) => self.page(*from, 2),
+                }
+            }
+        }
+    }
+
+    /// A page that a cell says on a report, and at other times too.
+    fn page(&mut self, from: CellId, page: usize) -> Sorted {
+        let owed = self.owed(from).and_then(|owed| owed.pages.get_mut(page)).map(std::mem::take);
+        Sorted { bench: owed.unwrap_or(false).then_some(Bench::Report), ..Sorted::OTHER }
+    }
+
+    fn owed(&mut self, cell: CellId) -> Option<&mut Owed> {
+        self.owed.resize(CellId::COUNT, Owed::default());
+        self.owed.get_mut(cell.index())
+    }
+
+    fn all_owe(&mut self, what: impl FnMut(&mut Owed)) {
+        self.owed.resize(CellId::COUNT, Owed::default());
+        self.owed.iter_mut().for_each(what);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::message::{Heard, Heartbeat, Refused, SkinSensors, Tree};
+
+    fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<Bench>> {
+        message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()
+    }
+
+    fn page(from: i64, page: NetworkPage) -> Message {
+        Message::Network { from: Node::Cell(CellId::new(from).unwrap()), epoch: Epoch(0), page }
+    }
+
+    fn heartbeat(from: i64, state: State) -> Message {
+        page(from, NetworkPage::Heartbeat(Heartbeat { state, ..Heartbeat::default() }))
+    }
+
+    fn skin(from: i64) -> Message {
+        let page = SensorPage::Skin(SkinSensors::default());
+        Message::Sensors { from: CellId::new(from).unwrap(), epoch: Epoch(0), page }
+    }
+
+    #[test]
+    fn what_answers_a_sync_or_a_report_is_the_benchs_once_and_what_comes_by_itself_is_not() {
+        for format in [Format::Fd, Format::Classic] {
+            let mut traffic = Traffic::default();
+            let mut last = |message: &Message| *said(&mut traffic, format, message).last().unwrap();
+            let (alive, tree) =
+                (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(Tree::default())));
+            assert_eq!([last(&alive), last(&skin(1)), last(&tree)], [None; 3]);
+            assert_eq!(last(&Message::Sync), Some(Bench::Sync));
+            assert_eq!(last(&heartbeat(2, State::CLAIMING)), None, "it leaves sync unanswered");
+            assert_eq!([last(&alive), last(&alive)], [Some(Bench::Sync), None]);
+            assert_eq!(last(&heartbeat(2, State::CONFIGURED)), None);
+            assert_eq!(last(&Message::Report), Some(Bench::Report));
+            assert_eq!(last(&skin(1)), None, "before the answers begin");
+            for page_of_one in
+                [NetworkPage::Heard(Heard::default()), NetworkPage::Refused(Refused::default())]
+            {
+                assert_eq!(last(&page(1, page_of_one)), Some(Bench::Report));
+            }
+            assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(Bench::Report), None, None]);
+            assert_eq!([last(&tree), last(&tree)], [Some(Bench::Report), None]);
+            // A cell without ports says no tree; its next one comes by itself.
+            last(&page(1, NetworkPage::Refused(Refused::default())));
+            assert_eq!([last(&alive), last(&tree)], [None; 2]);
+        }
+    }
+
+    #[test]
+    fn a_first_half_says_nothing_and_the_second_one_all_of_it() {
+        let mut traffic = Traffic::default();
+        let stimulus = Message::Stimulus {
+            to: Node::Everyone,
+            from: protocol::message::From::Next,
+            page: SensorPage::Skin(SkinSensors::default()),
+        };
+        assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(Bench::Stimulus)]);
+        let torque = skin(9).encode();
+        let sorted: Vec<_> = torque.frames(Format::Classic).map(|frame| traffic.sort(0, &frame)).collect();
+        assert_eq!((sorted[0].from, sorted[0].ends_pair), (None, false));
+        assert_eq!((sorted[1].from, sorted[1].ends_pair), (CellId::new(9).ok(), true));
+    }
+
+    proptest! {
+        #[test]
+        fn chance_makes_no_bench(frames in proptest::collection::vec((0..0x800_u32, any::<[u8; 16]>(), any::<bool>()), 0..400)) {
+            let mut traffic = Traffic::default();
+            // Of the first frame alone it would be believed: one in 65 536.
+            let stranger = Frame::classic(0x700, &[1]).unwrap();
+            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &stranger), Sorted::OTHER));
+            for (id, data, is_fd) in frames {
+                let frame = if is_fd {
+                    Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)
+                } else {
+                    Frame::classic(id, data.get(..8).unwrap())
+                };
+                prop_assert_eq!(traffic.sort(0, &frame.unwrap()).bench, None);
+            }
+        }
+    }
+}

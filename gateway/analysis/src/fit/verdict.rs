@@ -1,0 +1,215 @@
+//! Whether a bus carries what is on it, in the words of every command that says so.
+
+use std::fmt::{self, Display, Formatter};
+
+use serde::{Serialize, Serializer};
+
+use super::Judged;
+use super::limits::{Limit, NODES};
+
+/// Whether something fits on a bus.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Verdict {
+    /// In bandwidth, deadline and number of nodes.
+    Fits,
+    /// In bandwidth and deadline, but so many nodes are more than transceivers drive.
+    Nodes(u32),
+    /// More is asked of the bus than it carries.
+    Bandwidth,
+    /// An answer comes after the next joints.
+    Deadline,
+}
+
+impl Verdict {
+    /// Of what is too much on a bus of so many cells.
+    #[must_use]
+    pub fn of(exceeded: &[Limit], cells: u32) -> Self {
+        if exceeded.contains(&Limit::Bandwidth) {
+            Self::Bandwidth
+        } else if exceeded.contains(&Limit::Deadline) {
+            Self::Deadline
+        } else if exceeded.contains(&Limit::Nodes) {
+            Self::Nodes(cells.saturating_add(1))
+        } else {
+            Self::Fits
+        }
+    }
+
+    /// Whether all limits hold.
+    #[must_use]
+    pub const fn fits(self) -> bool {
+        matches!(self, Self::Fits)
+    }
+}
+
+impl Display for Verdict {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Fits => f.pad("fits"),
+            Self::Nodes(nodes) => f.pad(&format!("in time, but {nodes} nodes")),
+            Self::Bandwidth => f.pad("does not fit: bandwidth"),
+            Self::Deadline => f.pad("does not fit: deadline"),
+        }
+    }
+}
+
+impl Serialize for Verdict {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// Cells that answer joints.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+#[serde(tag = "answering", rename_all = "lowercase")]
+pub enum Cells {
+    /// All of them.
+    All {
+        /// So many.
+        cells: u32,
+    },
+    /// As many as did in a run.
+    Some {
+        /// In the epoch with most of them.
+        most: u32,
+        /// Of so many on the bus.
+        cells: u32,
+        /// Whether the skin says so; else that many were heard.
+        described: bool,
+    },
+    /// The bus speaks another protocol.
+    Foreign,
+}
+
+impl Cells {
+    /// How many are on the bus.
+    #[must_use]
+    pub const fn on_the_bus(self) -> u32 {
+        match self {
+            Self::All { cells } | Self::Some { cells, .. } => cells,
+            Self::Foreign => 0,
+        }
+    }
+}
+
+impl Display for Cells {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::All { cells: 1 } => f.write_str("the only cell answers"),
+            Self::All { cells } => write!(f, "all {cells} cells answer"),
+            Self::Some { most, cells, described: true } => {
+                write!(f, "at most {most} of {cells} cells answered")
+            }
+            Self::Some { most, cells, described: false } => {
+                write!(f, "at most {most} of {cells} cells heard answered")
+            }
+            Self::Foreign => f.write_str("another protocol"),
+        }
+    }
+}
+
+/// A bus' answer to "does it fit": in the worst case, or in a run.
+///
+/// ```
+/// # use analysis::fit::verdict::{Answer, Cells, Verdict};
+/// let rates = "1M/5M".to_owned();
+/// let verdict = Verdict::Bandwidth;
+/// let answer = Answer { load: 1.1889, rates, cells: Cells::All { cells: 253 }, verdict };
+/// assert_eq!(
+///     answer.to_string(),
+///     "worst case: 118.9 % of 1M/5M: does not fit: bandwidth (all 253 cells answer)"
+/// );
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Answer {
+    /// The share of the bus' time that is asked for; of a run, in the second in which that is most.
+    pub load: f64,
+    /// The bus' format and rates.
+    pub rates: String,
+    /// Who answers.
+    pub cells: Cells,
+    /// Whether that fits.
+    pub verdict: Verdict,
+}
+
+impl Answer {
+    /// Of a bus whose cells all answer.
+    #[must_use]
+    pub fn worst_case(judged: &Judged) -> Self {
+        Self {
+            load: judged.load.total(),
+            rates: super::name(judged.case.format, judged.case.rates),
+            cells: Cells::All { cells: judged.case.answers.cells() },
+            verdict: judged.verdict(),
+        }
+    }
+
+    /// Of a run: the load of its fullest second, and how many answers ended after the next joints.
+    #[must_use]
+    pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
+        let on_the_bus = cells.on_the_bus();
+        let limits = [
+            (Limit::Bandwidth, load <= 1.0),
+            (Limit::Deadline, late == 0),
+            (Limit::Nodes, on_the_bus < NODES),
+        ];
+        let exceeded: Vec<_> =
+            limits.into_iter().filter(|(_, holds)| !holds).map(|(limit, _)| limit).collect();
+        Self { load, rates, cells, verdict: Verdict::of(&exceeded, on_the_bus) }
+    }
+
+    /// Which case it is.
+    #[must_use]
+    pub const fn case(&self) -> &'static str {
+        match self.cells {
+            Cells::All { .. } => "worst case",
+            Cells::Some { .. } => "this run",
+            Cells::Foreign => "this capture",
+        }
+    }
+
+    /// Load and verdict, for a row of a table.
+    #[must_use]
+    pub fn value(&self) -> String {
+        format!("{}: {}", percent(self.load), self.verdict)
+    }
+}
+
+impl Display for Answer {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let (load, rates) = (percent(self.load), &self.rates);
+        write!(f, "{}: {load} of {rates}: {} ({})", self.case(), self.verdict, self.cells)
+    }
+}
+
+/// A share in %, with one decimal.
+#[must_use]
+pub fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn this_run(load: f64, late: u64, cells: u32) -> String {
+        let cells = Cells::Some { most: 120, cells, described: true };
+        Answer::this_run(load, late, "1M/5M".to_owned(), cells).to_string()
+    }
+
+    #[test]
+    fn a_run_is_judged_by_its_load_then_by_late_answers_then_by_nodes() {
+        let run = "this run: 55.3 % of 1M/5M";
+        for (late, cells, verdict) in [
+            (0, 109, "fits"),
+            (0, 110, "in time, but 111 nodes"),
+            (1, 109, "does not fit: deadline"),
+            (1, 253, "does not fit: deadline"),
+        ] {
+            let expected = format!("{run}: {verdict} (at most 120 of {cells} cells answered)");
+            assert_eq!(this_run(0.553, late, cells), expected);
+        }
+        assert!(this_run(1.001, 0, 9).contains("100.1 % of 1M/5M: does not fit: bandwidth"));
+        assert!(this_run(1.0, 0, 9).contains(": fits ("));
+    }
+}

@@ -1,0 +1,19 @@
+//! What captures say afterwards, and what a bus can carry.
+//!
+//! | module | what |
+//! |---|---|
+//! | [`stats`] | counts of each bus and each cell |
+//! | [`explain`] | where a torque comes from |
+//! | [`bus_model`], [`fit`], [`shadow`] | timing of buses: the model, a bench before it is built, a capture on its bus |
+//! | [`report`] | pages with figures |
+//! | [`dbc`] | packets for other tools |
+//! | [`paper`] | what the paper says |
+
+pub mod bus_model;
+pub mod dbc;
+pub mod explain;
+pub mod fit;
+pub mod paper;
+pub mod report;
+pub mod shadow;
+pub mod stats;

@@ -1,0 +1,305 @@
+//! A report on a run, from its recording: read once from beginning to end, in bounded memory.
+//!
+//! ```text
+//!   /ROBOT/…, /gateway/timing ─> motion ─┐
+//!   /can/BUS ─┬> lane (a Table each) ────┼─> page
+//!             └> Shadow ─────────────────┤
+//!   metadata, /can/notes ────────────────┘
+//! ```
+//!
+//! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
+//! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. What a real bus would have made of
+//! them is what `gateway shadow` says of the same recording.
+
+mod lane;
+mod motion;
+mod page;
+
+use std::path::PathBuf;
+
+use protocol::skin::{Bus, Skin};
+use protocol::wire_time::BitRatesError;
+use thiserror::Error;
+
+use super::figure::Page;
+use crate::fit::rates::{Asked, Chosen};
+use crate::shadow::{self, Shadow};
+use lane::Lane;
+use motion::Motion;
+use trace::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other, SKIN};
+use trace::recording::layout::Layout;
+use trace::ros2::read;
+
+/// Columns of a line; a page is not wider.
+const COLUMNS: usize = 1_000;
+/// A column's width at first, in s.
+const GRAIN_S: f64 = 0.002;
+
+/// Why there is no report.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Capture(#[from] CaptureError),
+    /// Frames alone.
+    #[error(
+        "{name} is no MCAP recording, and frames alone are not enough: `gateway run SKIN --record run.mcap` makes what a \
+         report needs"
+    )]
+    Log {
+        /// Its name.
+        name: String,
+    },
+    /// Of another program, or of nothing.
+    #[error("{name} holds no run: {what}; `gateway run SKIN --record run.mcap` makes what a report needs")]
+    Foreign {
+        /// Its name.
+        name: String,
+        /// What is missing.
+        what: String,
+    },
+    /// Bit rates that CAN does not have.
+    #[error("{bus}: {source}; say others with --nominal and --data")]
+    Rates {
+        /// The bus.
+        bus: String,
+        /// Why.
+        source: BitRatesError,
+    },
+}
+
+/// A report, and what of the recording is missing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// What it says.
+    pub page: Page,
+    /// A sentence, when the recording is cut off or damaged.
+    pub missing: Option<String>,
+    /// What the recording is called.
+    pub name: String,
+}
+
+/// How a report is asked for.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// The command, as the page has it.
+    pub command: String,
+    /// Bits in a second of all buses, in place of the skin's.
+    pub nominal: Option<u32>,
+    /// Bits in a second of FD frames' data, in place of the skin's.
+    pub data: Option<u32>,
+}
+
+impl Options {
+    /// The bit rates that a bus' load is reckoned with.
+    fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
+        let rates = Asked { nominal: self.nominal, data: self.data }.of_bus(bus);
+        rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
+    }
+}
+
+/// Reads a recording, or the parts of one, and says what it holds.
+///
+/// # Errors
+/// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
+pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
+    let (run, broken) = read(paths, options)?;
+    let missing = broken.map(|why| run.missing(&why));
+    let page = page::page(&run, &options.command, missing.as_deref());
+    Ok(Report { page, missing, name: run.name })
+}
+
+/// Reads it all; also why it has no proper end, if it has none.
+fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
+    let mut items = Items::open_all(paths)?;
+    let name = items.name().to_owned();
+    let bytes =
+        |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
+    let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
+    if items.format() == Format::Candump {
+        let empty = bytes == Some(0);
+        return Err(if empty {
+            ReportError::Foreign { name, what: "it is empty".to_owned() }
+        } else {
+            ReportError::Log { name }
+        });
+    }
+    // What stands before the first message is known when it is open.
+    let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
+    let damaged = loop {
+        match items.next() {
+            Ok(Some(item)) => run.take(&item),
+            Ok(None) => break None,
+            Err(error) => break Some(error),
+        }
+    };
+    run.finish();
+    let unfinished = items.extras().unfinished.clone();
+    if run.is_empty() {
+        let nothing = || "it has no tick and no frame of its skin's buses".to_owned();
+        return Err(match damaged {
+            Some(error) => error.into(),
+            None => ReportError::Foreign { name, what: unfinished.unwrap_or_else(nothing) },
+        });
+    }
+    Ok((run, damaged.map(|error| error.to_string()).or(unfinished)))
+}
+
+/// What a real bus would make of these buses.
+fn shadow(skin: &Skin, lanes: &[Lane]) -> Shadow {
+    let rates = Asked::default().rates().expect("common rates are possible");
+    let of_bus = lanes.iter().map(|lane| (lane.name.clone(), lane.rates.rates)).collect();
+    let options =
+        shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
+    Shadow::new(options).expect("no bit is damaged")
+}
+
+/// What a recording says, as far as it has been read.
+#[derive(Debug)]
+struct Run {
+    skin: Skin,
+    /// Its path, and of how many bytes.
+    name: String,
+    bytes: u64,
+    /// By name, as the recording has them.
+    metadata: Vec<(String, Vec<(String, String)>)>,
+    /// The topics of joints and of torques.
+    topics: [String; 2],
+    /// When the first message was, in ns since 1970.
+    began: Option<u64>,
+    motion: Motion,
+    lanes: Vec<Lane>,
+    shadow: Shadow,
+    /// Packets of any network that the kernel dropped on their way to sockets.
+    backlog: u64,
+    /// Frames of buses that the skin does not have.
+    others: u64,
+    /// Messages that are not what their topics say.
+    unreadable: u64,
+}
+
+impl Run {
+    fn begin(name: &str, bytes: u64, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
+        let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
+        let Some(skin) = extras.skin() else {
+            let why = extras.unfinished.as_ref().map_or_else(String::new, |why| format!(" ({why})"));
+            return Err(foreign(format!("{SKIN} is not attached to it{why}")));
+        };
+        let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
+        let layout = Layout::new(&skin);
+        let buses = skin.buses.iter().enumerate();
+        let lanes = buses.map(|(at, bus)| Ok(Lane::new(&skin, at, options.rates(bus)?)));
+        let mut lanes = lanes.collect::<Result<Vec<_>, ReportError>>()?;
+        let mut shadow = shadow(&skin, &lanes);
+        for before in &extras.in_force {
+            shadow.in_force(&before.bus, before.nanos, &before.frame);
+            if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
+                lane.in_force(before);
+            }
+        }
+        lanes.iter_mut().for_each(Lane::begin);
+        Ok(Self {
+            topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
+            motion: Motion::new(layout.joints.len()),
+            name: name.to_owned(),
+            bytes,
+            metadata: extras.metadata.clone(),
+            skin,
+            began: None,
+            lanes,
+            shadow,
+            backlog: 0,
+            others: 0,
+            unreadable: 0,
+        })
+    }
+
+    fn take(&mut self, item: &Item<'_>) {
+        match item {
+            Item::Entry(Entry::Frame(record)) => {
+                let at = self.seconds(record.time.nanos);
+                match self.skin.bus_named(record.interface).and_then(|bus| self.lanes.get_mut(bus)) {
+                    Some(lane) => {
+                        lane.frame(at, record);
+                        self.shadow.frame(record.interface, record.time.nanos, &record.frame);
+                        self.carried();
+                    }
+                    None => self.others += 1,
+                }
+            }
+            Item::Entry(Entry::Note(note)) => self.note(note),
+            Item::Other(other) => self.message(other),
+        }
+    }
+
+    fn note(&mut self, note: &Note<'_>) {
+        match note.kind {
+            NoteKind::Dropped(frames) => {
+                match self.skin.bus_named(note.interface).and_then(|bus| self.lanes.get_mut(bus)) {
+                    Some(lane) => lane.dropped = lane.dropped.saturating_add(frames),
+                    None => self.backlog = self.backlog.saturating_add(frames),
+                }
+            }
+            NoteKind::Unreadable(_) => self.unreadable += 1,
+            NoteKind::Text | NoteKind::CanXl => {}
+        }
+    }
+
+    fn message(&mut self, other: &Other<'_>) {
+        let at = self.seconds(other.nanos);
+        let [states, torques] = &self.topics;
+        let taken = if other.topic == states {
+            read::joints(other.message).map(|joints| self.motion.joints(at, &joints))
+        } else if other.topic == torques {
+            read::torques(other.message).map(|torques| self.motion.torques(at, &torques))
+        } else if other.topic == "/gateway/timing" {
+            read::timing(other.message, other.nanos).map(|timing| self.motion.timing(at, &timing))
+        } else {
+            Ok(())
+        };
+        self.unreadable += u64::from(taken.is_err());
+    }
+
+    /// Seconds since the first message.
+    fn seconds(&mut self, nanos: u64) -> f64 {
+        let began = *self.began.get_or_insert(nanos);
+        if nanos >= began { (nanos - began) as f64 * 1e-9 } else { (began - nanos) as f64 * -1e-9 }
+    }
+
+    /// Takes what it is now known of that a real bus would have carried it.
+    fn carried(&mut self) {
+        while let Some(frame) = self.shadow.poll() {
+            let at = self.seconds(frame.nanos);
+            let bus = frame.bus.and_then(|bus| self.skin.bus_named(self.shadow.bus(bus)));
+            let lane = bus.and_then(|bus| self.lanes.get_mut(bus));
+            lane.into_iter().for_each(|lane| lane.carried(at, frame.bits));
+        }
+    }
+
+    fn finish(&mut self) {
+        self.lanes.iter_mut().for_each(Lane::finish);
+        self.shadow.finish();
+        self.carried();
+    }
+
+    fn is_empty(&self) -> bool {
+        self.motion.ticks == 0 && self.lanes.iter().all(|lane| lane.frames == 0)
+    }
+
+    /// A value of the recording's metadata.
+    fn fact(&self, record: &str, key: &str) -> Option<&str> {
+        let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
+        facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
+    }
+
+    /// What of a recording without its end is missing, in a sentence.
+    fn missing(&self, why: &str) -> String {
+        let here = self.motion.seconds();
+        let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
+        let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
+            format!(" of the {planned} s that the run was to last: {:.2} s are missing", planned - here)
+        });
+        format!("{why}. What is here holds {here:.2} s{lacks}")
+    }
+}

@@ -1,0 +1,225 @@
+//! What a run's report says, and in which order.
+
+mod arm;
+mod bus;
+
+use super::Run;
+use super::lane::Lane;
+use crate::paper;
+use crate::report::figure::{Axis, Finding, Mark, On, Page, Quantity, Section, Series, Shape, number};
+use crate::report::thin::Thinned;
+use model::table::{Accuracy, Uplink};
+
+/// The paper's cells, control loop and broadcasts.
+const PAPER_CELLS: f64 = 253.0;
+const PAPER_CONTROL_HZ: f64 = 500.0;
+const PAPER_BROADCAST_HZ: f64 = 62.5;
+/// The paper's law of the central computation (Eq. 29 and 30), in µs: of each active cell, of each cell, of none.
+const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
+
+/// What a page is made of.
+struct Draft<'a> {
+    run: &'a Run,
+    /// When the loop began, in s after the recording's first message.
+    zero: f64,
+}
+
+pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
+    let draft = Draft { run, zero: run.motion.first.unwrap_or(0.0) };
+    let (skin, motion) = (&run.skin, &run.motion);
+    let seconds = number((motion.seconds() * 100.0).round() / 100.0);
+    let mut intro = format!(
+        "A run of {} with {} cells on {} and {seconds} s of its {} Hz control loop, from the recording {}. \
+         Times count from the first tick.",
+        skin.name,
+        skin.cells.len(),
+        several(skin.buses.len(), "bus", "buses"),
+        number(skin.timing.control_hz),
+        run.name,
+    );
+    if let Some(missing) = missing {
+        intro = format!("Not all of the run is here: {missing}. {intro}");
+    }
+    let mut sections = vec![draft.summary()];
+    if motion.ticks > 0 {
+        sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
+    }
+    sections.extend([draft.replies(), draft.load(), draft.losses()]);
+    Page { title: format!("{}: report on a run", skin.name), intro, facts: facts(run, command), sections }
+}
+
+impl Draft<'_> {
+    fn points(&self, thinned: &Thinned) -> Vec<(f64, f64)> {
+        thinned.points().into_iter().map(|(x, y)| (x - self.zero, y)).collect()
+    }
+
+    fn line(&self, label: impl Into<String>, thinned: &Thinned) -> Series {
+        Series::new(label, Shape::Line, self.points(thinned))
+    }
+
+    fn time(&self) -> Axis {
+        let axis = Axis::new("time", "s");
+        if self.run.motion.ticks > 1 { axis.between(0.0, self.run.motion.seconds()) } else { axis }
+    }
+
+    fn marks(&self) -> Vec<Mark> {
+        let mark = |(at, what): &(f64, &'static str)| Mark {
+            on: On::X,
+            at: at - self.zero,
+            label: (*what).to_owned(),
+        };
+        self.run.motion.turns.iter().map(mark).collect()
+    }
+
+    fn named(&self, lane: &Lane) -> String {
+        if self.run.lanes.len() > 1 { lane.name.clone() } else { String::new() }
+    }
+
+    /// All numbers that the paper has too, and what must hold.
+    fn summary(&self) -> Section {
+        let (skin, motion) = (&self.run.skin, &self.run.motion);
+        let mut findings = Vec::new();
+        let accuracy = self.run.lanes.iter().map(|lane| lane.table.accuracy()).reduce(Accuracy::with);
+        let accuracy = accuracy.unwrap_or_default();
+        let nm = |value| Quantity::new(value, "Nm");
+        for (what, theirs, errors) in [
+            (
+                "torques of single cells, loaded joints: mean absolute error",
+                paper::SINGLE_NM,
+                accuracy.single,
+            ),
+            ("the whole skin's torque, all joints: mean absolute error", paper::SUMMED_NM, accuracy.whole),
+            ("sums along the tree, loaded joints: mean absolute error", paper::SUMMED_NM, accuracy.sums),
+        ] {
+            if let Some(mean) = errors.mean() {
+                findings.push(Finding::less_is_better(what, nm(theirs), nm(mean)));
+            }
+        }
+        if !motion.central_ns.is_empty() {
+            let median = motion.central_ns.value_at_quantile(0.5) as f64 * 1e-3;
+            let (active, ticks) = motion.active_sum;
+            let active = active as f64 / ticks.max(1) as f64;
+            let [of_active, of_each, of_none] = PAPER_CENTRAL_US;
+            let law = of_active * active + of_each * skin.cells.len() as f64 + of_none;
+            let what = format!(
+                "central computation in a tick, median (paper: its law at these {} cells, {} of them active on average)",
+                skin.cells.len(),
+                number((active * 10.0).round() / 10.0)
+            );
+            findings.push(Finding::less_is_better(
+                what,
+                Quantity::new(law, "µs"),
+                Quantity::new(median, "µs"),
+            ));
+        }
+        let cells = Quantity::new(skin.cells.len() as f64, "");
+        findings.push(Finding::told("cells", cells).beside(Quantity::new(PAPER_CELLS, "")));
+        if motion.seconds() > 0.0 {
+            let hertz =
+                |count: u64, seconds: f64| Quantity::new(count.saturating_sub(1) as f64 / seconds, "Hz");
+            let loop_hz = hertz(motion.ticks.saturating_add(motion.unrecorded), motion.seconds());
+            findings
+                .push(Finding::told("control loop", loop_hz).beside(Quantity::new(PAPER_CONTROL_HZ, "Hz")));
+            let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);
+            let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
+            if let Some((first, last, count)) = most {
+                let hertz = hertz(count, last - first);
+                findings.push(Finding::told("joints", hertz).beside(Quantity::new(PAPER_BROADCAST_HZ, "Hz")));
+            }
+            let none = motion.skipped == 0;
+            findings.push(Finding::told("ticks skipped", count(motion.skipped)).must("none", none));
+        }
+        let accounts = self.run.lanes.iter().map(Lane::account);
+        let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
+        if due > 0 {
+            let what = format!("replies not there before the next joints, of {due} that were due");
+            findings.push(Finding::told(what, count(due - in_time)).must("none", in_time == due));
+        }
+        findings.extend(self.fits());
+        let uplink =
+            Uplink::total(self.run.lanes.iter().flat_map(|lane| lane.table.cells()).map(|cell| cell.uplink));
+        findings.push(
+            Finding::told("packets of cells lost, by their own count", count(uplink.lost))
+                .must("none", uplink.lost == 0),
+        );
+        let text = vec![
+            "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
+             5 % of the paper's, a number is the same."
+                .to_owned(),
+        ];
+        Section {
+            name: "summary".to_owned(),
+            title: "In numbers".to_owned(),
+            text,
+            findings,
+            ..Section::default()
+        }
+    }
+}
+
+fn count(count: u64) -> Quantity {
+    Quantity::new(count as f64, "")
+}
+
+fn several(count: usize, one: &str, more: &str) -> String {
+    format!("{count} {}", if count == 1 { one } else { more })
+}
+
+/// What it came about with.
+fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
+    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown").to_owned();
+    let machine = format!(
+        "{} {} on {}, {} processors",
+        fact("machine", "sysname"),
+        fact("machine", "release"),
+        fact("machine", "machine"),
+        fact("machine", "processors")
+    );
+    let mut facts = vec![
+        ("run's command".to_owned(), fact("program", "command_line")),
+        (
+            "program".to_owned(),
+            format!("{}, revision {}", fact("program", "program"), fact("program", "git_revision")),
+        ),
+        ("began".to_owned(), fact("program", "began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc)),
+        ("machine".to_owned(), machine),
+        (
+            "clock".to_owned(),
+            format!(
+                "{}, of {}; wall clock in steps of {} ns",
+                fact("machine", "clocksource"),
+                fact("machine", "clocksources"),
+                fact("machine", "realtime_resolution_ns")
+            ),
+        ),
+        (
+            "recording".to_owned(),
+            format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes),
+        ),
+        ("report's command".to_owned(), command.to_owned()),
+    ];
+    if let Some(idle) = run.fact("machine", "idle_late_p50_us") {
+        let (p99, max) = (fact("machine", "idle_late_p99_us"), fact("machine", "idle_late_max_us"));
+        let text = format!("woke a thread {idle} µs late (median), 99 % within {p99} µs, at most {max} µs");
+        facts.insert(5, ("idle machine".to_owned(), text));
+    }
+    let configuration = run.metadata.iter().find(|(name, _)| name == "configuration");
+    let pairs = configuration
+        .map(|(_, facts)| facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>());
+    facts.extend(pairs.map(|pairs| ("configuration".to_owned(), pairs.join("; "))));
+    facts
+}
+
+/// A time in ns since 1970 as people write it (Hinnant's `civil_from_days`).
+fn utc(nanos: u64) -> String {
+    let seconds = nanos / 1_000_000_000;
+    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let (day, month) = (day - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
+    let year = year + era * 400 + u64::from(month <= 2);
+    let (hour, minute, second) = (second / 3_600, second / 60 % 60, second % 60);
+    format!("{year}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02} UTC")
+}

@@ -1,0 +1,212 @@
+//! What a real bus would have made of some traffic: each frame's bits, when it would have gone out, and what that adds up to.
+//!
+//! ```text
+//!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
+//!                           one lane a bus: sorts,   who sends when └──> report: load, delays, late replies, queues
+//! ```
+//!
+//! A frame's time stamp is taken for the moment at which its sender wanted to send it, which on a bus without bit rate (vcan, the
+//! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
+//! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`GREATEST_QUEUE`] frames wait on a bus.
+
+mod answering;
+mod lane;
+mod load;
+mod phase;
+mod report;
+#[cfg(test)]
+mod tests;
+#[cfg(test)]
+mod tests_run;
+mod told;
+
+use std::fmt::{self, Display, Formatter};
+
+use protocol::can::{ERROR, Frame};
+use protocol::skin::Skin;
+use protocol::wire_time::{BitRates, Bits};
+
+use crate::bus_model::{BitErrors, BitErrorsError};
+use crate::fit;
+use crate::fit::verdict::Answer;
+use lane::{Known, Lane};
+use told::Told;
+
+pub use answering::Answering;
+pub use lane::GREATEST_QUEUE;
+pub use phase::PAUSE_NS;
+pub use report::{BusShadow, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
+pub use told::Shaded;
+pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
+
+/// A bus without a pause for so long, in ns, is saturated: from joints to joints, as mostly set.
+pub const SATURATED_NS: u64 = 16_000_000;
+/// The longer span in which the load is looked at, in ns.
+const SECOND_NS: u64 = 1_000_000_000;
+
+/// Buses that are told apart.
+pub const BUSES: usize = 64;
+
+/// What the buses are like.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Bit rates of every bus that is not named.
+    pub rates: BitRates,
+    /// Bit rates by the name of the bus.
+    pub of_bus: Vec<(String, BitRates)>,
+    /// How many bits are damaged, as a share, in [0, [`BitErrors::GREATEST`]].
+    pub bit_errors: f64,
+    /// From what errors are drawn; each bus has its own.
+    pub seed: u64,
+    /// Whether each frame is wanted from [`Shadow::poll`].
+    pub each_frame: bool,
+    /// Whether what only a bench sends is counted.
+    pub bench_traffic: bool,
+    /// The skin, for the worst case beside what there was.
+    pub skin: Option<Skin>,
+}
+
+impl Options {
+    /// All buses at these rates, and nothing else.
+    #[must_use]
+    pub const fn new(rates: BitRates) -> Self {
+        Self {
+            rates,
+            of_bus: Vec::new(),
+            bit_errors: 0.0,
+            seed: 1,
+            each_frame: false,
+            bench_traffic: false,
+            skin: None,
+        }
+    }
+
+    /// What is known of a bus.
+    fn of(&self, bus: &str) -> Known {
+        let named = self.of_bus.iter().find(|(name, _)| name == bus);
+        let rates = named.map_or(self.rates, |(_, rates)| *rates);
+        let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
+        let cells =
+            described.map(|(skin, bus)| u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX));
+        let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
+        let worst_case = worst_case.as_ref().map(Answer::worst_case);
+        Known { rates, cells, worst_case, bench_traffic: self.bench_traffic }
+    }
+}
+
+/// The latest time of a frame, in ns since 1970.
+const LATEST: u64 = u64::MAX / 2;
+
+/// Traffic on its way through the model.
+#[derive(Debug)]
+pub struct Shadow {
+    options: Options,
+    lanes: Vec<Lane>,
+    told: Option<Told>,
+    frames: u64,
+    further: u64,
+}
+
+impl Shadow {
+    /// Nothing seen yet.
+    ///
+    /// # Errors
+    /// When the bit-error rate is outside its range.
+    pub fn new(options: Options) -> Result<Self, BitErrorsError> {
+        BitErrors::new(options.bit_errors, options.seed)?;
+        let told = options.each_frame.then(Told::default);
+        Ok(Self { options, lanes: Vec::new(), told, frames: 0, further: 0 })
+    }
+
+    /// Takes the next frame of a bus, with its time in ns. A time after the year 2262 counts as its end: what a bus makes
+    /// of a frame comes later still, and has to be a time as well.
+    pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let nanos = nanos.min(LATEST);
+        let place = self.frames;
+        self.frames += 1;
+        let lane = self.lane(bus);
+        if let Some(told) = &mut self.told {
+            let flag = frame.raw_id() & ERROR;
+            told.enter(lane, nanos, frame.id() | flag, frame.is_extended() || frame.is_error());
+        }
+        let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
+            self.further += 1;
+            return;
+        };
+        lane.count(nanos);
+        let Some(bits) = Bits::of(frame) else {
+            lane.error_frames += 1;
+            return;
+        };
+        if let Some(told) = &mut self.told {
+            told.bits(place, bits);
+        }
+        lane.take(nanos, frame, bits, place, self.told.as_mut());
+    }
+
+    /// A frame that was on a bus before the capture began, and still says what holds.
+    pub fn in_force(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let lane = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane));
+        lane.into_iter().for_each(|lane| lane.in_force(nanos, frame));
+    }
+
+    /// Frames that whoever took the capture lost.
+    pub fn missing(&mut self, bus: &str, frames: u64) {
+        if let Some(lane) = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane)) {
+            lane.missing = lane.missing.saturating_add(frames);
+        }
+    }
+
+    /// There is no more: all that waits goes out.
+    pub fn finish(&mut self) {
+        self.lanes.iter_mut().for_each(|lane| lane.finish(self.told.as_mut()));
+        self.told.iter_mut().for_each(Told::finish);
+    }
+
+    /// The next frame, in the order in which they came, once it is known what became of it.
+    pub fn poll(&mut self) -> Option<Shaded> {
+        self.told.as_mut()?.poll()
+    }
+
+    /// The name of a bus, by [`Shaded::bus`].
+    #[must_use]
+    pub fn bus(&self, bus: usize) -> &str {
+        self.lanes.get(bus).map_or("", |lane| &lane.name)
+    }
+
+    /// What it adds up to.
+    #[must_use]
+    pub fn report(&self) -> Report {
+        Report {
+            frames: self.frames,
+            frames_of_other_buses: self.further,
+            bit_error_rate: self.options.bit_errors,
+            buses: self.lanes.iter().map(Lane::report).collect(),
+        }
+    }
+
+    fn lane(&mut self, bus: &str) -> Option<usize> {
+        // Mostly the one of the frame before, or one of a few.
+        let known = self.lanes.iter().position(|lane| lane.name == bus);
+        if known.is_some() || self.lanes.len() >= BUSES {
+            return known;
+        }
+        let index = self.lanes.len();
+        let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
+        let errors = BitErrors::new(self.options.bit_errors, seed).ok();
+        let errors = errors.filter(|_| self.options.bit_errors > 0.0);
+        self.lanes.push(Lane::new(bus, self.options.of(bus), errors));
+        Some(index)
+    }
+}
+
+/// An identifier as candump prints it; whether it has more than 11 bits.
+#[derive(Clone, Copy, Debug)]
+pub struct Identifier(pub u32, pub bool);
+
+impl Display for Identifier {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self(id, extended) = *self;
+        if extended { write!(f, "{id:08X}") } else { write!(f, "{id:03X}") }
+    }
+}

@@ -1,0 +1,106 @@
+//! What a recording says of itself: the program, the machine, the clocks, the configuration in force.
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use protocol::parameters::Parameter;
+use protocol::skin::Skin;
+use rustix::system::uname;
+use rustix::thread::ClockId;
+use rustix::time::{clock_getres, clock_gettime};
+
+use model::decode::parameter::Words;
+use model::quantiles::Quantiles;
+
+/// Facts by name.
+pub type Facts = BTreeMap<String, String>;
+
+/// The program and how it was called.
+#[must_use]
+pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
+    facts([
+        ("program", format!("gateway {}", env!("CARGO_PKG_VERSION"))),
+        ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
+        ("command_line", command_line.join(" ")),
+        ("began_ns", began_nanos.to_string()),
+    ])
+}
+
+/// The kernel, the clock that everything is timed by, and how late the machine wakes an idle thread.
+#[must_use]
+pub fn machine(idle: &Quantiles) -> Facts {
+    let about = uname();
+    let text = |text: &std::ffi::CStr| text.to_string_lossy().into_owned();
+    let clocks = "/sys/devices/system/clocksource/clocksource0/";
+    let read = |name: &str| {
+        fs::read_to_string(name).map_or_else(|_| "unknown".to_owned(), |text| text.trim().to_owned())
+    };
+    facts([
+        ("sysname", text(about.sysname())),
+        ("release", text(about.release())),
+        ("version", text(about.version())),
+        ("machine", text(about.machine())),
+        ("processors", std::thread::available_parallelism().map_or(0, usize::from).to_string()),
+        ("clocksource", read(&format!("{clocks}current_clocksource"))),
+        ("clocksources", read(&format!("{clocks}available_clocksource"))),
+        ("realtime_minus_monotonic_ns", realtime_minus_monotonic().to_string()),
+        ("realtime_resolution_ns", clock_getres(ClockId::Realtime).tv_nsec.to_string()),
+        ("idle_late_p50_us", format!("{:.1}", idle.p50)),
+        ("idle_late_p99_us", format!("{:.1}", idle.p99)),
+        ("idle_late_max_us", format!("{:.1}", idle.max)),
+    ])
+}
+
+/// What has to be added to the monotonic clock to make it the wall clock, in ns: the narrowest of some readings.
+#[must_use]
+pub fn realtime_minus_monotonic() -> i64 {
+    let nanos = |clock| {
+        let time = clock_gettime(clock);
+        time.tv_sec * 1_000_000_000 + time.tv_nsec
+    };
+    let reading = |_| {
+        let before = nanos(ClockId::Monotonic);
+        let wall = nanos(ClockId::Realtime);
+        let after = nanos(ClockId::Monotonic);
+        (after - before, wall - before - (after - before) / 2)
+    };
+    (0..3).map(reading).min().map_or(0, |(_, offset)| offset)
+}
+
+/// The skin and its timing as they are in force, beside what the run says of itself.
+#[must_use]
+pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Facts {
+    let mut all = facts([
+        ("skin", skin.name.clone()),
+        ("robot", skin.robot.name.clone()),
+        ("joints", skin.robot.joints.len().to_string()),
+        ("cells", skin.cells.len().to_string()),
+        ("control_hz", skin.timing.control_hz.to_string()),
+        ("joint_broadcast_hz", skin.timing.broadcast_hz().to_string()),
+        ("hold_epochs", skin.safety.hold_epochs.to_string()),
+        ("decay_epochs", skin.safety.decay_epochs.to_string()),
+        ("bad_cycles", skin.safety.bad_cycles.to_string()),
+        ("lost_bus", skin.safety.lost_bus.name().to_owned()),
+        ("events", Words(Parameter::Events.number(), skin.events.words()).to_string()),
+    ]);
+    for bus in &skin.buses {
+        let sensing = Words(Parameter::Sensing.number(), bus.sensing.words());
+        all.insert(format!("sensing/{}", bus.name), sensing.to_string());
+    }
+    all.extend(run);
+    all
+}
+
+/// The hash that each cell's configuration must have, by bus and number.
+#[must_use]
+pub fn hashes(skin: &Skin) -> Facts {
+    let of_cell = |cell: &protocol::skin::Cell| {
+        let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+        (format!("{bus}/{}", cell.node), format!("{:04X}", skin.parameters(cell).hash()))
+    };
+    skin.cells.iter().map(of_cell).collect()
+}
+
+fn facts<const N: usize>(facts: [(&str, String); N]) -> Facts {
+    facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}

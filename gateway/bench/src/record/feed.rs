@@ -1,0 +1,184 @@
+//! What is handed over to the recorder: bounded queues, one for each thread that fills one. Nobody waits for
+//! room; what does not fit is counted, and said in the recording where it is missing.
+
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
+
+use protocol::message::SkinSensors;
+
+use super::force::Seen;
+use crate::run::receiver::View;
+use control::cycle::turn::Timed;
+use model::table::Status;
+
+/// Frames of a bus that may wait: more than a second of a full bus.
+pub const FRAMES: usize = 65_536;
+/// Ticks that may wait: more than a second.
+pub const TICKS: usize = 1_024;
+/// Epochs of a bus that may wait: more than a second.
+pub const EPOCHS: usize = 128;
+
+/// What a bus' receiver hands over, in the order in which it came.
+#[derive(Clone, Copy, Debug)]
+pub enum Captured {
+    /// A frame.
+    Frame(Seen),
+    /// Frames that the bus dropped because they were not taken in time.
+    Dropped {
+        /// When this was known, in ns since 1970.
+        at_nanos: u64,
+        /// How many.
+        frames: u64,
+    },
+    /// Frames that did not fit into this queue.
+    Unrecorded {
+        /// When this was said, in ns since 1970.
+        at_nanos: u64,
+        /// How many.
+        frames: u64,
+    },
+}
+
+/// What the cells of a bus felt when joints stood on it.
+#[derive(Clone, Debug)]
+pub struct Touched {
+    /// When, in ns since 1970.
+    pub at_nanos: u64,
+    /// The joints' epoch.
+    pub epoch: u8,
+    /// Each cell, in the bus' order.
+    pub cells: Box<[(Option<SkinSensors>, Status)]>,
+}
+
+/// A receiver's end of its queues.
+#[derive(Debug)]
+pub struct Outlet {
+    frames: rtrb::Producer<Captured>,
+    touched: Option<rtrb::Producer<Touched>>,
+    /// Frames that did not fit, in all.
+    unrecorded: u64,
+    /// Of these, what nobody has been told of yet.
+    untold: u64,
+    /// Epochs that did not fit.
+    untouched: u64,
+}
+
+/// What did not fit into queues.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Unrecorded {
+    /// Frames.
+    pub frames: u64,
+    /// What cells felt in an epoch.
+    pub epochs: u64,
+}
+
+impl Outlet {
+    /// Hands a frame over.
+    pub fn frame(&mut self, seen: Seen) {
+        if self.untold > 0 {
+            self.tell(seen.at_nanos);
+        }
+        if self.untold > 0 || self.frames.push(Captured::Frame(seen)).is_err() {
+            self.unrecorded += 1;
+            self.untold += 1;
+        }
+    }
+
+    /// Frames that fit into the queue now.
+    #[must_use]
+    pub fn free(&self) -> usize {
+        self.frames.slots()
+    }
+
+    /// Says that the bus dropped frames.
+    pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
+        // A full queue says so itself.
+        let _ = self.frames.push(Captured::Dropped { at_nanos, frames });
+    }
+
+    /// Whether anybody wants to know what cells feel.
+    #[must_use]
+    pub const fn wants_touched(&self) -> bool {
+        self.touched.is_some()
+    }
+
+    /// Hands over what cells felt.
+    pub fn touched(&mut self, touched: Touched) {
+        if let Some(queue) = &mut self.touched
+            && queue.push(touched).is_err()
+        {
+            self.untouched += 1;
+        }
+    }
+
+    /// Says what did not fit, if there is room for saying it; whether nothing is left to say.
+    pub fn tell(&mut self, at_nanos: u64) -> bool {
+        let frames = self.untold;
+        if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
+            self.untold = 0;
+        }
+        self.untold == 0
+    }
+
+    /// What did not fit.
+    #[must_use]
+    pub const fn unrecorded(&self) -> Unrecorded {
+        Unrecorded { frames: self.unrecorded, epochs: self.untouched }
+    }
+}
+
+/// The recorder's end of a bus.
+#[derive(Debug)]
+pub struct Lane {
+    pub(super) frames: rtrb::Consumer<Captured>,
+    pub(super) touched: Option<rtrb::Consumer<Touched>>,
+    /// How its cells are.
+    pub(super) view: Arc<Mutex<View>>,
+    /// Whether it works.
+    pub(super) works: Arc<AtomicBool>,
+}
+
+/// The queues of a bus, both ends; `all` when not only frames are wanted.
+#[must_use]
+pub fn lane(all: bool, view: Arc<Mutex<View>>, works: Arc<AtomicBool>) -> (Outlet, Lane) {
+    let (frames, taken) = rtrb::RingBuffer::new(FRAMES);
+    let (touched, felt) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
+    let outlet = Outlet { frames, touched, unrecorded: 0, untold: 0, untouched: 0 };
+    (outlet, Lane { frames: taken, touched: felt, view, works })
+}
+
+/// All that comes to the recorder.
+#[derive(Debug)]
+pub struct Feed {
+    /// Each bus.
+    pub lanes: Vec<Lane>,
+    /// The control loop's ticks.
+    pub ticks: Option<rtrb::Consumer<Timed>>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::can::Frame;
+
+    #[test]
+    fn what_does_not_fit_is_said_where_it_is_missing() {
+        let (mut outlet, mut lane) = lane(false, Arc::default(), Arc::default());
+        let frame = |at_nanos| Seen { at_nanos, own: false, frame: Frame::EMPTY };
+        let all = FRAMES as u64;
+        (0..all + 7).for_each(|at| outlet.frame(frame(at)));
+        assert_eq!(outlet.unrecorded(), Unrecorded { frames: 7, epochs: 0 });
+        let mut taken = 0;
+        while let Ok(Captured::Frame(seen)) = lane.frames.pop() {
+            assert_eq!(seen.at_nanos, taken);
+            taken += 1;
+        }
+        assert_eq!(taken, all);
+        outlet.frame(frame(1_000_000));
+        outlet.frame(frame(1_000_001));
+        let said = lane.frames.pop().unwrap();
+        assert!(matches!(said, Captured::Unrecorded { at_nanos: 1_000_000, frames: 7 }), "{said:?}");
+        assert!(matches!(lane.frames.pop().unwrap(), Captured::Frame(seen) if seen.at_nanos == 1_000_000));
+        assert_eq!(outlet.unrecorded().frames, 7);
+    }
+}

@@ -1,0 +1,435 @@
+//! What is in force on a bus: the packets that somebody needs who begins in the middle.
+//!
+//! ```text
+//!   frames of a bus ──> take ──> [ InForce ] ──> frames: what still counts, in the bus' own order
+//! ```
+//!
+//! The last heartbeat of every cell, with the hash of its configuration, its last start and its place in the tree; what
+//! was switched and configured at run time; the stimuli that it feels and that wait for their epochs; the last joints,
+//! and whether cells were halted. Epochs count modulo 256, so a stimulus alone does not say whether it still waits. So
+//! with each stimulus come the joints before it and those from which on it holds: who takes these packets in their
+//! order by the protocol's rules comes to the same state as who took all of them.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use protocol::can::{Format, Frame};
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State};
+use protocol::packet::{self, Epoch, Half, Packet, Paired};
+use protocol::parameters::Parameter;
+use protocol::time::Micros;
+
+use model::stimuli::Waiting;
+
+/// A frame that somebody saw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// When, in ns since 1970.
+    pub at_nanos: u64,
+    /// Whether the gateway sent it.
+    pub own: bool,
+    /// What.
+    pub frame: Frame,
+}
+
+/// The frames of one packet, and its place in the bus' order.
+#[derive(Debug)]
+struct Said {
+    place: u64,
+    frames: [Option<Seen>; 2],
+}
+
+type Kept = Option<Arc<Said>>;
+
+/// A page that a cell feels: who said it, the last joints before that, and those from which on it holds.
+#[derive(Clone, Debug)]
+struct Felt {
+    said: Arc<Said>,
+    before: Kept,
+    since: Kept,
+}
+
+/// What is in force for one cell.
+#[derive(Clone, Debug, Default)]
+struct Cell {
+    /// Its last heartbeat.
+    heartbeat: Kept,
+    /// The first and the last heartbeat of its last start.
+    starts: [Kept; 2],
+    /// Its last word on where its sums go.
+    tree: Kept,
+    /// By number: the last writes of what is not stored.
+    switches: BTreeMap<u8, Arc<Said>>,
+    /// By number: the last writes that a commit has taken into use, and that commit.
+    committed: BTreeMap<u8, Arc<Said>>,
+    commit: Kept,
+    /// By number: the last writes since then, and a commit that has not been answered.
+    staged: BTreeMap<u8, Arc<Said>>,
+    asked: Kept,
+    /// The skin's page and the acceleration, once something is known of them.
+    felt: [Option<Felt>; 2],
+    waiting: Waiting<(usize, Felt)>,
+    /// It was told to measure: then it refuses stimuli.
+    measures: bool,
+}
+
+/// The packets of one bus that are in force.
+#[derive(Debug)]
+pub struct InForce {
+    /// Packets so far.
+    places: u64,
+    cells: Vec<Cell>,
+    joints: Option<(Epoch, Arc<Said>)>,
+    /// The last halt or resume.
+    halt: Kept,
+    /// By identifier: a classic first half whose second one is to come.
+    halves: Vec<(Half, Option<Seen>)>,
+    /// Identifiers of the gateway's side of which a first half stood on the bus last, and when, in ns since 1970.
+    open: BTreeMap<u16, u64>,
+}
+
+impl Default for InForce {
+    fn default() -> Self {
+        Self {
+            places: 0,
+            cells: vec![Cell::default(); CellId::COUNT],
+            joints: None,
+            halt: None,
+            halves: vec![(Half::NONE, None); 1 << 11],
+            open: BTreeMap::new(),
+        }
+    }
+}
+
+impl Cell {
+    /// It has started, or was told its mode: it forgets what it felt.
+    fn clear(&mut self, measures: bool) {
+        self.felt = [None, None];
+        self.waiting.clear();
+        self.measures = measures;
+    }
+
+    /// What a start forgets.
+    fn start(&mut self, said: &Arc<Said>, is_first: bool) {
+        self.clear(false);
+        self.switches.clear();
+        self.staged.clear();
+        self.asked = None;
+        let [first, last] = &mut self.starts;
+        if is_first {
+            *first = Some(Arc::clone(said));
+        }
+        *last = Some(Arc::clone(said));
+    }
+
+    fn write(&mut self, number: u8, said: &Arc<Said>, obeys: bool) {
+        let parameter = Parameter::from_number(number);
+        if parameter == Some(Parameter::Commit) {
+            self.asked = Some(Arc::clone(said));
+        } else if parameter.is_some_and(Parameter::is_volatile) {
+            self.switches.insert(number, Arc::clone(said));
+        } else if parameter.is_some() {
+            self.staged.insert(number, Arc::clone(said));
+        }
+        if parameter == Some(Parameter::Mode) {
+            self.clear(!obeys);
+        }
+    }
+
+    /// It has taken into use what was written before the commit that was asked last.
+    fn commit(&mut self) {
+        let Some(asked) = self.asked.take() else { return };
+        let staged = std::mem::take(&mut self.staged).into_iter();
+        let (mut taken, later): (BTreeMap<_, _>, _) = staged.partition(|(_, said)| said.place < asked.place);
+        self.committed.append(&mut taken);
+        (self.staged, self.commit) = (later, Some(asked));
+    }
+
+    /// What the cell itself says that it feels, when nothing else is known of it.
+    fn learn(&mut self, page: usize, felt: Felt) {
+        let joints = felt.before.as_ref().map_or(0, |joints| joints.place);
+        let waits = self.waiting.iter().any(|(_, (_, felt))| felt.said.place < joints);
+        if let Some(known @ None) = self.felt.get_mut(page).filter(|_| !waits) {
+            *known = Some(felt);
+        }
+    }
+
+    fn latch(&mut self, epoch: Epoch, joints: &Arc<Said>) {
+        for (page, felt) in self.waiting.latch(epoch) {
+            if let Some(known) = self.felt.get_mut(page) {
+                *known = Some(Felt { since: Some(Arc::clone(joints)), ..felt });
+            }
+        }
+    }
+
+    fn packets(&self) -> impl Iterator<Item = &Arc<Said>> {
+        let said = [&self.heartbeat, &self.tree, &self.commit, &self.asked].into_iter().chain(&self.starts);
+        let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
+        let felt = self.felt.iter().flatten().chain(self.waiting.iter().map(|(_, (_, felt))| felt));
+        let felt =
+            felt.flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
+        said.flatten().chain(written).chain(felt)
+    }
+}
+
+/// Where a page stands in [`Cell::felt`].
+const fn place_of(page: &SensorPage) -> usize {
+    match page {
+        SensorPage::Skin(_) => 0,
+        SensorPage::Acceleration(_) => 1,
+    }
+}
+
+impl InForce {
+    /// Takes a frame that stood on the bus. Bounded work; what is no packet counts for nothing.
+    pub fn take(&mut self, seen: Seen) {
+        let Ok(id) = packet::data_id(&seen.frame) else { return };
+        match id.kind {
+            Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => {}
+            Kind::Sensors | Kind::Configured => {}
+            Kind::Sum | Kind::Torque => return,
+        }
+        let Some((frames, packet)) = self.packet(id, seen) else { return };
+        let Ok(message) = Message::decode(&packet) else { return };
+        self.places += 1;
+        self.hear(&message, &Arc::new(Said { place: self.places, frames }));
+    }
+
+    /// The packet that a frame is or completes.
+    fn packet(&mut self, id: Id, seen: Seen) -> Option<([Option<Seen>; 2], Packet)> {
+        if seen.frame.format() == Format::Fd {
+            return Some(([Some(seen), None], Packet::from_fd(&seen.frame).ok()?));
+        }
+        let (half, first) = self.halves.get_mut(usize::from(id.to_bits()))?;
+        match half.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
+            Ok(Paired::Whole(packet)) => {
+                self.open.remove(&id.to_bits());
+                Some(([first.take(), Some(seen)], packet))
+            }
+            Ok(Paired::Waiting | Paired::Incomplete) => {
+                *first = Some(seen);
+                if !id.kind.is_from_cells() {
+                    self.open.insert(id.to_bits(), seen.at_nanos);
+                }
+                None
+            }
+            Err(_) => None,
+        }
+    }
+
+    /// Whether the second half of something that the gateway's side says may still come: nobody should begin between
+    /// the two.
+    #[must_use]
+    pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
+        let within = |bits: u16| Half::within(Id::from_bits(bits)).0 * 1_000;
+        self.open.iter().any(|(bits, at)| now_nanos < at.saturating_add(within(*bits)))
+    }
+
+    fn hear(&mut self, message: &Message, said: &Arc<Said>) {
+        let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
+        let before = self.joints.as_ref().map(|(_, joints)| Arc::clone(joints));
+        match *message {
+            Message::Joints { epoch, .. } => {
+                // Cells drop joints of the last epoch.
+                if last != Some(epoch) {
+                    self.cells.iter_mut().for_each(|cell| cell.latch(epoch, said));
+                }
+                self.joints = Some((epoch, Arc::clone(said)));
+            }
+            Message::Halt | Message::Resume => self.halt = Some(Arc::clone(said)),
+            Message::Network { from: Node::Cell(from), page, .. } => {
+                let Some(cell) = self.cells.get_mut(from.index()) else { return };
+                match page {
+                    NetworkPage::Heartbeat(heartbeat) => {
+                        if heartbeat.state.has(State::CLAIMING) {
+                            cell.start(said, heartbeat.sent == 0);
+                        }
+                        cell.heartbeat = Some(Arc::clone(said));
+                    }
+                    NetworkPage::Tree(_) => cell.tree = Some(Arc::clone(said)),
+                    NetworkPage::Heard(_) | NetworkPage::Refused(_) | NetworkPage::Ports(_) => {}
+                }
+            }
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                self.each(to, |cell| cell.write(number, said, words.first() == Some(&1)));
+            }
+            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. } => {
+                if number == Parameter::Commit.number() {
+                    self.each(Node::Cell(from), Cell::commit);
+                }
+            }
+            Message::Stimulus { to, from, page } => {
+                let felt = Felt { said: Arc::clone(said), before, since: None };
+                self.each(to, |cell| {
+                    if !cell.measures {
+                        cell.waiting.push(from, (place_of(&page), felt.clone()), last);
+                    }
+                });
+            }
+            Message::Sensors { from, epoch, page } => {
+                if last.is_none_or(|last| last == epoch) {
+                    let felt = Felt { said: Arc::clone(said), before, since: None };
+                    self.each(Node::Cell(from), |cell| cell.learn(place_of(&page), felt.clone()));
+                }
+            }
+            Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Cell)) {
+        for (cell, it) in CellId::all().zip(&mut self.cells) {
+            if to.names(cell) {
+                act(it);
+            }
+        }
+    }
+
+    /// All of them, in the bus' order.
+    #[must_use]
+    pub fn frames(&self) -> Vec<Seen> {
+        let joints = self.joints.iter().map(|(_, joints)| joints);
+        let packets = self.cells.iter().flat_map(Cell::packets).chain(joints).chain(&self.halt);
+        let ordered: BTreeMap<_, _> = packets.map(|said| (said.place, said)).collect();
+        ordered.values().flat_map(|said| said.frames.iter().flatten().copied()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::fixed::{Q1_14, Q5_10};
+    use protocol::message::{From, Heartbeat, Joints, SkinSensors, Tree};
+    use protocol::packet::WORDS;
+
+    fn say(force: &mut InForce, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
+        let frames: Vec<_> = message.encode().frames(format).collect();
+        frames.iter().for_each(|&frame| force.take(Seen { at_nanos, own: true, frame }));
+        frames
+    }
+
+    fn stimulus(node: u8, newtons: f64, epoch: u8) -> Message {
+        let skin = SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() };
+        Message::Stimulus {
+            to: Node::from_byte(node),
+            from: From::Epoch(Epoch(epoch)),
+            page: SensorPage::Skin(skin),
+        }
+    }
+
+    fn heartbeat(node: u8, sent: u16) -> Message {
+        let page = NetworkPage::Heartbeat(Heartbeat { sent, configuration: 77, ..Heartbeat::default() });
+        Message::Network { from: Node::from_byte(node), epoch: Epoch(0), page }
+    }
+
+    fn joints(epoch: u8) -> Message {
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        Message::Joints { epoch: Epoch(epoch), joints }
+    }
+
+    #[test]
+    fn the_last_of_everything_is_kept_in_both_formats() {
+        for format in [Format::Fd, Format::Classic] {
+            let mut force = InForce::default();
+            let cell = CellId::new(3).unwrap();
+            say(&mut force, 1, format, &heartbeat(3, 1));
+            let write = |number, word| Message::Configure {
+                to: Node::Everyone,
+                tag: 0,
+                request: Request::Write { number, words: [word, 0, 0, 0, 0, 0] },
+            };
+            let tree = |parent| Message::Network {
+                from: Node::Cell(cell),
+                epoch: Epoch(0),
+                page: NetworkPage::Tree(Tree { parent: Some(parent), ..Tree::default() }),
+            };
+            say(&mut force, 1, format, &write(7, 1));
+            say(&mut force, 1, format, &write(1, 1));
+            say(&mut force, 1, format, &tree(4));
+            say(&mut force, 2, format, &Message::Halt);
+            let mut expected = vec![];
+            expected.extend(say(&mut force, 2, format, &write(1, 2)));
+            expected.extend(say(&mut force, 2, format, &tree(5)));
+            expected.extend(say(&mut force, 2, format, &write(7, 2)));
+            expected.extend(say(&mut force, 2, format, &write(9, 2)));
+            expected.extend(say(&mut force, 3, format, &heartbeat(3, 2)));
+            // The order is the bus', whatever the times say.
+            expected.extend(say(&mut force, 4, format, &joints(1)));
+            expected.extend(say(&mut force, 1, format, &stimulus(3, 1.0, 7)));
+            expected.extend(say(&mut force, 6, format, &stimulus(255, 2.0, 8)));
+            expected.extend(say(&mut force, 7, format, &joints(2)));
+            expected.extend(say(&mut force, 8, format, &Message::Resume));
+            let torque = Message::Torque { from: cell, epoch: Epoch(2), torque: Default::default() };
+            say(&mut force, 9, format, &torque);
+            let frames: Vec<_> = force.frames().iter().map(|seen| seen.frame).collect();
+            assert_eq!(frames, expected, "{format:?}");
+        }
+    }
+
+    #[test]
+    fn of_stimuli_those_are_kept_that_are_felt_or_wait_with_the_joints_that_say_which() {
+        let mut force = InForce::default();
+        let mut kept = vec![];
+        let mut now = 0;
+        let mut say = |message: &Message, keep: bool| {
+            now += 1;
+            say(&mut force, now, Format::Fd, message);
+            kept.extend(keep.then_some(now));
+        };
+        say(&joints(1), false);
+        say(&stimulus(9, 1.0, 2), false);
+        say(&joints(2), true);
+        say(&stimulus(9, 2.0, 3), true);
+        say(&joints(3), true);
+        // More than the half of all epochs later it is still felt.
+        (4..=199).for_each(|epoch| say(&joints(epoch), false));
+        say(&joints(200), true);
+        (0..12).for_each(|at| say(&stimulus(8, 1.0, 210), at < 8));
+        let frames: Vec<_> = force.frames().iter().map(|seen| seen.at_nanos).collect();
+        assert_eq!(frames, kept);
+    }
+
+    #[test]
+    fn who_has_started_anew_has_nothing_in_force_but_what_was_committed() {
+        let mut force = InForce::default();
+        let to = Node::Cell(CellId::new(3).unwrap());
+        let write = |number, word| {
+            let request = Request::Write { number, words: [word, 0, 0, 0, 0, 0] };
+            Message::Configure { to, tag: 0, request }
+        };
+        let taken = Answer::Value { number: Parameter::Commit.number(), written: true, words: [0; WORDS] };
+        let taken = Message::Configured { from: CellId::new(3).unwrap(), tag: 0, answer: taken };
+        let claims = |sent| {
+            let beat = Heartbeat { state: State::CLAIMING, sent, ..Heartbeat::default() };
+            Message::Network { from: to, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
+        };
+        let said = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
+        let said = [&said[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
+        let kept = |force: &InForce| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
+        (0..).zip(&said).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
+        assert_eq!(kept(&force), [0, 1, 3, 4, 5, 6, 7]);
+        say(&mut force, 8, Format::Fd, &claims(0));
+        say(&mut force, 9, Format::Fd, &claims(1));
+        assert_eq!(kept(&force), [0, 1, 7, 8, 9]);
+    }
+
+    #[test]
+    fn nobody_begins_between_the_halves_of_what_the_gateway_says() {
+        let mut force = InForce::default();
+        let halves = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
+        let (ours, theirs) = (halves(&joints(1)), halves(&heartbeat(3, 1)));
+        let mut take = |at_nanos, frame| {
+            force.take(Seen { at_nanos, own: true, frame });
+            [0, 14_000_000, 16_000_000].map(|later| force.is_within_a_packet(at_nanos + later))
+        };
+        assert_eq!(take(5, theirs[0]), [false; 3]);
+        assert_eq!(take(6, ours[0]), [true, true, false]);
+        assert_eq!(take(7, ours[1]), [false; 3]);
+    }
+}

@@ -1,0 +1,185 @@
+//! What a run records, and the thread that writes it.
+//!
+//! ```text
+//!   receiver, one a bus ─ frames, drops, what cells feel ─┐
+//!   control loop ─────── ticks ────────────────────────────┼─> queues ─> recorder ─┬─> run.mcap, run-1.mcap, ...
+//!   kernel ───────────── drops of its backlog ─────────────┘   (bounded)            └─> candump log
+//! ```
+//!
+//! Nobody waits for the recorder: what does not fit into a queue is counted, and said in the recording where it is
+//! missing. Nothing that happens to a file ends the run. `docs/recording.md` has the topics.
+
+pub(crate) mod backlog;
+pub mod facts;
+pub mod feed;
+pub mod force;
+pub mod text;
+mod thread;
+pub mod topics;
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+
+use feed::{Feed, Unrecorded};
+use text::Text;
+use topics::Topics;
+use trace::recording::account::Recording;
+use trace::recording::layout::Layout;
+use trace::recording::repair;
+use trace::recording::series::{Attached, Head, Series, Split};
+
+use trace::files::check_regular;
+
+/// What is to be recorded where.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Frames as candump text.
+    pub candump: Option<Candump>,
+    /// Everything as MCAP.
+    pub mcap: Option<Mcap>,
+    /// Whether a file that exists is overwritten.
+    pub force: bool,
+}
+
+/// Frames as candump text.
+#[derive(Clone, Debug)]
+pub struct Candump {
+    /// The file.
+    pub path: PathBuf,
+    /// Whether it gets a number when one of its name exists.
+    pub numbered: bool,
+}
+
+/// Everything as MCAP.
+#[derive(Clone, Debug)]
+pub struct Mcap {
+    /// The first file.
+    pub path: PathBuf,
+    /// When another file is begun.
+    pub split: Split,
+    /// Files in each file.
+    pub attachments: Vec<Attached>,
+    /// How the program was called.
+    pub command_line: Vec<String>,
+}
+
+/// Files that are claimed, and not begun.
+#[derive(Debug)]
+pub struct Outputs {
+    text: Option<Text>,
+    series: Option<Series<Topics>>,
+}
+
+impl Outputs {
+    /// Opens what will be written, so that what makes that impossible is known before there is anything to write.
+    /// Repairs what runs that were killed left beside it, each of which is said. A FIFO is waited for until somebody
+    /// reads it, or until `stopped`.
+    ///
+    /// # Errors
+    /// What cannot be written, and what to do.
+    pub fn claim(options: &Options, stopped: &AtomicBool, say: impl FnMut(&str)) -> Result<Self, String> {
+        let text = options.candump.as_ref().map(|candump| {
+            let failed = |error| format!("--candump {}: {error}", candump.path.display());
+            Text::create(candump, options.force, stopped).map_err(failed)
+        });
+        let text = text.transpose()?;
+        let series = options.mcap.as_ref().map(|mcap| {
+            let name = mcap.path.display();
+            if mcap.path.extension().is_none_or(|extension| extension != "mcap") {
+                return Err(format!("--record {name}: a recording's name ends in .mcap"));
+            }
+            check_regular(&mcap.path, options.force).map_err(|error| format!("--record {name}: {error}"))?;
+            repair::orphans(&mcap.path, say);
+            Series::claim(&mcap.path, options.force, mcap.split)
+                .map_err(|error| format!("--record {name}: {error}"))
+        });
+        Ok(Self { text, series: series.transpose()? })
+    }
+
+    /// Whether nothing is to be recorded.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.text.is_none() && self.series.is_none()
+    }
+
+    /// The candump log, if there is one.
+    #[must_use]
+    pub fn log(&self) -> Option<&Path> {
+        self.text.as_ref().map(Text::path)
+    }
+
+    /// Whether more than frames is wanted.
+    #[must_use]
+    pub const fn wants_all(&self) -> bool {
+        self.series.is_some()
+    }
+
+    /// Begins to record what comes; each file begins with `head`.
+    ///
+    /// # Errors
+    /// When there is no thread for it.
+    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> io::Result<Recorder> {
+        let stop = Arc::new(Stop::default());
+        let (tell, said) = mpsc::channel();
+        let work = thread::Work::new(self, feed, layout, tell);
+        let (ended, name) = (Arc::clone(&stop), "recorder".to_owned());
+        let thread = std::thread::Builder::new().name(name).spawn(move || work.run(head, &ended))?;
+        Ok(Recorder { thread, stop, said })
+    }
+}
+
+/// How a recording is ended.
+#[derive(Debug, Default)]
+struct Stop {
+    /// Now.
+    now: AtomicBool,
+    /// As if there had been no run.
+    discard: AtomicBool,
+}
+
+/// The thread that records.
+#[derive(Debug)]
+pub struct Recorder {
+    thread: std::thread::JoinHandle<Recording>,
+    stop: Arc<Stop>,
+    said: mpsc::Receiver<String>,
+}
+
+impl Recorder {
+    /// What people should know since they were told last.
+    pub fn said(&self) -> impl Iterator<Item = String> + '_ {
+        self.said.try_iter()
+    }
+
+    /// Ends a recording of a run that never began, and leaves nothing of it but a log of what was heard.
+    #[must_use]
+    pub fn discard(self) -> Recording {
+        self.stop.discard.store(true, Ordering::Relaxed);
+        self.stop.now.store(true, Ordering::Release);
+        // It can leave no more than a file that the next run takes away.
+        self.thread.join().unwrap_or_default()
+    }
+
+    /// Records what has been handed over, when nobody hands over more, and ends the files. `unrecorded` is what
+    /// did not fit into receivers' queues, `ticks` what did not into the loop's.
+    #[must_use]
+    pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> Recording {
+        self.stop.now.store(true, Ordering::Release);
+        let mut recording = self.thread.join().unwrap_or_else(|_| {
+            let errors =
+                vec!["the recorder panicked: what it had written is recovered by the next run".to_owned()];
+            Recording { errors, ..Recording::default() }
+        });
+        recording.lost_queue = unrecorded.frames;
+        recording.lost += unrecorded.frames;
+        for (name, lost) in [("ticks", ticks), ("epochs", unrecorded.epochs)] {
+            if lost > 0 {
+                recording.messages_lost.insert(name, lost);
+            }
+        }
+        recording
+    }
+}

@@ -1,0 +1,433 @@
+//! The recorder's thread: takes what has come, writes it, flushes, looks around.
+
+use std::mem;
+use std::path::Path;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::Sender;
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::parameters::MAX_JOINTS;
+use rustix::time::{ClockId, clock_gettime};
+
+use super::backlog;
+use super::facts::realtime_minus_monotonic;
+use super::feed::{Captured, FRAMES, Feed, Lane};
+use super::force::InForce;
+use super::text::Text;
+use super::topics::Topics;
+use super::{Outputs, Stop};
+use trace::capture::{Note, NoteKind};
+use trace::files::sync;
+use trace::recording::account::{Recording, Written};
+use trace::recording::layout::Layout;
+use trace::recording::series::{Head, Said, Series, What};
+use trace::ros2::skin::Felt;
+use trace::ros2::standard::{Diagnosis, Level, Point};
+
+/// The thread's rhythm.
+const LOOK: Duration = Duration::from_millis(10);
+/// What has been written for so long is handed on: what a killed run may lose, beside one [`LOOK`].
+const FLUSH: Duration = Duration::from_millis(40);
+/// How often the kernel is asked for what its backlog dropped.
+const ASK: Duration = Duration::from_millis(100);
+/// How often the state of everything is recorded.
+const DIAGNOSE: Duration = Duration::from_millis(500);
+
+/// One bus, as the recorder sees it.
+#[derive(Default)]
+struct Seen {
+    in_force: InForce,
+    /// Frames recorded or counted as lost.
+    frames: u64,
+    /// Dropped by the bus.
+    dropped: u64,
+    /// Not fitted into the queue.
+    unrecorded: u64,
+    /// Not written since the last file ended.
+    missing: u64,
+    /// Epochs.
+    epochs: u64,
+}
+
+/// What the thread works on.
+pub(super) struct Work {
+    text: Option<Text>,
+    series: Option<Series<Topics>>,
+    feed: Feed,
+    layout: Layout,
+    tell: Sender<String>,
+    errors: Vec<Said>,
+    /// How many of them were told.
+    told: usize,
+    buses: Vec<Seen>,
+    /// Joint positions at the last tick.
+    q: Option<[f64; MAX_JOINTS]>,
+    backlog: Option<u64>,
+    ticks: u64,
+    ticks_skipped: u64,
+    greatest_late_ns: u64,
+    scratch: (Vec<Felt>, Vec<Point>),
+}
+
+/// Something that happens now and then.
+struct Every(Duration, Instant);
+
+impl Every {
+    fn new(period: Duration) -> Self {
+        Self(period, Instant::now())
+    }
+
+    fn is_due(&mut self) -> bool {
+        let due = self.1.elapsed() >= self.0;
+        if due {
+            self.1 = Instant::now();
+        }
+        due
+    }
+}
+
+impl Work {
+    pub(super) fn new(outputs: Outputs, feed: Feed, layout: Layout, tell: Sender<String>) -> Self {
+        let Outputs { text, series } = outputs;
+        let buses = feed.lanes.iter().map(|_| Seen::default()).collect();
+        Self {
+            text,
+            series,
+            feed,
+            layout,
+            tell,
+            errors: Vec::new(),
+            told: 0,
+            buses,
+            q: None,
+            backlog: backlog::dropped(),
+            ticks: 0,
+            ticks_skipped: 0,
+            greatest_late_ns: 0,
+            scratch: (Vec::new(), Vec::new()),
+        }
+    }
+
+    /// Records until someone says stop, and what has come until then.
+    pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
+        if let Some(series) = &mut self.series {
+            series.begin(head, |writer| Topics::new(writer, &self.layout));
+        }
+        let (mut flush, mut ask, mut diagnose) = (Every::new(FLUSH), Every::new(ASK), Every::new(DIAGNOSE));
+        loop {
+            let ended = stop.now.load(Ordering::Acquire);
+            let taken = self.take();
+            if ended && stop.discard.load(Ordering::Relaxed) {
+                return self.discard();
+            }
+            if ask.is_due() || ended {
+                self.ask_kernel();
+            }
+            if diagnose.is_due() || ended {
+                self.diagnose();
+            }
+            if flush.is_due() {
+                self.flush();
+            }
+            self.say();
+            if ended {
+                break;
+            }
+            if taken < FRAMES / 8 {
+                thread::sleep(LOOK);
+            }
+        }
+        self.finish()
+    }
+
+    /// Writes everything that waits; the most that waited in one queue.
+    fn take(&mut self) -> usize {
+        let offset = realtime_minus_monotonic();
+        let mut most = 0;
+        self.take_ticks(offset);
+        for bus in 0..self.feed.lanes.len() {
+            most = most.max(self.take_frames(bus));
+            self.take_touched(bus);
+        }
+        most
+    }
+
+    fn take_frames(&mut self, bus: usize) -> usize {
+        let (Some(lane), Some(seen), Some(name)) =
+            (self.feed.lanes.get_mut(bus), self.buses.get_mut(bus), self.layout.buses.get(bus))
+        else {
+            return 0;
+        };
+        // What comes while this is written is the next round's, so that other queues have their turn.
+        let waiting = lane.frames.slots();
+        let Ok(waiting) = lane.frames.read_chunk(waiting) else { return 0 };
+        let taken = waiting.len();
+        for captured in waiting {
+            match captured {
+                Captured::Frame(frame) => {
+                    seen.frames += 1;
+                    seen.in_force.take(frame);
+                    if let Some(text) = &mut self.text
+                        && let Err(error) = text.frame(name, &frame)
+                    {
+                        self.errors.push(failed(text, &error));
+                    }
+                    if let Some(series) = &mut self.series {
+                        seen.missing += u64::from(!series.is_open());
+                        series.put(What::Frame, |writer, topics| topics.frame(writer, bus, name, &frame));
+                    }
+                }
+                Captured::Dropped { at_nanos, frames } => {
+                    seen.dropped += frames;
+                    let (place, total) = (format!("CAN frames on '{name}' socket"), seen.dropped);
+                    let dropped = Dropped { at_nanos, interface: name, frames, place: &place, total };
+                    dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+                }
+                Captured::Unrecorded { at_nanos, frames } => {
+                    seen.unrecorded += frames;
+                    let place = format!("CAN frames on '{name}' in the queue to the recorder");
+                    let (interface, total, place) = (name.as_str(), seen.unrecorded, place.as_str());
+                    let dropped = Dropped { at_nanos, interface, frames, place, total };
+                    dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+                }
+            }
+        }
+        taken
+    }
+
+    fn take_ticks(&mut self, offset: i64) {
+        let Some(ticks) = &mut self.feed.ticks else { return };
+        while let Ok(timed) = ticks.pop() {
+            self.q = Some(timed.record.q);
+            self.ticks += 1;
+            self.ticks_skipped += timed.record.skipped;
+            self.greatest_late_ns = self.greatest_late_ns.max(timed.late_ns);
+            let nanos = timed.due_ns.saturating_add_signed(offset);
+            if let Some(series) = &mut self.series {
+                series
+                    .put(What::Others(4), |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
+            }
+        }
+    }
+
+    fn take_touched(&mut self, bus: usize) {
+        let (Some(lane), Some(seen)) = (self.feed.lanes.get_mut(bus), self.buses.get_mut(bus)) else {
+            return;
+        };
+        let (Some(queue), Some(series)) = (&mut lane.touched, &mut self.series) else { return };
+        while let Ok(touched) = queue.pop() {
+            let cloud = seen.epochs.is_multiple_of(self.layout.epochs_per_cloud);
+            let q = self.q.as_ref().filter(|_| cloud);
+            seen.epochs += 1;
+            let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
+            for (place, _) in patches {
+                let messages = if q.is_some() { 2 } else { 1 };
+                series.put(What::Others(messages), |writer, topics| {
+                    topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
+                });
+            }
+        }
+    }
+
+    /// What the kernel dropped on the way to all sockets: of which bus, if of any, nobody knows.
+    fn ask_kernel(&mut self) {
+        let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
+        let frames = total.saturating_sub(before);
+        self.backlog = Some(total);
+        if frames > 0 {
+            let place = "packets of any network in the kernel's backlog";
+            let dropped = Dropped { at_nanos: wall(), interface: "", frames, place, total };
+            dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+        }
+    }
+
+    fn diagnose(&mut self) {
+        let Some(series) = &mut self.series else { return };
+        let mut parts = vec![Diagnosis {
+            level: if self.ticks_skipped > 0 { Level::Warn } else { Level::Ok },
+            name: "gateway: control loop".to_owned(),
+            message: if self.ticks_skipped > 0 { "ticks were skipped" } else { "in time" }.to_owned(),
+            values: vec![
+                ("ticks", mem::take(&mut self.ticks).to_string()),
+                ("skipped", mem::take(&mut self.ticks_skipped).to_string()),
+                ("greatest_late_us", (mem::take(&mut self.greatest_late_ns) / 1_000).to_string()),
+            ],
+        }];
+        let buses = self.feed.lanes.iter().zip(&self.layout.buses).zip(&self.buses);
+        parts.extend(buses.map(|((lane, name), seen)| bus(lane, name, seen)));
+        let lost = series.lost();
+        let unrecorded: u64 = self.buses.iter().map(|bus| bus.unrecorded).sum();
+        let all_well = lost.frames + lost.others + unrecorded == 0;
+        parts.push(Diagnosis {
+            level: if all_well { Level::Ok } else { Level::Error },
+            name: "gateway: recorder".to_owned(),
+            message: if all_well { "everything is recorded" } else { "something is missing" }.to_owned(),
+            values: vec![
+                ("bytes", series.bytes().to_string()),
+                ("frames_not_written", lost.frames.to_string()),
+                ("others_not_written", lost.others.to_string()),
+                ("frames_queue_full", unrecorded.to_string()),
+            ],
+        });
+        let now = wall();
+        series.put(What::Others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
+    }
+
+    fn flush(&mut self) {
+        if let Some(text) = &mut self.text
+            && let Err(error) = text.flush()
+        {
+            self.errors.push(failed(text, &error));
+        }
+        let Some(series) = &mut self.series else { return };
+        // Both halves of what the cells are told stand in one file.
+        let now = wall();
+        let holds = self.buses.iter().any(|bus| bus.in_force.is_within_a_packet(now));
+        if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
+            return;
+        }
+        // So that this file can be understood without the one before.
+        for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
+            for frame in seen.in_force.frames() {
+                series
+                    .put(What::Others(1), |writer, topics| topics.in_force(writer, now, (bus, name), &frame));
+            }
+        }
+        for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
+            let frames = mem::take(&mut seen.missing);
+            if frames > 0 {
+                let place = format!("CAN frames on '{name}' while nothing could be written");
+                let dropped =
+                    Dropped { at_nanos: wall(), interface: name, frames, place: &place, total: frames };
+                dropped.write(&mut None, &mut self.series, &mut self.errors);
+            }
+        }
+    }
+
+    /// Tells what people should know.
+    fn say(&mut self) {
+        if let Some(series) = &mut self.series {
+            self.errors.extend(series.said());
+        }
+        for line in self.errors.get(self.told..).unwrap_or_default() {
+            // Nobody listens any more when the run ends.
+            let _ = self.tell.send(line.to_string());
+        }
+        self.told = self.errors.len();
+    }
+
+    /// Leaves a log of what was heard, and else nothing.
+    fn discard(mut self) -> Recording {
+        if let Some(series) = &mut self.series {
+            series.discard();
+        }
+        let files: Vec<_> = self.text.and_then(Text::discard).into_iter().collect();
+        Recording { frames: files.iter().map(|file| file.frames).sum(), files, ..Recording::default() }
+    }
+
+    fn finish(mut self) -> Recording {
+        let mut recording = Recording::default();
+        let mut lost = 0;
+        if let Some(mut series) = self.series.take() {
+            let (files, unwritten) = series.finish();
+            for Written { path, .. } in &files {
+                // While the run lasted the recorder waited for no disk; now nobody waits for the recorder.
+                if let Err(error) = sync(Path::new(path)) {
+                    self.errors.push(Said::Else(format!("{path}: {error}")));
+                }
+            }
+            recording.files = files;
+            lost = unwritten.frames;
+            if unwritten.others > 0 {
+                recording.messages_lost.insert("unwritten", unwritten.others);
+            }
+            self.errors.extend(series.said());
+        }
+        if let Some(text) = self.text.take() {
+            let path = text.path().display().to_string();
+            let (file, unwritten, finished) = text.finish();
+            recording.files.push(file);
+            lost = lost.max(unwritten);
+            // What was said before is the reason.
+            if let Err(error) = finished {
+                self.errors.push(Said::BrokeOff(format!("{path}: {error}")));
+            }
+        }
+        self.say();
+        let offered: u64 = self.buses.iter().map(|bus| bus.frames).sum();
+        recording.frames = offered.saturating_sub(lost);
+        recording.lost_write = lost;
+        recording.lost = lost;
+        let spent = Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default();
+        recording.processor_s = spent.as_secs_f64();
+        recording.errors = self.errors.iter().map(|said| said.what().to_owned()).collect();
+        recording
+    }
+}
+
+/// Frames that are missing from here on.
+struct Dropped<'a> {
+    at_nanos: u64,
+    /// The bus, if it is known.
+    interface: &'a str,
+    frames: u64,
+    /// Which frames, and where.
+    place: &'a str,
+    total: u64,
+}
+
+impl Dropped<'_> {
+    /// Says it in every format.
+    fn write(&self, text: &mut Option<Text>, series: &mut Option<Series<Topics>>, errors: &mut Vec<Said>) {
+        let Self { at_nanos: nanos, interface, frames, place, total } = *self;
+        let line = format!("DROPCOUNT: dropped {frames} {place} (total drops {total})");
+        if let Some(text) = text
+            && let Err(error) = text.note(&line)
+        {
+            errors.push(failed(text, &error));
+        }
+        if let Some(series) = series {
+            let kind = NoteKind::Dropped(frames);
+            let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
+            series.put(What::Others(1), |writer, topics| topics.note(writer, &note));
+        }
+    }
+}
+
+fn failed(text: &Text, error: &std::io::Error) -> Said {
+    Said::BrokeOff(format!("{}: {error}", text.path().display()))
+}
+
+/// How a bus is.
+fn bus(lane: &Lane, name: &str, seen: &Seen) -> Diagnosis {
+    let works = lane.works.load(Ordering::Relaxed);
+    let (mut cells, mut silent) = (0, 0);
+    if let Ok(view) = lane.view.lock() {
+        cells = view.cells.len();
+        silent = view.cells.iter().filter(|cell| !cell.heard || cell.dead).count();
+    }
+    let (level, message) = match (works, silent, seen.dropped) {
+        (false, _, _) => (Level::Error, "the bus does not work"),
+        (true, 0, 0) => (Level::Ok, "all cells are there"),
+        (true, 0, _) => (Level::Warn, "frames were dropped"),
+        (true, _, _) => (Level::Warn, "cells are silent"),
+    };
+    Diagnosis {
+        level,
+        name: format!("gateway: bus {name}"),
+        message: message.to_owned(),
+        values: vec![
+            ("cells", cells.to_string()),
+            ("silent", silent.to_string()),
+            ("frames", seen.frames.to_string()),
+            ("dropped", seen.dropped.to_string()),
+        ],
+    }
+}
+
+/// The wall clock in ns since 1970.
+fn wall() -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,236 @@
+//! What stands on each topic of a recording.
+
+use std::borrow::Cow;
+use std::io;
+
+use protocol::candump::{Direction, Record, Timestamp};
+use protocol::parameters::MAX_JOINTS;
+
+use super::feed::Touched;
+use super::force::Seen;
+use control::controller::BadCycle;
+use control::cycle::Halt;
+use control::cycle::turn::Timed;
+use model::table::Status;
+use trace::capture::Note;
+use trace::recording::file::Channel;
+use trace::recording::layout::{Layout, Patch};
+use trace::recording::series::Writer;
+use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
+use trace::ros2::messages::{CanFrame, CaptureNote};
+use trace::ros2::skin::{Felt, LoopTiming, PatchState, Torques};
+use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
+
+/// What positions of points are relative to.
+const BASE: &str = "base";
+
+/// The channels of one file.
+#[derive(Debug)]
+pub struct Topics {
+    can: Vec<Channel>,
+    state: Vec<Channel>,
+    notes: Channel,
+    joint_states: Channel,
+    joint_commands: Channel,
+    torques: Channel,
+    timing: Channel,
+    diagnostics: Channel,
+    /// By patch: its state, its points.
+    patches: Vec<[Channel; 2]>,
+}
+
+impl Topics {
+    /// All of them, so that a reader knows from the beginning what may come.
+    ///
+    /// # Errors
+    /// When the file cannot be written, as of everything below.
+    pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
+        let digits = [("time_digits", "9")];
+        let mut of_buses = |before: &str| -> io::Result<Vec<Channel>> {
+            let topics = layout.buses.iter().map(|bus| format!("{before}{bus}"));
+            topics.map(|topic| writer.channel::<CanFrame<'_>>(&topic, &digits)).collect()
+        };
+        let (can, state) = (of_buses(TOPIC_OF_BUS)?, of_buses(TOPIC_OF_STATE)?);
+        let patches = layout.patches.iter().map(|Patch { topic, .. }| {
+            let state = writer.channel::<PatchState<'_>>(topic, &[])?;
+            Ok([state, writer.channel::<PointCloud<'_>>(&format!("{topic}/points"), &[])?])
+        });
+        let patches = patches.collect::<io::Result<_>>()?;
+        let arm = &layout.arm;
+        Ok(Self {
+            can,
+            state,
+            notes: writer.channel::<CaptureNote<'_>>(NOTES, &[])?,
+            joint_states: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_states"), &[])?,
+            joint_commands: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_commands"), &[])?,
+            torques: writer.channel::<Torques<'_>>(&format!("/{arm}/torques"), &[])?,
+            timing: writer.channel::<LoopTiming>("/gateway/timing", &[])?,
+            diagnostics: writer.channel::<Diagnostics<'_>>("/diagnostics", &[])?,
+            patches,
+        })
+    }
+
+    /// A frame of a bus.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn frame(&mut self, writer: &mut Writer, bus: usize, name: &str, seen: &Seen) -> io::Result<()> {
+        let Some(channel) = self.can.get_mut(bus) else { return Ok(()) };
+        writer.write(channel, seen.at_nanos, &message(name, seen))
+    }
+
+    /// A frame that is in force when the file begins, at `nanos`: its own time may be long before, and would be
+    /// the beginning of what viewers show.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn in_force(
+        &mut self,
+        writer: &mut Writer,
+        nanos: u64,
+        (bus, name): (usize, &str),
+        seen: &Seen,
+    ) -> io::Result<()> {
+        let Some(channel) = self.state.get_mut(bus) else { return Ok(()) };
+        writer.write(channel, nanos, &message(name, seen))
+    }
+
+    /// Something between frames.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn note(&mut self, writer: &mut Writer, note: &Note<'_>) -> io::Result<()> {
+        writer.write(&mut self.notes, note.nanos, &CaptureNote(Cow::Borrowed(note)))
+    }
+
+    /// A tick of the loop that should have begun at a time.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn tick(
+        &mut self,
+        writer: &mut Writer,
+        layout: &Layout,
+        nanos: u64,
+        timed: &Timed,
+    ) -> io::Result<()> {
+        let names = &layout.joints;
+        fn of(joints: usize, values: &[f64; MAX_JOINTS]) -> &[f64] {
+            values.get(..joints).unwrap_or_default()
+        }
+        let record = &timed.record;
+        let [position, velocity, effort, command] =
+            [&record.q, &record.qdot, &record.torque, &record.command].map(|values| of(names.len(), values));
+        writer.write(
+            &mut self.joint_states,
+            nanos,
+            &JointState { nanos, names, position, velocity, effort },
+        )?;
+        let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
+        writer.write(&mut self.joint_commands, nanos, &command)?;
+        let (central, active) = match &timed.central {
+            Some((_, felt)) => (of(names.len(), &felt.torque), felt.active),
+            None => (&[][..], 0),
+        };
+        writer.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active })?;
+        writer.write(&mut self.timing, nanos, &timing(nanos, timed))
+    }
+
+    /// What a patch's cells feel; with points where the joints' positions are given.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn patch(
+        &mut self,
+        writer: &mut Writer,
+        layout: &Layout,
+        place: usize,
+        touched: &Touched,
+        q: Option<&[f64; MAX_JOINTS]>,
+        scratch: &mut (Vec<Felt>, Vec<Point>),
+    ) -> io::Result<()> {
+        let (Some(patch), Some([state, points])) = (layout.patches.get(place), self.patches.get_mut(place))
+        else {
+            return Ok(());
+        };
+        let Some(central) = layout.central.get(patch.bus) else { return Ok(()) };
+        let (felt, cloud) = scratch;
+        felt.clear();
+        felt.extend(patch.cells.iter().map(|&(cell, node)| {
+            let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, Status::Unknown));
+            #[expect(clippy::cast_possible_truncation, reason = "words of 16 bits")]
+            let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
+                (central.force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
+            });
+            Felt { node, force, proximity, status: number(status) }
+        }));
+        let nanos = touched.at_nanos;
+        let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells: felt };
+        writer.write(state, nanos, &message)?;
+        let Some(q) = q else { return Ok(()) };
+        let frames = central.frames_at(q);
+        cloud.clear();
+        cloud.extend(felt.iter().zip(&patch.cells).map(|(felt, &(cell, _))| {
+            #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]
+            let position = central.position(cell, &frames).map(|metres| metres as f32);
+            Point { position, force: felt.force }
+        }));
+        writer.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud })
+    }
+
+    /// How everything is.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn diagnostics(&mut self, writer: &mut Writer, nanos: u64, parts: &[Diagnosis]) -> io::Result<()> {
+        writer.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts })
+    }
+}
+
+fn message<'a>(interface: &'a str, seen: &Seen) -> CanFrame<'a> {
+    let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
+    let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
+    CanFrame(Record { time, interface, frame: seen.frame, direction })
+}
+
+const fn number(status: Status) -> u8 {
+    match status {
+        Status::Unknown => 0,
+        Status::Quiet => 1,
+        Status::Active => 2,
+        Status::Stale => 3,
+        Status::Dead => 4,
+    }
+}
+
+fn timing(nanos: u64, timed: &Timed) -> LoopTiming {
+    let record = &timed.record;
+    #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+    let micros = |nanos: u64| nanos as f64 * 1e-3;
+    LoopTiming {
+        nanos,
+        tick: record.tick.number,
+        skipped: record.skipped,
+        late_us: micros(timed.late_ns),
+        took_us: micros(timed.took_ns),
+        central_us: timed.central.map_or(0.0, |(nanos, _)| micros(nanos)),
+        contributing: record.contributing,
+        age: record.age,
+        stale: record.stale,
+        dead: record.dead,
+        bad: match record.bad {
+            None => 0,
+            Some(BadCycle::Torque) => 1,
+            Some(BadCycle::NoPeer) => 2,
+            Some(BadCycle::NoAnswer) => 3,
+            Some(BadCycle::Nonsense) => 4,
+        },
+        halted: match record.halted {
+            None => 0,
+            Some(Halt::BadCycles(_)) => 1,
+            Some(Halt::Frame) => 2,
+        },
+        at_limit: record.moved.at_limit,
+        refused: record.moved.refused,
+    }
+}

@@ -1,0 +1,273 @@
+//! Replay: a capture goes back onto buses, and what the cells answer is compared with what they answered then.
+//!
+//! ```text
+//!   capture ─ survey: buses, cells, hashes, the state where it begins
+//!      │
+//!      └─ reader thread ── order, pick, number ── steps ──> player (SCHED_FIFO) ──> buses ──> cells
+//!                               │                                │                    │
+//!                               └── recorded replies ──> judge <─┴─ announced joints  │
+//!                                                          ▲                          │
+//!                                                          └── ear (one a bus) <──────┘
+//! ```
+//!
+//! What decides is pure: [`survey`], [`state`], [`order`], [`reel`], [`player`] (its clock and buses are a
+//! [`player::Stage`]), [`judge`] and [`difference`]. The rest is threads, sockets and the clock.
+
+pub mod difference;
+mod ear;
+mod feed;
+mod hall;
+pub mod judge;
+mod live;
+pub mod player;
+pub mod reel;
+pub mod report;
+mod session;
+mod start;
+pub mod state;
+pub mod survey;
+mod teller;
+pub mod touched;
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use hdrhistogram::Histogram;
+use protocol::bus::Kinds;
+use protocol::id::CellId;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use crate::run::{RunError, realtime};
+use crate::signals::caught;
+use judge::Judge;
+use model::decode::BUSES;
+use model::decode::pick::Pick;
+use model::quantiles::histogram;
+use player::Pace;
+use reel::Only;
+use report::Summary;
+use session::Session;
+use start::{Checks, Routes};
+use survey::{Part, Survey};
+use teller::Teller;
+use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
+
+/// The period of wake-ups at which lateness is judged, in ns.
+const GRID_NS: u64 = 2_000_000;
+/// Wake-ups of the idle machine that are measured.
+const IDLE_WAKEUPS: u32 = 100;
+/// Lines of a log that cannot be read are named up to so many.
+const NAMED_LINES: u64 = 5;
+
+/// Cells that are started for a replay.
+#[derive(Clone, Debug)]
+pub struct Spawn {
+    /// Their skin; else the one attached to the recording.
+    pub skin: Option<PathBuf>,
+    /// At most so many in a process.
+    pub cells_per_process: usize,
+    /// Their program, when it is not beside this one.
+    pub cell_node: Option<PathBuf>,
+}
+
+/// What a replay needs to know.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The capture: a file, or the parts of a recording.
+    pub files: Vec<PathBuf>,
+    /// Which kind of bus.
+    pub kinds: Kinds,
+    /// Whose frames are sent.
+    pub only: Only,
+    /// Which kinds, to and from whom; its times are not looked at.
+    pub pick: Pick,
+    /// The capture's buses whose frames are sent; all when empty.
+    pub buses: Vec<String>,
+    /// Which bus of the capture goes to which one now.
+    pub map: Vec<(String, String)>,
+    /// Which part of the capture.
+    pub part: Part,
+    /// How often; without end when there is no number.
+    pub passes: Option<u32>,
+    /// How fast.
+    pub pace: Pace,
+    /// How long before its time a frame is waited for by spinning.
+    pub spin: Duration,
+    /// Whether joints wait until all cells have answered the ones before.
+    pub lockstep: bool,
+    /// Whether replies are compared with recorded ones.
+    pub expect: bool,
+    /// Cells to start.
+    pub spawn: Option<Spawn>,
+    /// The embedded bus' program, when it is not beside this one.
+    pub vcan_setup: Option<PathBuf>,
+    /// Whether cells that measure are put into test mode.
+    pub test_mode: bool,
+    /// How long a full bus is waited for.
+    pub patience: Duration,
+    /// Bytes that may wait in the socket of a bus, as the kernel counts them.
+    pub receive_buffer: usize,
+    /// Whether a line that cannot be read ends it before it begins.
+    pub strict: bool,
+    /// Whether nothing is said on the way.
+    pub quiet: bool,
+}
+
+/// Replays a capture to its end, or until SIGINT or SIGTERM.
+///
+/// # Errors
+/// When it cannot begin, or could not be read to its end. What went wrong on the buses and in the comparison is in the
+/// summary.
+pub fn replay(options: &Options) -> Result<Summary, RunError> {
+    let teller = Teller::new(options.quiet);
+    let (survey, extras, name) = look_through(options, &teller)?;
+    let survey = Arc::new(survey);
+    let routes = Routes::new(options, &survey, &name)?;
+    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
+    let wearing = wearing.transpose()?;
+    // Until now there was nothing that had to be put in order at an end.
+    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::Failed)?;
+    let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
+    let recorded = start::recorded_skin(&extras);
+    let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;
+    for lane in buses.lanes.iter() {
+        teller.say(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
+    }
+    let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
+    let heard = if speaks { buses.listen()? } else { Vec::new() };
+    if let (Some(spawn), Some(wearing)) = (&options.spawn, &wearing) {
+        buses.start_cells(spawn, wearing, &heard)?;
+    } else if options.only == Only::All {
+        warn_of_doubles(&survey, &routes, &heard, &teller);
+    }
+
+    let checks = Checks {
+        survey: Arc::clone(&survey),
+        routes: routes.clone(),
+        expects: options.expect,
+        spawned: options.spawn.is_some(),
+        name,
+    };
+    let judged = routes
+        .names
+        .iter()
+        .filter_map(|(bus, name)| Some((name.clone(), survey.buses.get(*bus)?.cells.clone())));
+    let judge = Judge::new(judged, survey.first.unwrap_or(0), options.expect);
+    Session::new(options, checks, judge, buses, signalled, teller).run(idle.as_ref(), wearing.as_ref())
+}
+
+/// Reads the capture once, from end to end; also what it is called.
+fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, String), RunError> {
+    if options.files.iter().any(|file| file.as_os_str() == "-") {
+        return Err(RunError::Usage(
+            "a capture is read twice, which standard input cannot be: write it to a file, and name that"
+                .to_owned(),
+        ));
+    }
+    if let Some(pipe) =
+        options.files.iter().find(|it| it.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
+    {
+        return Err(RunError::Usage(format!(
+            "{} is no regular file, and a capture is read twice: write it to a file, and name that",
+            pipe.display()
+        )));
+    }
+    let mut reader = Reader::open_all(&options.files).map_err(|error| RunError::Usage(error.to_string()))?;
+    let name = reader.name().to_owned();
+    let mut survey = Survey::new(options.part);
+    let too_many = |buses: usize| {
+        let why = "a replay sends to no more than that";
+        (buses > BUSES)
+            .then(|| RunError::Usage(format!("{name} has frames of more than {BUSES} buses: {why}")))
+    };
+    // What was in force stands before the first frame, and is known when it is open.
+    let in_force = &reader.extras().in_force;
+    let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
+    too_many(buses.len()).map_or(Ok(()), Err)?;
+    survey.begin(in_force);
+    let (mut unreadable, mut backwards) = (0_u64, None);
+    while let Some(entry) = reader.next().map_err(failed)? {
+        match entry {
+            Entry::Frame(record) => {
+                if record.time.nanos < survey.last && backwards.is_none() {
+                    backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
+                }
+                survey.take(&record);
+                too_many(survey.buses.len()).map_or(Ok(()), Err)?;
+            }
+            Entry::Note(note) => match note.kind {
+                NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
+                NoteKind::Unreadable(why) => {
+                    let line = format!("{name}:{}: {why}", note.line);
+                    if options.strict {
+                        return Err(RunError::Failed(line));
+                    }
+                    unreadable += 1;
+                    if unreadable <= NAMED_LINES {
+                        teller.say(&line);
+                    }
+                }
+                NoteKind::Text | NoteKind::CanXl => {}
+            },
+        }
+    }
+    survey.finish();
+    if unreadable > 0 {
+        teller.say(&format!("{name}: lines that could not be read and are left out: {unreadable}"));
+    }
+    if survey.dropped > 0 {
+        teller.say(&format!("{name}: {} frames are missing: whoever took it lost them", survey.dropped));
+    }
+    if let Some(what) = &reader.extras().unfinished {
+        teller.say(&format!("{name}: {what}"));
+    }
+    if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
+        let back = Duration::from_nanos(nanos).as_secs_f64();
+        teller.say(&format!(
+            "{name}: times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \
+             before it is sent at once"
+        ));
+    }
+    if survey.frames == 0 {
+        return Err(RunError::Usage(format!("{name}: there is no frame in it")));
+    }
+    let (from, to) = survey.bounds();
+    if from > survey.last || from >= to {
+        let length = Duration::from_nanos(survey.last - survey.first.unwrap_or(0)).as_secs_f64();
+        return Err(RunError::Usage(format!(
+            "nothing is left to be sent: {name} lasts {length:.3} s from its first frame on, and --from and --to \
+             leave none of it"
+        )));
+    }
+    Ok((survey, reader.extras().clone(), name))
+}
+
+fn failed(error: CaptureError) -> RunError {
+    RunError::Failed(error.to_string())
+}
+
+/// Measured in a thread as punctual as the player's.
+fn idle_lateness() -> Histogram<u64> {
+    let measure = || {
+        realtime::prepare();
+        realtime::idle_lateness(GRID_NS, IDLE_WAKEUPS)
+    };
+    thread::spawn(measure).join().unwrap_or_else(|_| histogram())
+}
+
+/// Cells that speak already are about to hear themselves.
+fn warn_of_doubles(survey: &Survey, routes: &Routes, heard: &[BTreeSet<CellId>], teller: &Teller) {
+    for ((bus, name), heard) in routes.names.iter().zip(heard) {
+        let Some(bus) = survey.buses.get(*bus) else { continue };
+        let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
+        if !both.is_empty() {
+            teller.say(&format!(
+                "cells that are on {name} will hear their own words of the capture: {}; --only inputs leaves these out",
+                start::names(&both)
+            ));
+        }
+    }
+}

@@ -1,0 +1,313 @@
+//! Sending what is due, when it is due.
+//!
+//! ```text
+//!   steps ──> [ Player ] ──> frames due together, bus by bus ──> stage
+//! ```
+//!
+//! The stage has the clock and the buses; in the tests both are variables.
+
+use hdrhistogram::Histogram;
+use protocol::bus::batch::BATCH;
+use protocol::can::Frame;
+use protocol::message::{Joints, Message};
+use protocol::packet::Epoch;
+use serde::Serialize;
+
+use super::reel::{Due, Role, Step};
+use model::quantiles::histogram;
+
+/// From the decision to begin to the first frame, in ns.
+const LEAD_NS: u64 = 1_000_000;
+
+/// What became of frames that were to be sent.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Sent {
+    /// The bus has taken all.
+    All,
+    /// It took so many and stayed full.
+    Full(usize),
+    /// It took so many and is down.
+    Down(usize),
+    /// It took so many and has ended, as the text says.
+    Ended(usize, String),
+}
+
+/// Joints that were sent and that cells answer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Open {
+    /// Their epoch.
+    pub epoch: Epoch,
+    /// Their positions.
+    pub joints: Joints,
+    /// Which ones they are.
+    pub round: Option<u64>,
+}
+
+/// The clock, the buses, and whoever listens.
+pub trait Stage {
+    /// A monotonic clock in ns.
+    fn now(&self) -> u64;
+    /// Waits until the clock reads `at`, or somebody says stop.
+    fn wait_until(&mut self, at: u64);
+    /// Nothing is there to be sent, and more will come.
+    fn pause(&mut self);
+    /// Whether somebody has said stop.
+    fn is_over(&self) -> bool;
+    /// Joints are about to be sent.
+    fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch);
+    /// Sends frames, waiting for room for a while.
+    fn send(&mut self, lane: usize, frames: &[Frame]) -> Sent;
+    /// A bus did not take the joints of a round.
+    fn was_not_sent(&mut self, lane: usize, round: u64);
+    /// Waits until the cells of a bus have answered.
+    fn wait_for_answers(&mut self, lane: usize, open: &Open);
+    /// Brings about a state, bus by bus.
+    ///
+    /// # Errors
+    /// When the cells are then not as they have to be, or a bus has ended.
+    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String>;
+    /// The replay is there, in ns after its first frame.
+    fn show(&mut self, at: u64);
+}
+
+/// The next step.
+#[derive(Debug)]
+pub enum Next<'a> {
+    /// This.
+    Step(&'a Step),
+    /// It is not there yet.
+    Later,
+    /// There is none.
+    End,
+}
+
+/// Where steps come from.
+pub trait Feed {
+    /// The next step, which stays there.
+    fn peek(&mut self) -> Next<'_>;
+    /// Takes it away.
+    fn take(&mut self) -> Option<Step>;
+}
+
+/// How fast.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pace {
+    /// At the capture's own times, so many times as fast.
+    Timed(f64),
+    /// As fast as the bus takes it.
+    Max,
+}
+
+/// What became of one bus' frames.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct LaneTally {
+    /// Taken by the bus.
+    pub sent: u64,
+    /// Not taken, because it stayed full.
+    pub refused: u64,
+    /// Not taken, because it was down.
+    pub lost: u64,
+    /// How often it went down.
+    pub outages: u64,
+}
+
+/// What a player has done.
+#[derive(Debug)]
+pub struct Played {
+    /// Bus by bus.
+    pub lanes: Vec<LaneTally>,
+    /// How late frames were sent, in ns; without those that were to be sent at once.
+    pub late: Histogram<u64>,
+    /// Whether somebody said stop before the end.
+    pub was_stopped: bool,
+    /// Why it could not go on.
+    pub failure: Option<String>,
+}
+
+/// Sends steps.
+#[derive(Debug)]
+pub struct Player {
+    pace: Pace,
+    /// With lockstep, the frames of a sync on each bus.
+    syncs: Option<Vec<Vec<Frame>>>,
+    /// Joints of each bus whose answers are awaited.
+    open: Vec<Option<Open>>,
+    down: Vec<bool>,
+    /// The clock's and the capture's time of the same moment.
+    origin: Option<(u64, u64)>,
+    played: Played,
+    batch: Vec<Frame>,
+    /// The rounds of joints in the batch, and where they stand.
+    rounds: Vec<(usize, u64)>,
+}
+
+impl Player {
+    /// For some buses; `syncs` has the frames of a sync on each, when the next joints shall wait for all answers.
+    #[must_use]
+    pub fn new(lanes: usize, pace: Pace, syncs: Option<Vec<Vec<Frame>>>) -> Self {
+        Self {
+            pace,
+            syncs,
+            open: vec![None; lanes],
+            down: vec![false; lanes],
+            origin: None,
+            played: Played {
+                lanes: vec![LaneTally::default(); lanes],
+                late: histogram(),
+                was_stopped: false,
+                failure: None,
+            },
+            batch: Vec::with_capacity(BATCH),
+            rounds: Vec::with_capacity(BATCH),
+        }
+    }
+
+    /// Sends all, or until somebody says stop or a bus has ended.
+    pub fn play(mut self, feed: &mut impl Feed, stage: &mut impl Stage) -> Played {
+        while self.played.failure.is_none() {
+            if stage.is_over() {
+                self.played.was_stopped = true;
+                break;
+            }
+            match feed.peek() {
+                Next::End => break,
+                Next::Later => stage.pause(),
+                Next::Step(Step::Restore(_)) => {
+                    self.wait_for_all(stage);
+                    if let Some(Step::Restore(states)) = feed.take() {
+                        self.played.failure = stage.restore(&states).err();
+                        self.origin = None;
+                    }
+                }
+                Next::Step(Step::Frame(due)) => {
+                    let due = *due;
+                    self.frames_from(&due, feed, stage);
+                }
+            }
+        }
+        if self.played.failure.is_none() && !self.played.was_stopped {
+            self.wait_for_all(stage);
+        }
+        self.played
+    }
+
+    fn wait_for_all(&mut self, stage: &mut impl Stage) {
+        for lane in 0..self.open.len() {
+            self.wait_for_answers(lane, stage);
+        }
+    }
+
+    fn wait_for_answers(&mut self, lane: usize, stage: &mut impl Stage) {
+        if let Some(open) = self.open.get_mut(lane).and_then(Option::take) {
+            stage.wait_for_answers(lane, &open);
+        }
+    }
+
+    /// When a frame is due by the clock; at once when there is none.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::cast_precision_loss,
+        reason = "times far below 2^53 ns"
+    )]
+    fn deadline(&mut self, due: &Due, now: u64) -> Option<u64> {
+        let Pace::Timed(speed) = self.pace else { return None };
+        if due.is_late {
+            return None;
+        }
+        let (clock, at) = *self.origin.get_or_insert((now + LEAD_NS, due.at));
+        Some(clock + (due.at.saturating_sub(at) as f64 / speed) as u64)
+    }
+
+    /// Sends a frame when it is due, and with it those behind it that are due by then on the same bus.
+    fn frames_from(&mut self, first: &Due, feed: &mut impl Feed, stage: &mut impl Stage) {
+        let lane = first.lane;
+        if self.syncs.is_some() && is_joints(first) {
+            self.wait_for_answers(lane, stage);
+        }
+        self.batch.clear();
+        self.rounds.clear();
+        let deadline = self.deadline(first, stage.now());
+        // Whoever hears the answer has to know the question, and afterwards there is no time for that.
+        let mut open = self.push(first, stage);
+        let _ = feed.take();
+        if let Some(deadline) = deadline {
+            stage.wait_until(deadline);
+        }
+        let now = stage.now();
+        self.was_late(deadline, now);
+        stage.show(first.at);
+        // In lockstep joints end a batch: what comes next has to wait, or belongs to the next ones.
+        while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
+            let Next::Step(Step::Frame(next)) = feed.peek() else { break };
+            let next = *next;
+            let waits =
+                self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
+            let deadline = self.deadline(&next, now);
+            if next.lane != lane || waits || deadline.is_some_and(|deadline| deadline > now) {
+                break;
+            }
+            self.was_late(deadline, now);
+            open = self.push(&next, stage).or(open);
+            let _ = feed.take();
+        }
+        let frames = self.batch.len();
+        let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(lane)).filter(|_| open.is_some());
+        self.batch.extend(sync.into_iter().flatten());
+        let sent = stage.send(lane, &self.batch);
+        self.account(lane, frames, sent, stage);
+        let is_down = self.down.get(lane).copied().unwrap_or(false);
+        if let Some(place) = self.open.get_mut(lane).filter(|_| self.syncs.is_some() && !is_down) {
+            *place = open.or(*place);
+        }
+    }
+
+    fn push(&mut self, due: &Due, stage: &mut impl Stage) -> Option<Open> {
+        self.batch.push(due.frame);
+        let Role::Joints { epoch, joints, round } = due.role else { return None };
+        stage.announce(due.lane, round, epoch);
+        self.rounds.extend(round.map(|round| (self.batch.len(), round)));
+        Some(Open { epoch, joints, round })
+    }
+
+    fn was_late(&mut self, deadline: Option<u64>, now: u64) {
+        if let Some(deadline) = deadline {
+            // It grows by itself; it cannot refuse.
+            let _ = self.played.late.record(now.saturating_sub(deadline));
+        }
+    }
+
+    fn account(&mut self, lane: usize, frames: usize, sent: Sent, stage: &mut impl Stage) {
+        let (Some(tally), Some(down)) = (self.played.lanes.get_mut(lane), self.down.get_mut(lane)) else {
+            return;
+        };
+        let (taken, is_down, failure) = match sent {
+            Sent::All => (frames, false, None),
+            Sent::Full(taken) => (taken.min(frames), false, None),
+            Sent::Down(taken) => (taken.min(frames), true, None),
+            Sent::Ended(taken, why) => (taken.min(frames), true, Some(why)),
+        };
+        let rest = (frames - taken) as u64;
+        tally.sent += taken as u64;
+        if is_down {
+            tally.lost += rest;
+            tally.outages += u64::from(!*down);
+        } else {
+            tally.refused += rest;
+        }
+        *down = is_down;
+        for (behind, round) in &self.rounds {
+            if *behind > taken {
+                stage.was_not_sent(lane, *round);
+            }
+        }
+        self.played.failure = failure;
+    }
+}
+
+const fn is_joints(due: &Due) -> bool {
+    matches!(due.role, Role::Joints { .. } | Role::HalfOfJoints)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,353 @@
+//! From the frames of a capture to what is sent, and when.
+//!
+//! ```text
+//!   frames ──> take ──> [ order by time ] ──> [ what is it? ] ──> picked? ──> Step, Step, ... ──> player
+//!                                └── joints, replies ──> judge
+//! ```
+
+use std::collections::BTreeMap;
+
+use protocol::can::Frame;
+use protocol::candump::Record;
+use protocol::id::Id;
+use protocol::message::{Joints, Message};
+use protocol::packet::{Epoch, data_id};
+use protocol::time::Micros;
+
+use super::judge::Judge;
+use super::survey::{Survey, is_input, is_joints};
+use model::decode::pick::Pick;
+use model::decode::settle::Settler;
+use model::decode::{Decoded, Fault};
+use trace::order::{Order, Ordered};
+
+/// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
+const LATE_REPLIES_NS: u64 = 1_000_000_000;
+/// The least time from one pass to the next, in ns.
+const LEAST_GAP_NS: u64 = 1_000_000;
+
+/// Whose frames are sent.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Only {
+    /// Everybody's, foreign ones too.
+    #[default]
+    All,
+    /// Commands, configuration and stimuli.
+    Inputs,
+    /// What cells said.
+    Replies,
+}
+
+/// What is sent.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// Whose.
+    pub only: Only,
+    /// Which kinds, to and from whom. Times are the survey's.
+    pub pick: Pick,
+    /// By the capture's buses: where a bus' frames go, if they go anywhere.
+    pub lanes: Vec<Option<usize>>,
+    /// Whether packets are read: joints are numbered, and replies handed on.
+    pub reads: bool,
+}
+
+/// Frames that are not sent, by reason.
+pub type Skipped = BTreeMap<&'static str, u64>;
+
+/// What is to be done next.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Step {
+    /// A frame is to be sent.
+    Frame(Due),
+    /// A pass begins: the state in force is brought about, bus by bus.
+    Restore(Vec<(usize, Vec<Message>)>),
+}
+
+/// A frame and its time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Due {
+    /// When, in ns after the first one, by the capture's clock and over all passes.
+    pub at: u64,
+    /// On which bus.
+    pub lane: usize,
+    /// What.
+    pub frame: Frame,
+    /// What it means for the order of things.
+    pub role: Role,
+    /// It is older than what was sent before it, and is sent at once.
+    pub is_late: bool,
+}
+
+/// What a frame means for the order of things.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Role {
+    /// Nothing.
+    Plain,
+    /// The first half of joints.
+    HalfOfJoints,
+    /// Joints, and the number of their round.
+    Joints {
+        /// Their epoch.
+        epoch: Epoch,
+        /// Their positions.
+        joints: Joints,
+        /// Which ones they are on their bus.
+        round: Option<u64>,
+    },
+}
+
+/// What a reel came to.
+#[derive(Clone, Debug, Default)]
+pub struct Cut {
+    /// Frames that were not sent.
+    pub skipped: Skipped,
+    /// Frames that were older than one sent before them.
+    pub late: u64,
+    /// The first of these: which frame of the capture it is, from 1, and by how many ns its time runs backwards.
+    pub first_late: Option<(u64, u64)>,
+}
+
+/// Whether there is more to come.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Flow {
+    /// Yes.
+    More,
+    /// What follows is of no interest.
+    Enough,
+}
+
+/// One frame that waits for its place.
+#[derive(Debug)]
+struct Waiting {
+    bus: usize,
+    frame: Frame,
+    number: u64,
+}
+
+/// One pass over a capture, or several.
+#[derive(Debug)]
+pub struct Reel<'a> {
+    survey: &'a Survey,
+    selection: &'a Selection,
+    order: Order<Waiting>,
+    settler: Settler<Ordered<Waiting>>,
+    cut: Cut,
+    read: u64,
+    /// When this pass begins, in ns after the first one.
+    offset: u64,
+    /// The times of the first and the last frame of this pass that are sent.
+    sent: Option<(u64, u64)>,
+    /// Frames and joints of this pass that are sent.
+    counts: (u64, u64),
+}
+
+impl<'a> Reel<'a> {
+    /// Of a capture that has been looked through.
+    #[must_use]
+    pub fn new(survey: &'a Survey, selection: &'a Selection) -> Self {
+        Self {
+            survey,
+            selection,
+            order: Order::default(),
+            settler: Settler::new(None),
+            cut: Cut::default(),
+            read: 0,
+            offset: 0,
+            sent: None,
+            counts: (0, 0),
+        }
+    }
+
+    /// Takes the capture's next frame.
+    pub fn take(&mut self, record: &Record<'_>, judge: &mut Judge, mut out: impl FnMut(Step)) -> Flow {
+        self.read += 1;
+        let Some(bus) = self.survey.bus_named(record.interface) else {
+            self.skip(reason::NEW);
+            return Flow::More;
+        };
+        self.order.push(bus, record.time.nanos, Waiting { bus, frame: record.frame, number: self.read });
+        while let Some(next) = self.order.pop() {
+            self.settle(next);
+            if self.place_settled(judge, &mut out) == Flow::Enough {
+                return Flow::Enough;
+            }
+        }
+        Flow::More
+    }
+
+    /// Finds out what a frame is.
+    fn settle(&mut self, next: Ordered<Waiting>) {
+        let name = self.survey.buses.get(next.item.bus).map_or("", |bus| bus.name.as_str());
+        let frame = next.item.frame;
+        self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
+    }
+
+    /// Frames whose turn has come, as far as it is known what they are.
+    fn place_settled(&mut self, judge: &mut Judge, out: &mut impl FnMut(Step)) -> Flow {
+        while let Some((next, decoded)) = self.settler.pop() {
+            if self.place(&next, &decoded, judge, out) == Flow::Enough {
+                return Flow::Enough;
+            }
+        }
+        Flow::More
+    }
+
+    /// Takes in that the capture, or what is of interest of it, is at its end; another pass may follow.
+    pub fn end_pass(&mut self, judge: &mut Judge, mut out: impl FnMut(Step)) {
+        while let Some(next) = self.order.pop_last() {
+            self.settle(next);
+        }
+        self.settler.finish();
+        self.place_settled(judge, &mut out);
+        self.order = Order::default();
+        self.settler = Settler::new(None);
+        if let Some((first, last)) = self.sent.take() {
+            let (frames, joints) = self.counts;
+            let steps = if joints > 1 { joints } else { frames }.saturating_sub(1).max(1);
+            let gap = ((last - first).checked_div(steps)).unwrap_or(0).max(LEAST_GAP_NS);
+            self.offset += last - first + gap;
+        }
+        self.counts = (0, 0);
+        self.read = 0;
+    }
+
+    /// The messages that bring about the state in force where the part begins.
+    #[must_use]
+    pub fn restoring(&self) -> Step {
+        let bounds = self.survey.bounds();
+        let of = |(bus, lane): (&super::survey::Bus, &Option<usize>)| {
+            let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
+            Some(((*lane)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
+        };
+        Step::Restore(self.survey.buses.iter().zip(&self.selection.lanes).filter_map(of).collect())
+    }
+
+    /// What it came to.
+    #[must_use]
+    pub fn into_cut(self) -> Cut {
+        self.cut
+    }
+
+    /// Counts something that is not sent.
+    pub fn skip(&mut self, reason: &'static str) {
+        *self.cut.skipped.entry(reason).or_default() += 1;
+    }
+
+    /// A frame's turn has come.
+    fn place(
+        &mut self,
+        next: &Ordered<Waiting>,
+        decoded: &Decoded,
+        judge: &mut Judge,
+        out: &mut impl FnMut(Step),
+    ) -> Flow {
+        let (from, to) = self.survey.bounds();
+        if next.at >= to.saturating_add(LATE_REPLIES_NS) {
+            return Flow::Enough;
+        }
+        let Waiting { bus, frame, number } = next.item;
+        let is_in_part = (from..to).contains(&next.nanos);
+        let unwanted = if next.nanos < from {
+            Some(reason::BEFORE)
+        } else if next.nanos >= to {
+            Some(reason::AFTER)
+        } else {
+            self.unwanted(bus, &frame, decoded)
+        };
+        let role = self.read_on(bus, next.nanos, decoded, unwanted.is_none(), is_in_part, judge);
+        if let Some(reason) = unwanted {
+            self.skip(reason);
+            return Flow::More;
+        }
+        let Some(lane) = self.selection.lanes.get(bus).copied().flatten() else { return Flow::More };
+        if next.is_late {
+            self.cut.late += 1;
+            let back = next.at - next.nanos;
+            self.cut.first_late.get_or_insert((number, back));
+        }
+        let (first, last) = self.sent.get_or_insert((next.at, next.at));
+        *last = next.at;
+        let at = self.offset + (next.at - *first);
+        self.counts.0 += 1;
+        self.counts.1 += u64::from(matches!(role, Role::Joints { .. }) && lane == 0);
+        out(Step::Frame(Due { at, lane, frame, role, is_late: next.is_late }));
+        Flow::More
+    }
+
+    /// Why a frame of the part is not sent.
+    fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
+        let picked = self.selection.lanes.get(bus).is_some_and(Option::is_some)
+            && self.selection.pick.takes(0, 0, frame, decoded);
+        if frame.is_error() {
+            return Some(reason::ERROR);
+        }
+        if matches!(decoded, Decoded::Wire(..)) {
+            return Some(reason::WIRE);
+        }
+        // Cells heard what is damaged as well.
+        let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
+        match self.selection.only {
+            _ if !picked => Some(reason::NOT_PICKED),
+            Only::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
+            Only::Replies if id.and_then(Id::sender).is_none() => Some(reason::NO_REPLY),
+            Only::All | Only::Inputs | Only::Replies => None,
+        }
+    }
+
+    /// Reads what a frame says, as far as that is of interest.
+    fn read_on(
+        &self,
+        bus: usize,
+        nanos: u64,
+        decoded: &Decoded,
+        is_sent: bool,
+        is_in_part: bool,
+        judge: &mut Judge,
+    ) -> Role {
+        let lane = self.selection.lanes.get(bus).copied().flatten();
+        let Some(lane) = lane.filter(|_| self.selection.reads) else { return Role::Plain };
+        match *decoded {
+            Decoded::Message(Message::Joints { epoch, joints }) => {
+                let round = judge.record_joints(lane, nanos, epoch, is_sent);
+                Role::Joints { epoch, joints, round }
+            }
+            Decoded::Message(message) => {
+                judge.record(lane, &message, is_in_part);
+                Role::Plain
+            }
+            Decoded::Half { id } | Decoded::Damaged { id, fault: Fault::Incomplete } if is_joints(id) => {
+                Role::HalfOfJoints
+            }
+            Decoded::Half { .. }
+            | Decoded::Foreign(_)
+            | Decoded::Wire(..)
+            | Decoded::Damaged { .. }
+            | Decoded::Meaningless { .. } => Role::Plain,
+        }
+    }
+}
+
+/// Why frames are not sent.
+pub mod reason {
+    /// Before `--from`.
+    pub const BEFORE: &str = "before --from";
+    /// At `--to` or after it.
+    pub const AFTER: &str = "after --to";
+    /// Left out by `--kind`, `--node` or `--bus`.
+    pub const NOT_PICKED: &str = "not picked";
+    /// No command, configuration or stimulus.
+    pub const NO_INPUT: &str = "no input";
+    /// Not said by a cell.
+    pub const NO_REPLY: &str = "no reply";
+    /// An error frame is a message of a driver, and was never on a bus.
+    pub const ERROR: &str = "error frame";
+    /// Cells say over their wires what they have to say now; and wires are on no real bus.
+    pub const WIRE: &str = "simulated wire";
+    /// Of a bus that the capture did not have when it was first read.
+    pub const NEW: &str = "bus came later";
+    /// What stands between frames.
+    pub const NOTE: &str = "note";
+}
+
+#[cfg(test)]
+mod tests;

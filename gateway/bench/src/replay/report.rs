@@ -1,0 +1,204 @@
+//! What a replay came to: the figures of the table at its end, and of `--summary` and `--json`.
+//!
+//! The keys of the JSON are the names of the fields here; `docs/replay.md` says what they mean.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::difference::{Difference, How, When};
+use super::judge::{Lacking, Tally};
+use super::player::LaneTally;
+use model::quantiles::Quantiles;
+
+/// A whole replay.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// The capture's file.
+    pub file: String,
+    /// How long frames were sent, in s.
+    pub duration_s: f64,
+    /// Whether it was ended by a signal.
+    pub interrupted: bool,
+    /// Frames that the buses took.
+    pub sent: u64,
+    /// Frames that they did not take, because they stayed full.
+    pub refused: u64,
+    /// Frames that they did not take, because they were down.
+    pub lost: u64,
+    /// Frames that were not to be sent, by reason.
+    pub skipped: BTreeMap<&'static str, u64>,
+    /// Frames that were sent at once, because newer ones had been sent before them.
+    pub sent_at_once: u64,
+    /// Each bus.
+    pub buses: Vec<BusSummary>,
+    /// How late frames were sent; none of a replay without times.
+    pub late_us: Option<Quantiles>,
+    /// How late the same machine wakes a thread when nothing else runs.
+    pub idle_late_us: Option<Quantiles>,
+    /// How long before its time a frame was waited for by spinning, in µs.
+    pub spin_us: f64,
+    /// Whether the machine granted SCHED_FIFO.
+    pub fifo: bool,
+    /// Whether it locked the memory.
+    pub memory_locked: bool,
+    /// With lockstep, who did not answer.
+    pub lockstep: Option<Lockstep>,
+    /// With a comparison, how it went.
+    pub expect: Option<Expect>,
+    /// Why it did not come to its end, if it did not.
+    pub failure: Option<String>,
+}
+
+/// One bus.
+#[derive(Clone, Debug, Serialize)]
+pub struct BusSummary {
+    /// Its name in the capture.
+    pub capture: String,
+    /// Its name now.
+    pub name: String,
+    /// What carries its frames.
+    pub kind: String,
+    /// Its frames.
+    #[serde(flatten)]
+    pub frames: LaneTally,
+    /// Replies that came faster than they were heard.
+    pub unheard: u64,
+}
+
+/// How cells kept step.
+#[derive(Clone, Debug, Serialize)]
+pub struct Lockstep {
+    /// Cells that did not answer in time, as people read it.
+    pub silent_cells: Vec<String>,
+    /// Joints that were asked again, because a cell was too late for them.
+    pub asked_again: u64,
+}
+
+/// How replies compare with recorded ones.
+#[derive(Clone, Debug, Serialize)]
+pub struct Expect {
+    /// The counts.
+    #[serde(flatten)]
+    pub tally: Tally,
+    /// Joints that the cells came to too late, by their own counters: replies to them are missing.
+    pub joints_skipped: u64,
+    /// Frames that whoever recorded said to have lost: inputs among them cannot be sent.
+    pub recording_dropped: u64,
+    /// Cells whose configuration in the recording is not known, and was not compared.
+    pub unchecked_cells: u64,
+    /// The first reply that is not as it was recorded.
+    pub first: Option<First>,
+}
+
+/// A reply that is not as it was recorded.
+#[derive(Clone, Debug, Serialize)]
+pub struct First {
+    /// How.
+    pub how: How,
+    /// The bus, as it is called now.
+    pub bus: String,
+    /// The cell.
+    pub cell: u8,
+    /// The joints that it answers, if it answers joints.
+    #[serde(flatten)]
+    pub when: Option<When>,
+    /// In words, as it is shown.
+    pub text: String,
+}
+
+impl From<&Difference> for First {
+    fn from(difference: &Difference) -> Self {
+        let Difference { how, bus, cell, when, .. } = difference;
+        Self { how: *how, bus: bus.clone(), cell: cell.get(), when: *when, text: difference.to_string() }
+    }
+}
+
+impl Lacking {
+    /// The reasons that there were, with their counts, for people.
+    #[must_use]
+    pub fn reasons(&self) -> Vec<(&'static str, u64)> {
+        let Self {
+            silent,
+            untaken,
+            unrecorded,
+            ended,
+            said_later,
+            uncounted,
+            joints_unrecorded,
+            joints_earlier,
+            asked_earlier,
+            measured,
+            sensed_otherwise,
+            slot_missed,
+            parent_changing,
+            tree_unknown,
+            sums_not_taken,
+        } = *self;
+        let all = [
+            ("the cell was silent", silent),
+            ("the cell had not taken the joints", untaken),
+            ("the reply was not recorded", unrecorded),
+            ("the recording ended", ended),
+            ("the end of a contact was said later", said_later),
+            ("no counters tell whether the cell took the joints", uncounted),
+            ("the joints were not recorded", joints_unrecorded),
+            ("the joints are in the part before", joints_earlier),
+            ("the configure is in the part before", asked_earlier),
+            ("the cell measured", measured),
+            ("what a cell felt was said at other joints", sensed_otherwise),
+            ("the cell did not come to its slot", slot_missed),
+            ("a cell was changing its parent", parent_changing),
+            ("a cell had not said where its sums go", tree_unknown),
+            ("a sum lacked one of its children's", sums_not_taken),
+        ];
+        all.into_iter().filter(|(_, count)| *count > 0).collect()
+    }
+}
+
+impl Summary {
+    /// Why it is no success, in one line; none when it is.
+    #[must_use]
+    pub fn verdict(&self) -> Option<String> {
+        if let Some(failure) = &self.failure {
+            return Some(failure.clone());
+        }
+        let mut wrong = Vec::new();
+        if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.is_good()) {
+            let Tally { different, missing, extra, not_asked, .. } = expect.tally;
+            let counts = [
+                ("different", different),
+                ("missing", missing),
+                ("extra", extra),
+                ("not asked for", not_asked),
+            ];
+            let counts = counts.into_iter().filter(|(_, count)| *count > 0);
+            let counts: Vec<_> = counts.map(|(what, count)| format!("{count} {what}")).collect();
+            if !counts.is_empty() {
+                wrong.push(format!("replies are not as they were recorded: {}", counts.join(", ")));
+            }
+            if expect.tally.lacks_the_tree() {
+                wrong.push(
+                    "no sum could be compared: cells have not said where their sums go, then or now"
+                        .to_owned(),
+                );
+            }
+            if expect.joints_skipped > 0 && self.lockstep.is_none() {
+                wrong.push(format!(
+                    "cells came too late for joints {} times: --lockstep waits for them",
+                    expect.joints_skipped
+                ));
+            }
+        }
+        if let Some(lockstep) = self.lockstep.as_ref().filter(|lockstep| !lockstep.silent_cells.is_empty()) {
+            wrong.push(format!("cells did not answer: {}", lockstep.silent_cells.join(", ")));
+        }
+        if self.lost > 0 {
+            wrong.push(format!("{} frames were lost while a bus was down", self.lost));
+        }
+        if self.refused > 0 {
+            wrong.push(format!("{} frames were refused: a bus stayed full", self.refused));
+        }
+        (!wrong.is_empty()).then(|| wrong.join("; "))
+    }
+}

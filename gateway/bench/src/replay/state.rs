@@ -1,0 +1,494 @@
+//! What holds on a bus at some point of a capture, and the messages that bring it about again.
+//!
+//! ```text
+//!   messages up to there ──> take ──> [ State ] ──> restoring ──> messages before the first replayed one
+//! ```
+//!
+//! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it; and the end of a
+//! contact is said once, by a cell that was in contact at the joints before. So a replay that begins in the middle
+//! says again, in this order: the configuration as it was written; resume; the stimuli in force before the last
+//! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
+//! were said.
+
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::id::{CellId, Node};
+use protocol::message::{
+    From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State as Flags,
+};
+use protocol::packet::Epoch;
+use protocol::parameters::Parameter;
+
+use super::touched::Touched;
+use model::stimuli::Waiting;
+
+/// Messages since the last joints that are kept as they were said.
+const SINCE: usize = 16_384;
+
+/// What one cell feels, by the protocol's rules.
+#[derive(Clone, Debug, Default)]
+struct Feeling {
+    /// In force, once something has been said of it.
+    skin: Option<SkinSensors>,
+    acceleration: Option<[Q3_12; 3]>,
+    pending: Waiting<SensorPage>,
+    /// It was told to measure: then it refuses stimuli.
+    measures: bool,
+}
+
+impl Feeling {
+    fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
+        if !self.measures {
+            self.pending.push(from, page, last);
+        }
+    }
+
+    fn latch(&mut self, epoch: Epoch) {
+        let mut pending = std::mem::take(&mut self.pending);
+        pending.latch(epoch).for_each(|page| self.feel(page));
+        self.pending = pending;
+    }
+
+    const fn feel(&mut self, page: SensorPage) {
+        match page {
+            SensorPage::Skin(skin) => self.skin = Some(skin),
+            SensorPage::Acceleration(acceleration) => self.acceleration = Some(acceleration),
+        }
+    }
+
+    /// What the cell itself says that it feels, when nothing else is known of it.
+    fn learn(&mut self, page: SensorPage) {
+        let unknown = match page {
+            SensorPage::Skin(_) => self.skin.is_none(),
+            SensorPage::Acceleration(_) => self.acceleration.is_none(),
+        };
+        if unknown && self.pending.is_empty() {
+            self.feel(page);
+        }
+    }
+
+    /// Whether something touches it from the joints of an epoch on, if that is known.
+    fn is_touched_from(&self, epoch: Epoch) -> Option<bool> {
+        let touches = |skin: &SkinSensors| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
+        if self.pending.is_empty() {
+            return self.skin.as_ref().map(touches);
+        }
+        let mut then = self.clone();
+        then.latch(epoch);
+        then.skin.as_ref().map(touches)
+    }
+
+    /// Nothing, in either mode.
+    fn clear(&mut self, measures: bool) {
+        *self = Self { measures, ..Self::default() };
+    }
+
+    /// The pages in force.
+    fn pages(&self) -> impl Iterator<Item = SensorPage> + use<> {
+        let skin = self.skin.filter(|skin| *skin != SkinSensors::default()).map(SensorPage::Skin);
+        let acceleration = self.acceleration.filter(|xyz| *xyz != [Q3_12::ZERO; 3]);
+        skin.into_iter().chain(acceleration.map(SensorPage::Acceleration))
+    }
+}
+
+/// What held on a bus before its last joints.
+#[derive(Clone, Debug)]
+struct Before {
+    /// Parameters that were written, in order, without those that were written over.
+    writes: Vec<(Node, u8, Message)>,
+    halted: bool,
+    /// By the cell's place.
+    cells: Vec<Feeling>,
+}
+
+/// What holds on one bus.
+#[derive(Clone, Debug)]
+pub struct State {
+    before: Before,
+    /// The last joints. Whether a cell was in contact at them depends on what held before.
+    joints: Option<(Epoch, Joints)>,
+    /// What was said since then, as it was said.
+    since: Vec<Message>,
+}
+
+impl Default for State {
+    fn default() -> Self {
+        let cells = vec![Feeling::default(); CellId::COUNT];
+        let before = Before { writes: Vec::new(), halted: false, cells };
+        Self { before, joints: None, since: Vec::new() }
+    }
+}
+
+impl Before {
+    /// Takes in what was said after the joints `last`.
+    fn take(&mut self, message: &Message, last: Option<Epoch>) {
+        match *message {
+            Message::Halt => self.halted = true,
+            Message::Resume => self.halted = false,
+            Message::Stimulus { to, from, page } => self.each(to, |cell| cell.push(from, page, last)),
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                self.write(to, number, *message);
+                if number == Parameter::Mode.number() {
+                    self.each(to, |cell| cell.clear(words.first() != Some(&1)));
+                }
+            }
+            Message::Configure { .. }
+            | Message::Joints { .. }
+            | Message::Network { .. }
+            | Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    fn latch(&mut self, epoch: Epoch) {
+        for cell in &mut self.cells {
+            cell.latch(epoch);
+        }
+    }
+
+    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Feeling)) {
+        for (cell, feeling) in CellId::all().zip(&mut self.cells) {
+            if to.names(cell) {
+                act(feeling);
+            }
+        }
+    }
+
+    /// A cell that has started anew has forgotten what it felt, and what was switched.
+    fn start_anew(&mut self, cell: Node) {
+        self.each(cell, |cell| cell.clear(false));
+        self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
+    }
+
+    /// Keeps a write. One of the same parameter to the same cells is written over, unless a commit since then has
+    /// taken it into use; so what is kept grows with the commits, and with nothing else.
+    fn write(&mut self, to: Node, number: u8, message: Message) {
+        let commit = Parameter::Commit.number();
+        let since_commit =
+            self.writes.iter().rposition(|(_, number, _)| *number == commit).map_or(0, |at| at + 1);
+        let stale = |(at, write): (usize, &(Node, u8, Message))| {
+            let over = write.0 == to && write.1 == number && number != commit;
+            (over && (at >= since_commit || is_volatile(number))).then_some(at)
+        };
+        if let Some(at) = self.writes.iter().enumerate().find_map(stale) {
+            self.writes.remove(at);
+        }
+        self.writes.push((to, number, message));
+    }
+}
+
+fn is_volatile(number: u8) -> bool {
+    Parameter::from_number(number).is_some_and(Parameter::is_volatile)
+}
+
+impl State {
+    /// Takes in the bus' next message.
+    pub fn take(&mut self, message: &Message) {
+        match *message {
+            // Cells drop joints of the last epoch.
+            Message::Joints { epoch, joints } => {
+                if self.joints.is_none_or(|(last, _)| last != epoch) {
+                    self.fold();
+                    self.joints = Some((epoch, joints));
+                }
+            }
+            Message::Halt
+            | Message::Resume
+            | Message::Stimulus { .. }
+            | Message::Configure { request: Request::Write { .. }, .. } => {
+                if self.since.len() == SINCE {
+                    self.fold();
+                }
+                self.since.push(*message);
+            }
+            Message::Sensors { from, epoch, page } => {
+                if self.joints.is_none_or(|(last, _)| last == epoch) {
+                    self.before.each(Node::Cell(from), |cell| cell.learn(page));
+                }
+            }
+            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. }
+                if heartbeat.state.has(Flags::CLAIMING) =>
+            {
+                self.before.start_anew(from);
+                let stimulus = |it: &Message| matches!(it, Message::Stimulus { to, .. } if *to == from);
+                let switch = |it: &Message| matches!(it, Message::Configure { to, request: Request::Write { number, .. }, .. } if *to == from && is_volatile(*number));
+                self.since.retain(|message| !stimulus(message) && !switch(message));
+            }
+            Message::Configure { .. }
+            | Message::Network { .. }
+            | Message::Sync
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    /// What was said until now holds before what comes.
+    fn fold(&mut self) {
+        let last = self.joints.map(|(epoch, _)| epoch);
+        if let Some(epoch) = last {
+            self.before.latch(epoch);
+        }
+        for message in self.since.drain(..) {
+            self.before.take(&message, last);
+        }
+    }
+
+    /// The epoch of the last joints.
+    #[must_use]
+    pub fn last_epoch(&self) -> Option<Epoch> {
+        self.joints.map(|(epoch, _)| epoch)
+    }
+
+    /// Who is touched since the last joints, by what was said before them.
+    #[must_use]
+    pub fn touched(&self) -> Touched {
+        let mut touched = Touched::default();
+        let Some((epoch, _)) = self.joints else { return touched };
+        for (cell, feeling) in CellId::all().zip(&self.before.cells) {
+            if let Some(is_touched) = feeling.is_touched_from(epoch) {
+                touched.insert(cell, is_touched);
+            }
+        }
+        touched
+    }
+
+    /// Whether a cell that has just started is in this state already.
+    #[must_use]
+    pub fn is_fresh(&self) -> bool {
+        let Before { writes, halted, cells } = &self.before;
+        let felt = cells.iter().any(|cell| cell.pages().next().is_some() || !cell.pending.is_empty());
+        !felt && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
+    }
+
+    /// Whether new parameters were taken into use.
+    #[must_use]
+    pub fn configures(&self) -> bool {
+        let commit = Parameter::Commit.number();
+        let commits = |message: &Message| matches!(message, Message::Configure { request: Request::Write { number, .. }, .. } if *number == commit);
+        self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
+    }
+
+    /// What has to be said so that `cells` are in this state; `next` are the joints that come first then, for a bus
+    /// that has had none yet: the cells then forget the epoch of whoever spoke to them before.
+    #[must_use]
+    pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
+        let Before { writes, halted, cells: feelings } = &self.before;
+        // Ports are cut in test mode only, and the mode may have been written again since.
+        let cuts = |write: &&(Node, u8, Message)| write.1 == Parameter::Cuts.number();
+        let (cut, others): (Vec<_>, Vec<_>) = writes.iter().partition(cuts);
+        let mut messages: Vec<_> = others.iter().chain(&cut).map(|(_, _, message)| *message).collect();
+        messages.push(Message::Resume);
+        let known: Vec<_> = CellId::all().zip(feelings).filter(|(cell, _)| cells(*cell)).collect();
+        let stimulus = |cell, from, page| Message::Stimulus { to: Node::Cell(cell), from, page };
+        let felt: Vec<_> = known
+            .iter()
+            .flat_map(|(cell, feeling)| feeling.pages().map(|page| stimulus(*cell, From::Next, page)))
+            .collect();
+        let pending = known
+            .iter()
+            .flat_map(|(cell, it)| it.pending.iter().map(|&(from, page)| stimulus(*cell, from, page)));
+        let pending: Vec<_> = pending.collect();
+        let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
+            epoch: epoch.plus(0_u8.wrapping_sub(steps)),
+            joints,
+        };
+        let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.plus(u8::MAX), joints)));
+        if let Some(last) = last.filter(|_| !felt.is_empty() || !pending.is_empty()) {
+            // Joints of a cell's last epoch would be dropped, and so those that matter may not be the first.
+            messages.push(steps_before(2, last));
+            messages.extend(felt);
+            messages.push(steps_before(1, last));
+        } else {
+            messages.extend(felt);
+        }
+        messages.extend(pending);
+        if *halted {
+            messages.push(Message::Halt);
+        }
+        messages.extend(last.map(|last| steps_before(0, last)));
+        messages.extend(&self.since);
+        messages
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::message::Heartbeat;
+
+    fn press(newtons: f64) -> SensorPage {
+        SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
+    }
+
+    fn cell(number: i64) -> CellId {
+        CellId::new(number).unwrap()
+    }
+
+    fn to(number: i64, from: From, newtons: f64) -> Message {
+        Message::Stimulus { to: Node::Cell(cell(number)), from, page: press(newtons) }
+    }
+
+    fn joints(epoch: u8) -> Message {
+        Message::Joints { epoch: Epoch(epoch), joints: Joints::default() }
+    }
+
+    fn mode(to: Node, words: i16) -> Message {
+        let request = Request::Write { number: Parameter::Mode.number(), words: [words, 0, 0, 0, 0, 0] };
+        Message::Configure { to, tag: 0, request }
+    }
+
+    fn restored(messages: &[Message]) -> Vec<Message> {
+        let mut state = State::default();
+        for message in messages {
+            state.take(message);
+        }
+        state.restoring(|_| true, None)
+    }
+
+    #[test]
+    fn what_was_in_force_what_waited_and_what_was_said_since_are_told_apart() {
+        let at = |epoch| From::Epoch(Epoch(epoch));
+        let said = [
+            joints(10),
+            to(1, at(11), 1.0),
+            joints(11),
+            to(1, at(13), 2.0),
+            joints(12),
+            to(2, From::Next, 3.0),
+        ];
+        let expected = [
+            Message::Resume,
+            joints(10),
+            to(1, From::Next, 1.0),
+            joints(11),
+            to(1, at(13), 2.0),
+            joints(12),
+            to(2, From::Next, 3.0),
+        ];
+        assert_eq!(restored(&said), expected);
+    }
+
+    #[test]
+    fn a_late_stimulus_waits_for_the_next_joints() {
+        let late = to(1, From::Epoch(Epoch(11)), 1.0);
+        assert_eq!(restored(&[joints(11), late]), [Message::Resume, joints(11), late]);
+        let next = to(1, From::Next, 1.0);
+        let expected = [Message::Resume, joints(10), joints(11), next, joints(12)];
+        assert_eq!(restored(&[joints(11), late, joints(12)]), expected);
+    }
+
+    #[test]
+    fn halted_cells_are_halted_before_the_last_joints_or_after_them_as_it_was() {
+        let said =
+            [Message::Halt, joints(1), Message::Resume, joints(2), Message::Halt, joints(3), Message::Resume];
+        assert_eq!(restored(&said[..2]), [Message::Resume, Message::Halt, joints(1)]);
+        assert_eq!(restored(&said[..4]), [Message::Resume, joints(2)]);
+        assert_eq!(restored(&said[..5]), [Message::Resume, joints(2), Message::Halt]);
+        assert_eq!(restored(&said), [Message::Resume, Message::Halt, joints(3), Message::Resume]);
+    }
+
+    #[test]
+    fn who_has_let_go_started_anew_or_measures_feels_nothing() {
+        let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
+        let page = NetworkPage::Heartbeat(heartbeat);
+        let anew = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
+        for end in [to(1, From::Next, 0.0), anew] {
+            let said = [to(1, From::Next, 1.0), joints(1), end, joints(2), joints(3)];
+            assert_eq!(restored(&said), [Message::Resume, joints(3)]);
+        }
+        let measure = mode(Node::Everyone, 0);
+        let said = [to(1, From::Next, 1.0), joints(1), measure, to(1, From::Next, 1.0), joints(2), joints(3)];
+        assert_eq!(restored(&said), [measure, Message::Resume, joints(3)]);
+    }
+
+    #[test]
+    fn parameters_are_written_again_as_far_as_they_still_count() {
+        let write = |number, word| Message::Configure {
+            to: Node::Everyone,
+            tag: 0,
+            request: Request::Write { number, words: [word, 0, 0, 0, 0, 0] },
+        };
+        let said =
+            [write(1, 1), write(1, 2), write(127, 9), write(1, 3), mode(Node::Everyone, 1), write(127, 9)];
+        let again = [&said[..], &[mode(Node::Everyone, 1), write(1, 4), joints(1)]].concat();
+        let expected = [
+            write(1, 2),
+            write(127, 9),
+            write(1, 3),
+            write(127, 9),
+            mode(Node::Everyone, 1),
+            write(1, 4),
+            Message::Resume,
+            joints(1),
+        ];
+        assert_eq!(restored(&again), expected);
+    }
+
+    #[test]
+    fn what_was_switched_last_is_switched_again_and_cuts_come_after_the_mode() {
+        let write = |to, number, word| Message::Configure {
+            to,
+            tag: 0,
+            request: Request::Write { number, words: [word, 9, 0, 0, 0, 0] },
+        };
+        let (all, one) = (Node::Everyone, Node::Cell(cell(1)));
+        let said = [
+            write(all, 6, 1),
+            write(all, 7, 2),
+            write(one, 7, 1),
+            write(one, 9, 2),
+            write(all, 127, 9),
+            write(all, 6, 0),
+            mode(all, 1),
+            joints(1),
+        ];
+        let commit = write(all, 127, 9);
+        let expected = [
+            write(all, 7, 2),
+            write(one, 7, 1),
+            commit,
+            write(all, 6, 0),
+            mode(all, 1),
+            write(one, 9, 2),
+            Message::Resume,
+            joints(1),
+        ];
+        assert_eq!(restored(&said), expected);
+        let page = NetworkPage::Heartbeat(Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() });
+        let anew = Message::Network { from: one, epoch: Epoch(0), page };
+        let expected = [write(all, 7, 2), commit, write(all, 6, 0), mode(all, 1), Message::Resume, joints(1)];
+        assert_eq!(restored(&[&said[..], &[anew]].concat()), expected);
+        assert_eq!(restored(&[&said[..7], &[anew, joints(1)]].concat()), expected);
+    }
+
+    #[test]
+    fn what_a_cell_says_of_itself_counts_until_somebody_presses_it() {
+        let says =
+            |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
+        let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
+        let expected = [Message::Resume, joints(255), to(1, From::Next, 1.0), joints(0), joints(1)];
+        assert_eq!(restored(&said), expected);
+    }
+
+    #[test]
+    fn a_bus_without_joints_makes_cells_forget_another_epoch() {
+        let state = State::default();
+        assert!(state.is_fresh());
+        let next = Some((Epoch(0), Joints::default()));
+        assert_eq!(state.restoring(|_| true, next), [Message::Resume, joints(255)]);
+    }
+
+    #[test]
+    fn only_cells_that_are_there_are_pressed() {
+        let mut state = State::default();
+        state.take(&Message::Stimulus { to: Node::Everyone, from: From::Next, page: press(1.0) });
+        state.take(&joints(1));
+        let messages = state.restoring(|it| it.get() == 7, None);
+        assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, From::Next, 1.0), joints(1)]);
+    }
+}

@@ -1,0 +1,448 @@
+//! What a capture holds, found in a first reading: its buses and their cells, what the cells' own counters say that
+//! it lacks, and the state in force where the replay begins.
+
+use std::collections::BTreeMap;
+
+use protocol::can::Format;
+use protocol::candump::Record;
+use protocol::id::{CellId, Command, Id, Node};
+use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
+use protocol::packet::{Epoch, data_id};
+use protocol::parameters::Parameter;
+use protocol::time::Micros;
+
+use super::state::State;
+use model::decode::{Decoded, Decoder};
+use trace::capture::InForce;
+
+/// A cell that says nothing for so long is not there, in ns.
+const SILENT_NS: u64 = 600_000_000;
+
+/// A part of a capture, in ns after its first frame.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Part {
+    /// From here on.
+    pub from: u64,
+    /// Up to, and without, here.
+    pub to: Option<u64>,
+}
+
+/// A whole capture.
+#[derive(Debug)]
+pub struct Survey {
+    part: Part,
+    /// When the first frame came, in ns since 1970.
+    pub first: Option<u64>,
+    /// The greatest time.
+    pub last: u64,
+    /// Frames.
+    pub frames: u64,
+    /// Frames that whoever took the capture said to have lost.
+    pub dropped: u64,
+    /// Each bus, in the order of their first frames.
+    pub buses: Vec<Bus>,
+    decoder: Decoder,
+}
+
+/// One bus.
+#[derive(Debug)]
+pub struct Bus {
+    /// Its name in the capture.
+    pub name: String,
+    /// Frames on it.
+    pub frames: u64,
+    /// Whether any of them is CAN FD.
+    pub has_fd: bool,
+    /// What packets travel in, by the first one.
+    pub format: Option<Format>,
+    /// Joint broadcasts on it.
+    pub joints: u64,
+    /// When the last of them stood on it, in ns since 1970.
+    last_joints: u64,
+    /// Of these, those that were under way when somebody last asked for a report; none when nobody has.
+    at_report: Option<(u64, u64)>,
+    /// Whether a cell told its counters, or something was in force when the capture began: then a part of a
+    /// recording, or one that was cut off, may lack what its counters would account for.
+    is_accounted: bool,
+    /// What was said before the capture began and is in force at its beginning, as it has it.
+    pub in_force: Vec<Message>,
+    /// The state in force where the part begins.
+    pub state: State,
+    /// The first joints in the part.
+    pub first_joints: Option<(Epoch, Joints)>,
+    /// Sums that cells sent.
+    pub sums: u64,
+    /// Its cells.
+    pub cells: BTreeMap<CellId, Cell>,
+    /// What is known of cells from before the capture.
+    before: BTreeMap<CellId, Before>,
+}
+
+/// What is known of a cell from before the capture.
+#[derive(Clone, Copy, Debug)]
+struct Before {
+    /// When it was heard last, in ns since 1970.
+    heard: u64,
+    hash: Known<u16>,
+    measures: bool,
+}
+
+/// One cell.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    /// The hash of its configuration where the part begins, if that can be known.
+    pub hash: Known<u16>,
+    /// Whether it measured in the part: then its torques cannot come back.
+    pub measured: bool,
+    /// When it was heard, in ns since 1970: first and last.
+    pub heard: (u64, u64),
+    /// From when to when it said nothing, when that was long.
+    pub silences: Vec<(u64, u64)>,
+    /// Packets that it sent and that are not in the capture.
+    pub unrecorded: u64,
+    /// Joints that it did not take or came too late for.
+    pub untaken: u64,
+    /// Between which joints its counters account for that: from after one time up to another, in ns since 1970.
+    accounted: Vec<(u64, u64)>,
+    /// Whether counters account for anything on its bus; else whatever is lacking is a difference.
+    is_accounted: bool,
+    /// Since when it claims its number, which it does after each start.
+    claims: Option<u64>,
+    /// Packets since the last heartbeat, which says how many were sent before it.
+    counted: Option<(u16, u64)>,
+    /// Its counters at the last report, the joints until then, and the time of the last of them.
+    report: Option<(Heard, u64, u64)>,
+}
+
+/// Something that may have been learnt too late.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Known<T> {
+    /// Nothing has been said of it.
+    No,
+    /// It has changed before anything was said of it.
+    TooLate,
+    /// This.
+    Yes(T),
+}
+
+impl Survey {
+    /// Of a part of a capture that has not been read.
+    #[must_use]
+    pub const fn new(part: Part) -> Self {
+        let decoder = Decoder::new(None);
+        Self { part, first: None, last: 0, frames: 0, dropped: 0, buses: Vec::new(), decoder }
+    }
+
+    /// Takes what was in force when the capture began, before its first frame.
+    pub fn begin(&mut self, in_force: &[InForce]) {
+        let mut decoder = Decoder::new(None);
+        for InForce { bus, frame, nanos, .. } in in_force {
+            if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
+                let bus = self.bus(bus);
+                bus.is_accounted = true;
+                bus.state.take(&message);
+                bus.take_before(&message, *nanos);
+                bus.in_force.push(message);
+            }
+        }
+    }
+
+    /// Takes the next frame.
+    pub fn take(&mut self, record: &Record<'_>) {
+        let nanos = record.time.nanos;
+        self.first.get_or_insert(nanos);
+        self.last = self.last.max(nanos);
+        self.frames += 1;
+        let (begins, ends) = self.bounds();
+        let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+        let bus = self.bus(record.interface);
+        bus.frames += 1;
+        bus.has_fd |= record.frame.format() == Format::Fd;
+        if let (Ok(id), Decoded::Message(_) | Decoded::Meaningless { .. }) =
+            (data_id(&record.frame), &decoded)
+            && let Some(cell) = id.sender()
+        {
+            bus.heard(cell, nanos);
+        }
+        match decoded {
+            Decoded::Message(message) => {
+                let format = record.frame.format();
+                bus.format.get_or_insert(format);
+                bus.take(&message, nanos, nanos < begins, (begins..ends).contains(&nanos));
+            }
+            Decoded::Foreign(_)
+            | Decoded::Wire(..)
+            | Decoded::Half { .. }
+            | Decoded::Damaged { .. }
+            | Decoded::Meaningless { .. } => {}
+        }
+    }
+
+    /// Takes in that the capture is at its end.
+    pub fn finish(&mut self) {
+        let last = self.last;
+        for bus in &mut self.buses {
+            for cell in bus.cells.values_mut() {
+                cell.end(last);
+                cell.is_accounted = bus.is_accounted;
+            }
+        }
+    }
+
+    /// The part, in ns since 1970: from, and up to and without. From the beginning on means all, also what is older
+    /// than the first frame.
+    #[must_use]
+    pub fn bounds(&self) -> (u64, u64) {
+        let first = self.first.unwrap_or(0);
+        let end = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
+        (if self.part.from == 0 { 0 } else { first.saturating_add(self.part.from) }, end)
+    }
+
+    /// Where a bus stands, by its name in the capture.
+    #[must_use]
+    pub fn bus_named(&self, name: &str) -> Option<usize> {
+        self.buses.iter().position(|bus| bus.name == name)
+    }
+
+    /// The names of the buses, for people.
+    #[must_use]
+    pub fn names(&self) -> String {
+        self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
+    }
+
+    fn bus(&mut self, name: &str) -> &mut Bus {
+        let at = self.bus_named(name).unwrap_or_else(|| {
+            self.buses.push(Bus::new(name));
+            self.buses.len() - 1
+        });
+        self.buses.get_mut(at).expect("found, or just made")
+    }
+}
+
+impl Bus {
+    fn new(name: &str) -> Self {
+        Self {
+            name: name.to_owned(),
+            frames: 0,
+            has_fd: false,
+            format: None,
+            joints: 0,
+            last_joints: 0,
+            at_report: None,
+            is_accounted: false,
+            in_force: Vec::new(),
+            state: State::default(),
+            first_joints: None,
+            sums: 0,
+            cells: BTreeMap::new(),
+            before: BTreeMap::new(),
+        }
+    }
+
+    /// Takes in what was said before the capture and is in force at its beginning.
+    fn take_before(&mut self, message: &Message, nanos: u64) {
+        match *message {
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                let is_settled = !heartbeat.state.has(Flags::CLAIMING);
+                let measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
+                let hash = if is_settled { Known::Yes(heartbeat.configuration) } else { Known::No };
+                self.before.insert(from, Before { heard: nanos, hash, measures });
+            }
+            Message::Configure { to, request: Request::Write { number, words }, .. } => {
+                for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.names(**cell)) {
+                    if number == Parameter::Mode.number() {
+                        before.measures = words.first() != Some(&1);
+                    } else if number == Parameter::Commit.number() {
+                        before.hash = Known::No;
+                    }
+                }
+            }
+            Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
+        }
+    }
+
+    fn heard(&mut self, cell: CellId, nanos: u64) {
+        let before = self.before.get(&cell);
+        self.cells.entry(cell).or_insert_with(|| Cell::new(nanos, before)).hear(nanos);
+    }
+
+    fn take(&mut self, message: &Message, nanos: u64, is_before: bool, is_in_part: bool) {
+        if is_before {
+            self.state.take(message);
+        }
+        match *message {
+            Message::Joints { epoch, joints } => {
+                self.joints += 1;
+                self.last_joints = self.last_joints.max(nanos);
+                if is_in_part {
+                    self.first_joints.get_or_insert((epoch, joints));
+                }
+            }
+            Message::Report => self.at_report = Some((self.joints, self.last_joints)),
+            Message::Sum { .. } => self.sums += 1,
+            Message::Network { from: Node::Cell(from), page, .. } => {
+                let (at_report, joints) = (self.at_report, (self.joints, self.last_joints));
+                self.is_accounted |= matches!(page, NetworkPage::Heard(_));
+                let Some(cell) = self.cells.get_mut(&from) else { return };
+                match page {
+                    NetworkPage::Heartbeat(heartbeat) => {
+                        cell.claim(&heartbeat, nanos, joints);
+                        cell.heartbeat(&heartbeat, is_before, is_in_part);
+                    }
+                    NetworkPage::Heard(heard) => cell.report(heard, at_report),
+                    NetworkPage::Refused(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
+                }
+            }
+            // Configured anew before its first heartbeat: what it computed with before, nobody knows.
+            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. }
+                if number == Parameter::Commit.number() =>
+            {
+                if let Some(cell) = self.cells.get_mut(&from)
+                    && (is_before || cell.hash == Known::No)
+                {
+                    cell.hash = if is_before { Known::No } else { Known::TooLate };
+                }
+            }
+            Message::Sensors { .. }
+            | Message::Halt
+            | Message::Sync
+            | Message::Resume
+            | Message::Torque { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. }
+            | Message::Stimulus { .. } => {}
+        }
+        // After a heartbeat has been read: what it says was sent is what was sent before it.
+        if let Some(cell) = message.encode().id.sender().and_then(|cell| self.cells.get_mut(&cell)) {
+            cell.count();
+        }
+    }
+
+    /// The cells that speak in a part of the capture.
+    pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &Cell)> {
+        let speaks = move |cell: &Cell| cell.heard.1 >= from && cell.heard.0 < to;
+        self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
+    }
+}
+
+impl Cell {
+    fn new(nanos: u64, before: Option<&Before>) -> Self {
+        // A cell that has just spoken before the capture was there when it began.
+        let first =
+            before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
+        Self {
+            hash: before.map_or(Known::No, |before| before.hash),
+            measured: before.is_some_and(|before| before.measures),
+            heard: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
+            silences: Vec::new(),
+            unrecorded: 0,
+            untaken: 0,
+            accounted: Vec::new(),
+            is_accounted: false,
+            claims: None,
+            counted: None,
+            report: None,
+        }
+    }
+
+    fn hear(&mut self, nanos: u64) {
+        let last = self.heard.1;
+        if nanos > last.saturating_add(SILENT_NS) {
+            self.silences.push((last, nanos));
+        }
+        self.heard.1 = last.max(nanos);
+    }
+
+    /// The capture is at its end.
+    fn end(&mut self, nanos: u64) {
+        let from = self.claims.unwrap_or(self.heard.1);
+        if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
+            self.silences.push((from, u64::MAX));
+        }
+    }
+
+    /// While it claims its number it answers nothing, and after a start its counters begin anew.
+    fn claim(&mut self, heartbeat: &Heartbeat, nanos: u64, (joints, last): (u64, u64)) {
+        if heartbeat.state.has(Flags::CLAIMING) {
+            self.claims.get_or_insert(nanos);
+            self.counted = None;
+            self.report = Some((Heard::default(), joints, last));
+        } else if let Some(since) = self.claims.take() {
+            self.silences.push((since, nanos));
+        }
+    }
+
+    /// One packet more.
+    const fn count(&mut self) {
+        if let Some((_, packets)) = &mut self.counted {
+            *packets += 1;
+        }
+    }
+
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, is_before: bool, is_in_part: bool) {
+        let settled = !heartbeat.state.has(Flags::CLAIMING);
+        if let Some((sent, packets)) = self.counted {
+            let difference = u64::from(heartbeat.sent.wrapping_sub(sent));
+            self.unrecorded += difference.saturating_sub(packets);
+        }
+        self.counted = Some((heartbeat.sent, 0));
+        if settled && (is_before || self.hash == Known::No) {
+            self.hash = Known::Yes(heartbeat.configuration);
+        }
+        self.measured |= settled && is_in_part && !heartbeat.state.has(Flags::TEST_MODE);
+    }
+
+    /// Counters that were asked for at some joints. When that was before the capture, nobody knows which joints they
+    /// account for.
+    fn report(&mut self, heard: Heard, asked: Option<(u64, u64)>) {
+        let Some((joints, last)) = asked else { return };
+        if let Some((before, joints_before, from)) = self.report {
+            let taken = heard.joints.wrapping_sub(before.joints);
+            let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
+            let known = u64::from(taken) + u64::from(repeated);
+            self.untaken += joints.saturating_sub(joints_before).saturating_sub(known);
+            match self.accounted.last_mut() {
+                Some((_, until)) if *until == from => *until = last,
+                _ => self.accounted.push((from, last)),
+            }
+        }
+        self.report = Some((heard, joints, last));
+    }
+
+    /// Whether counters that it told before and after account for joints of this time, in ns since 1970; where none on
+    /// its bus do, nothing is excused by what they would say.
+    #[must_use]
+    pub fn is_counted_at(&self, nanos: u64) -> bool {
+        !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
+    }
+
+    /// Whether it said nothing for long around a time, in ns since 1970.
+    #[must_use]
+    pub fn is_silent_at(&self, nanos: u64) -> bool {
+        nanos < self.heard.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
+    }
+}
+
+/// Whether a frame is of the gateway's side: a command, configuration, a stimulus.
+#[must_use]
+pub const fn is_input(id: Id) -> bool {
+    !id.kind.is_from_cells()
+}
+
+/// Whether a frame is of a broadcast of joints, or of half of one.
+#[must_use]
+pub fn is_joints(id: Id) -> bool {
+    id == Id::command(Command::Joints)
+}

@@ -1,0 +1,232 @@
+//! When and why the robot was halted, and what the ticks before were like.
+//!
+//! The main thread fills the ring with the records that the loop hands on, so that the loop does nothing for it.
+
+use std::collections::VecDeque;
+
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use crate::summary::{Halted, TickBefore};
+use control::cycle::Halt;
+use control::cycle::carried::bit;
+use control::cycle::turn::Timed;
+
+/// Ticks that are kept: 0.4 s at 500 Hz.
+const TICKS: usize = 200;
+/// Halts that are told one by one.
+const HALTS: usize = 100;
+
+/// What is known of halts.
+#[derive(Debug, Default)]
+pub(super) struct Halts {
+    /// The last ticks.
+    ring: VecDeque<Timed>,
+    /// The ticks up to the last halt.
+    before: Vec<Timed>,
+    halts: Vec<Halted>,
+    /// Halts beyond those that are told one by one.
+    pub(super) further: u64,
+    /// The halt that lasts.
+    lasting: Option<Halted>,
+}
+
+impl Halts {
+    /// Takes the next tick.
+    pub(super) fn take(&mut self, timed: &Timed) {
+        if self.ring.len() == TICKS {
+            self.ring.pop_front();
+        }
+        self.ring.push_back(*timed);
+        let record = &timed.record;
+        match (record.halted, &mut self.lasting) {
+            (Some(why), None) => {
+                self.before = self.ring.iter().copied().collect();
+                self.lasting = Some(Halted {
+                    at_s: seconds(record.tick.time),
+                    tick: record.tick.number,
+                    epoch: record.epoch.0,
+                    reason: reason(why),
+                    until_s: None,
+                });
+            }
+            (None, Some(halted)) => {
+                halted.until_s = Some(seconds(record.tick.time));
+                self.end();
+            }
+            (Some(_), Some(_)) | (None, None) => {}
+        }
+    }
+
+    fn end(&mut self) {
+        let Some(halted) = self.lasting.take() else { return };
+        if self.halts.len() < HALTS {
+            self.halts.push(halted);
+        } else {
+            self.further += 1;
+        }
+    }
+
+    /// Why the robot is halted, if it is.
+    pub(super) fn why(&self) -> Option<&str> {
+        self.lasting.as_ref().map(|halted| halted.reason.as_str())
+    }
+
+    /// Each halt, oldest first; one that lasts is the last and is always there.
+    pub(super) fn all(&self) -> Vec<Halted> {
+        self.halts.iter().chain(&self.lasting).cloned().collect()
+    }
+
+    /// The ticks up to the last halt, oldest first.
+    pub(super) fn history(&self, skin: &Skin) -> Vec<TickBefore> {
+        self.before.iter().map(|timed| tick(timed, skin)).collect()
+    }
+}
+
+/// A tick in words and numbers.
+#[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
+    let record = &timed.record;
+    let joints = |all: &[f64]| all.iter().copied().take(skin.robot.joints.len()).collect();
+    let lost = skin.buses.iter().enumerate().filter(|(index, _)| record.missing & bit(*index) != 0);
+    TickBefore {
+        tick: record.tick.number,
+        time_s: seconds(record.tick.time),
+        late_us: timed.late_ns as f64 / 1e3,
+        took_us: timed.took_ns as f64 / 1e3,
+        skipped: record.skipped,
+        epoch: record.epoch.0,
+        q_rad: joints(&record.q),
+        qdot_rad_s: joints(&record.qdot),
+        torque_nm: joints(&record.torque),
+        valid: record.valid,
+        contributing: record.contributing,
+        age: record.age,
+        stale: record.stale,
+        dead: record.dead,
+        lost_buses: lost.map(|(_, bus)| bus.name.clone()).collect(),
+        bad_cycle: record.bad.map(|bad| bad.to_string()),
+        command_rad_s: joints(&record.command),
+        halted: record.halted.is_some(),
+    }
+}
+
+fn reason(why: Halt) -> String {
+    match why {
+        Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
+        Halt::Frame => "somebody sent a halt frame".to_owned(),
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "times far below 2^53 us")]
+fn seconds(time: Micros) -> f64 {
+    time.0 as f64 / 1e6
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use control::controller::{BadCycle, Controller, Input, Step};
+    use control::cycle::carried::Heard;
+    use control::cycle::{Cycle, Tick};
+    use control::robot::SimulatedArm;
+    use model::table::Sums;
+    use model::testing;
+
+    /// Moves up to a tick, then has no answer.
+    struct Until(u64);
+
+    impl Controller for Until {
+        fn step(&mut self, input: &Input) -> Step {
+            if input.tick < self.0 { Step::Move([0.25; 6]) } else { Step::Bad(BadCycle::NoAnswer) }
+        }
+    }
+
+    /// A loop without a machine, whose records go to what is tested.
+    struct Bench {
+        cycle: Cycle,
+        sums: Sums,
+        halts: Halts,
+        tick: u64,
+    }
+
+    impl Bench {
+        fn new(answers: u64) -> Self {
+            let skin = testing::skin();
+            let robot = SimulatedArm::new(&skin, [0.0; 6]);
+            let cycle = Cycle::new(&skin, Box::new(Until(answers)), Box::new(robot));
+            Self { cycle, sums: Sums::default(), halts: Halts::default(), tick: 0 }
+        }
+
+        fn ticks(&mut self, ticks: u64) {
+            for _ in 0..ticks {
+                let tick = Tick { number: self.tick, time: Micros(self.tick * 2_000) };
+                let heard = Heard { sums: &self.sums, works: true };
+                let outcome = self.cycle.tick(tick, 0, [heard]);
+                if let Some((epoch, _)) = outcome.joints {
+                    self.sums.read_back = Some(epoch);
+                }
+                let record = outcome.record;
+                self.halts.take(&Timed { record, due_ns: 0, late_ns: 1_500, took_ns: 2_500, central: None });
+                self.tick += 1;
+            }
+        }
+    }
+
+    #[test]
+    fn the_ticks_before_a_halt_stay_whatever_comes_after_it() {
+        let limit = u64::from(testing::skin().safety.bad_cycles);
+        let mut bench = Bench::new(1_000);
+        bench.ticks(1_000 + limit - 1);
+        assert_eq!((bench.halts.why(), bench.halts.all().len()), (None, 0));
+        bench.ticks(5_000);
+        let [halted] = bench.halts.all().try_into().unwrap();
+        let tick = 1_000 + limit - 1;
+        let reason = "too many bad cycles in a row: the external controller's answer is missing";
+        assert_eq!((halted.tick, halted.reason.as_str(), halted.until_s), (tick, reason, None));
+        assert_eq!(bench.halts.why(), Some(reason));
+        assert!((halted.at_s - f64::from(u32::try_from(tick).unwrap()) * 0.002).abs() < 1e-9, "{halted:?}");
+        assert_eq!(u64::from(halted.epoch), tick / 8 % 256, "of the last joints, as the bus has it");
+
+        let before = bench.halts.history(&testing::skin());
+        let ticks: Vec<_> = before.iter().map(|it| it.tick).collect();
+        assert_eq!(ticks, (tick - 199..=tick).collect::<Vec<_>>());
+        for it in &before {
+            let bad = it.tick >= 1_000;
+            assert_eq!((it.bad_cycle.is_some(), it.valid, it.halted), (bad, true, it.tick == tick), "{it:?}");
+            let command = if it.halted { 0.0 } else { 0.25 };
+            assert!(it.command_rad_s.iter().all(|speed| (speed - command).abs() < 1e-9), "{it:?}");
+            assert!((it.late_us - 1.5).abs() < 1e-9 && (it.took_us - 2.5).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn halts_that_were_resumed_have_their_ends_and_are_bounded() {
+        let mut bench = Bench::new(u64::MAX);
+        bench.ticks(10);
+        for _ in 0..150 {
+            bench.sums.halts += 1;
+            bench.ticks(3);
+            assert_eq!(bench.halts.why(), Some("somebody sent a halt frame"));
+            bench.sums.resumes += 1;
+            bench.ticks(2);
+            assert_eq!(bench.halts.why(), None);
+        }
+        let all = bench.halts.all();
+        assert_eq!((all.len(), bench.halts.further), (HALTS, 50));
+        for (number, halted) in (0_u64..).zip(&all) {
+            assert_eq!(halted.tick, 10 + 5 * number);
+            let lasted = halted.until_s.unwrap() - halted.at_s;
+            assert!((lasted - 0.006).abs() < 1e-9, "{halted:?}");
+        }
+        bench.sums.halts += 1;
+        bench.ticks(1);
+        let all = bench.halts.all();
+        assert_eq!(
+            (all.len(), all.last().unwrap().until_s),
+            (HALTS + 1, None),
+            "one that lasts is always there"
+        );
+        assert_eq!(bench.halts.history(&testing::skin()).last().unwrap().tick, all.last().unwrap().tick);
+    }
+}

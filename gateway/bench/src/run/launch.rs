@@ -1,0 +1,379 @@
+//! The processes of a bench: embedded buses and cells. All of them end with the gateway, however it
+//! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
+
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
+use protocol::skin::Skin;
+use rustix::process::{Pid, Signal, kill_process};
+use thiserror::Error;
+
+use super::RunError;
+use model::scenario::ProcessAction;
+
+/// Two gateways on one bus notice each other in this time.
+pub const LISTEN: Duration = Duration::from_millis(500);
+/// Cells that were started and make no progress for so long are given up.
+pub const STARTING: Duration = Duration::from_secs(15);
+/// How long processes may take to end when asked to.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Why a process could not be started.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum LaunchError {
+    /// There is no such program.
+    #[error(
+        "{name} is not at {path}: build it with `cargo build --release`, or say where it is with --{name}"
+    )]
+    Missing {
+        /// The program.
+        name: &'static str,
+        /// Where it should be.
+        path: PathBuf,
+    },
+    /// It is there and does not start.
+    #[error("{path} does not start: {source}")]
+    Start {
+        /// The program.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The ends of processes cannot be noticed.
+    #[error("cannot catch SIGCHLD: {0}")]
+    Signal(std::io::Error),
+    /// An embedded bus is not served.
+    #[error("{path} does not serve {bus}; see its own message above")]
+    Serve {
+        /// The program.
+        path: PathBuf,
+        /// The bus.
+        bus: String,
+    },
+}
+
+/// Where a program of this project is: named by the user, or beside this one.
+///
+/// # Errors
+/// When it is not there.
+pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, LaunchError> {
+    let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
+    let path = given.map(Path::to_owned).or_else(beside).unwrap_or_else(|| PathBuf::from(name));
+    // A bare name would be looked for in PATH, and not here.
+    let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
+    if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
+}
+
+/// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is
+/// killed.
+#[derive(Debug)]
+pub struct ServedBus {
+    bus: String,
+    child: Child,
+}
+
+impl ServedBus {
+    /// Serves a bus and waits until clients can connect; in a directory, if not in the usual one.
+    ///
+    /// # Errors
+    /// When the program does not start or does not say that it serves.
+    pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
+        let mut command = Command::new(program);
+        command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
+        apart(&mut command, directory);
+        let start = |source| LaunchError::Start { path: program.to_owned(), source };
+        let mut served = Self { bus: bus.to_owned(), child: command.spawn().map_err(start)? };
+        let mut line = String::new();
+        if let Some(out) = served.child.stdout.take() {
+            BufReader::new(out).read_line(&mut line).map_err(start)?;
+        }
+        if line.starts_with("serving ") {
+            Ok(served)
+        } else {
+            Err(LaunchError::Serve { path: program.to_owned(), bus: bus.to_owned() })
+        }
+    }
+
+    /// Its process.
+    #[must_use]
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// The bus.
+    #[must_use]
+    pub fn bus(&self) -> &str {
+        &self.bus
+    }
+
+    /// How its process ended, if it did.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().ok().flatten()
+    }
+}
+
+/// Opens a bus; an embedded one that nobody serves is served, by `vcan_setup` if that is named.
+///
+/// # Errors
+/// When it does not open, or is not served.
+pub fn open_or_serve(
+    name: &str,
+    kind: Choice,
+    wanted: &Options,
+    vcan_setup: Option<&Path>,
+) -> Result<(Bus, Option<ServedBus>), RunError> {
+    match Bus::open(name, kind, wanted) {
+        Err(BusError::NotServed { .. }) => {
+            let served =
+                ServedBus::start(&program("vcan-setup", vcan_setup)?, name, wanted.directory.as_deref())?;
+            Ok((Bus::open(name, kind, wanted)?, Some(served)))
+        }
+        opened => Ok((opened?, None)),
+    }
+}
+
+impl Drop for ServedBus {
+    fn drop(&mut self) {
+        // Its standard input ends, and so does it.
+        drop(self.child.stdin.take());
+        end(&mut [&mut self.child]);
+    }
+}
+
+/// How a process is told which cells it is.
+#[derive(Clone, Debug)]
+struct Start {
+    program: PathBuf,
+    arguments: Vec<String>,
+    directory: Option<PathBuf>,
+}
+
+/// The process of one cell or of several.
+#[derive(Debug)]
+struct Process {
+    start: Start,
+    bus: usize,
+    nodes: (u8, u8),
+    child: Child,
+    ended: bool,
+}
+
+/// A process that ended by itself or was killed.
+#[derive(Clone, Copy, Debug)]
+pub struct Ended {
+    /// Its bus.
+    pub bus: usize,
+    /// The first and last of its cells.
+    pub nodes: (u8, u8),
+    /// How it ended.
+    pub status: ExitStatus,
+}
+
+/// All cells' processes.
+#[derive(Debug, Default)]
+pub struct Processes {
+    all: Vec<Process>,
+    /// Set by SIGCHLD, so that hundreds of processes are asked how they are only when one has changed.
+    changed: Arc<AtomicBool>,
+}
+
+/// How cells are started.
+#[derive(Clone, Copy, Debug)]
+pub struct Plan<'a> {
+    /// The program.
+    pub program: &'a Path,
+    /// The skin's file.
+    pub skin_file: &'a Path,
+    /// The skin.
+    pub skin: &'a Skin,
+    /// Which kind each bus is.
+    pub kinds: &'a Kinds,
+    /// Where embedded buses are, if not where they usually are.
+    pub directory: Option<&'a Path>,
+    /// At most so many cells in a process.
+    pub per_process: usize,
+    /// Where cells keep their parameters, if they do.
+    pub flash: Option<&'a Path>,
+}
+
+impl Processes {
+    /// Starts all cells of a skin. Call it from the thread that lives as long as the cells shall.
+    ///
+    /// # Errors
+    /// When a process does not start; those before it are ended again.
+    pub fn start(plan: &Plan<'_>) -> Result<Self, LaunchError> {
+        let mut processes = Self::default();
+        let changed = Arc::clone(&processes.changed);
+        signal_hook::flag::register(signal_hook::consts::SIGCHLD, changed).map_err(LaunchError::Signal)?;
+        for (bus, described) in plan.skin.buses.iter().enumerate() {
+            let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+            nodes.sort_unstable();
+            for nodes in groups(&nodes, plan.per_process) {
+                let start = plan.of(&described.name, nodes);
+                let child = start.spawn()?;
+                processes.all.push(Process { start, bus, nodes, child, ended: false });
+            }
+        }
+        Ok(processes)
+    }
+
+    /// The processes' numbers.
+    pub fn pids(&self) -> impl Iterator<Item = u32> {
+        self.all.iter().filter(|process| !process.ended).map(|process| process.child.id())
+    }
+
+    /// Processes that have ended since the last call.
+    pub fn ended(&mut self) -> Vec<Ended> {
+        let mut ended = Vec::new();
+        if !self.changed.swap(false, Ordering::Relaxed) {
+            return ended;
+        }
+        for process in self.all.iter_mut().filter(|process| !process.ended) {
+            if let Ok(Some(status)) = process.child.try_wait() {
+                process.ended = true;
+                ended.push(Ended { bus: process.bus, nodes: process.nodes, status });
+            }
+        }
+        ended
+    }
+
+    /// Does something to the process of a cell; returns whether there is one.
+    ///
+    /// # Errors
+    /// When a process is to be started again and does not start.
+    pub fn act(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
+        let holds =
+            |process: &&mut Process| process.bus == bus && process.nodes.0 <= node && node <= process.nodes.1;
+        let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
+        match action {
+            ProcessAction::Kill => process.signal(Signal::KILL),
+            ProcessAction::Stop => process.signal(Signal::STOP),
+            ProcessAction::Continue => process.signal(Signal::CONT),
+            ProcessAction::Restart => {
+                process.signal(Signal::KILL);
+                let _ = process.child.wait();
+                process.child = process.start.spawn()?;
+                process.ended = false;
+            }
+        }
+        Ok(true)
+    }
+}
+
+impl Process {
+    fn signal(&self, signal: Signal) {
+        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| !self.ended) {
+            let _ = kill_process(pid, signal);
+        }
+    }
+}
+
+impl Drop for Processes {
+    fn drop(&mut self) {
+        for process in &self.all {
+            // A stopped process would not hear the other signal.
+            process.signal(Signal::CONT);
+            process.signal(Signal::TERM);
+        }
+        let mut children: Vec<_> =
+            self.all.iter_mut().filter(|process| !process.ended).map(|process| &mut process.child).collect();
+        end(&mut children);
+    }
+}
+
+impl Plan<'_> {
+    fn of(&self, bus: &str, (first, last): (u8, u8)) -> Start {
+        let mut arguments = vec!["--bus".to_owned(), bus.to_owned()];
+        if first == last {
+            arguments.extend(["--node".to_owned(), first.to_string()]);
+        } else {
+            arguments.extend(["--nodes".to_owned(), format!("{first}-{last}")]);
+        }
+        arguments.extend(["--skin".to_owned(), self.skin_file.display().to_string()]);
+        // A bus that is lost is served or made again, and the cells on it are the same.
+        arguments.push("--reconnect".to_owned());
+        arguments.extend(["--bus-kind".to_owned(), self.kinds.of(bus).to_string()]);
+        arguments.extend(["--with-parent".to_owned(), std::process::id().to_string()]);
+        if let Some(flash) = self.flash {
+            arguments.extend(["--flash".to_owned(), flash.display().to_string()]);
+        }
+        let directory = self.directory.map(Path::to_owned);
+        Start { program: self.program.to_owned(), arguments, directory }
+    }
+}
+
+impl Start {
+    fn spawn(&self) -> Result<Child, LaunchError> {
+        let mut command = Command::new(&self.program);
+        command.args(&self.arguments).stdin(Stdio::null()).stdout(Stdio::null());
+        apart(&mut command, self.directory.as_deref());
+        command.spawn().map_err(|source| LaunchError::Start { path: self.program.clone(), source })
+    }
+}
+
+/// Ctrl-C on a terminal goes to everyone in its process group, and is meant for the gateway alone: cells and
+/// buses have to outlive it until the last words are said. They find embedded buses where it does.
+fn apart(command: &mut Command, directory: Option<&Path>) {
+    command.process_group(0);
+    if let Some(directory) = directory {
+        command.env("SKINBUS_DIR", directory);
+    }
+}
+
+/// Runs of consecutive numbers, at most `size` long.
+fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
+    let mut groups: Vec<(u8, u8)> = Vec::new();
+    for &node in nodes {
+        match groups.last_mut() {
+            Some((first, last)) if *last + 1 == node && usize::from(node - *first) < size => *last = node,
+            _ => groups.push((node, node)),
+        }
+    }
+    groups
+}
+
+/// Waits for processes that were asked to end, and kills those that do not.
+fn end(children: &mut [&mut Child]) {
+    let give_up = Instant::now() + PATIENCE;
+    loop {
+        let running = children
+            .iter_mut()
+            .filter_map(|child| child.try_wait().is_ok_and(|status| status.is_none()).then_some(()));
+        if running.count() == 0 {
+            return;
+        }
+        if Instant::now() > give_up {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    for child in children {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_are_grouped_in_runs_of_consecutive_numbers() {
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 1).len(), 6);
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 2), [(1, 2), (3, 3), (5, 6), (254, 254)]);
+        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 64), [(1, 3), (5, 6), (254, 254)]);
+    }
+
+    #[test]
+    fn a_missing_program_is_named_with_the_remedy() {
+        let error = program("cell-node", Some(Path::new("/nowhere/cell-node"))).unwrap_err().to_string();
+        assert!(error.starts_with("cell-node is not at /nowhere/cell-node: build it with"), "{error}");
+    }
+}

@@ -1,0 +1,101 @@
+//! What the loop's records add up to.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use hdrhistogram::Histogram;
+
+use super::halts::Halts;
+use control::cycle::turn::Timed;
+use model::quantiles::{Quantiles, histogram};
+
+/// What the loop's records add up to.
+#[derive(Debug)]
+pub(super) struct Measured {
+    pub(super) late: Histogram<u64>,
+    pub(super) took: Histogram<u64>,
+    pub(super) took_distributed: Histogram<u64>,
+    pub(super) central: Histogram<u64>,
+    pub(super) ticks: u64,
+    pub(super) skipped: u64,
+    pub(super) bad: BTreeMap<String, u64>,
+    /// Ticks without each bus, as [`control::cycle::Record::missing`] has the buses.
+    pub(super) missing: [u64; 32],
+    pub(super) halts: Halts,
+    last: Option<Timed>,
+    pub(super) first_broadcast_s: Option<f64>,
+}
+
+impl Measured {
+    pub(super) fn new() -> Self {
+        Self {
+            late: histogram(),
+            took: histogram(),
+            took_distributed: histogram(),
+            central: histogram(),
+            ticks: 0,
+            skipped: 0,
+            bad: BTreeMap::new(),
+            missing: [0; 32],
+            halts: Halts::default(),
+            last: None,
+            first_broadcast_s: None,
+        }
+    }
+
+    pub(super) fn take(&mut self, records: &mut rtrb::Consumer<Timed>, began: Instant) {
+        while let Ok(timed) = records.pop() {
+            if self.first_broadcast_s.is_none() {
+                self.first_broadcast_s = Some(began.elapsed().as_secs_f64());
+            }
+            self.ticks += 1;
+            self.skipped += timed.record.skipped;
+            record(&mut self.late, timed.late_ns);
+            record(&mut self.took, timed.took_ns);
+            match timed.central {
+                Some((nanos, _)) => record(&mut self.central, nanos),
+                None => record(&mut self.took_distributed, timed.took_ns),
+            }
+            for (bus, ticks) in self.missing.iter_mut().enumerate() {
+                *ticks += u64::from(timed.record.missing >> bus & 1);
+            }
+            if let Some(bad) = timed.record.bad {
+                *self.bad.entry(bad.to_string()).or_default() += 1;
+            }
+            self.halts.take(&timed);
+            self.last = Some(timed);
+        }
+    }
+
+    /// How it goes: what matters most first, for a narrow terminal shows no more.
+    pub(super) fn line(
+        &self,
+        started: Instant,
+        duration_us: u64,
+        cells: usize,
+        comparing: bool,
+        lost: &[&str],
+    ) -> String {
+        let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
+        let seconds = started.elapsed().as_secs_f64();
+        let of = Duration::from_micros(duration_us).as_secs_f64();
+        let mode = if comparing { "compare" } else { "distributed" };
+        let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
+        let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
+        let halted = self.halts.why().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
+        format!(
+            "{seconds:5.1} of {of:.1} s{lost}{halted}  {:3} of {cells} in contact, {} stale, {} dead  \
+             late p99 {:.0} us  {mode:11}  torque {} Nm",
+            record.contributing,
+            record.stale,
+            record.dead,
+            Quantiles::of(&self.late, 1e-3).p99,
+            torque.join(" "),
+        )
+    }
+}
+
+/// A histogram that is made without a bound grows by itself; it cannot refuse.
+fn record(histogram: &mut Histogram<u64>, value: u64) {
+    let _ = histogram.record(value);
+}

@@ -1,0 +1,128 @@
+//! A bench, live: buses, cells, receivers, the control loop, and the thread that watches over them.
+//!
+//! ```text
+//!   main thread ── starts ──> cells, embedded buses (processes)
+//!       │  ▲
+//!       │  └── news, view, records, captured frames ──┐
+//!       │                                             │
+//!       ├─ stimuli ─> bus ─> receiver (one a bus) ────┤
+//!       │              ▲         └─ snapshot ─> control loop (SCHED_FIFO)
+//!       │              └──────────── joints ────────────┘
+//!       └─ progress line, summary              recorder: what all of them hand over, into files
+//! ```
+
+mod halts;
+#[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
+mod io;
+pub mod launch;
+pub mod link;
+mod measured;
+mod network;
+mod organise;
+pub mod progress;
+pub mod realtime;
+pub mod receiver;
+pub mod roots;
+mod start;
+mod switching;
+mod usage;
+mod watch;
+
+use std::path::PathBuf;
+
+use protocol::bus::{BusError, Kinds};
+use protocol::document::DocumentError;
+use protocol::skin::Skin;
+use thiserror::Error;
+
+use crate::summary::Summary;
+use model::scenario::Scenario;
+
+/// What a run needs to know.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The skin's file, which cells read too.
+    pub skin_file: PathBuf,
+    /// The skin.
+    pub skin: Skin,
+    /// What happens.
+    pub scenario: Scenario,
+    /// Which kind each bus is.
+    pub kinds: Kinds,
+    /// Where embedded buses are, if not where they usually are.
+    pub directory: Option<PathBuf>,
+    /// Whether cells are started; else they are on the bus already.
+    pub spawn: bool,
+    /// At most so many cells in a process.
+    pub cells_per_process: usize,
+    /// Where cells keep their parameters, if they do.
+    pub flash: Option<PathBuf>,
+    /// The cells' program, when it is not beside this one.
+    pub cell_node: Option<PathBuf>,
+    /// The embedded bus' program, when it is not beside this one.
+    pub vcan_setup: Option<PathBuf>,
+    /// Bytes that may wait in the gateway's socket of a bus, as the kernel counts them: about 1 KiB a frame.
+    pub receive_buffer: usize,
+    /// What is recorded where.
+    pub record: crate::record::Options,
+    /// Whether progress is shown.
+    pub quiet: bool,
+}
+
+/// Why a run did not come to its end.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// A file says something that cannot be.
+    #[error(transparent)]
+    Document(#[from] DocumentError),
+    /// A bus does not open.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A program does not start.
+    #[error(transparent)]
+    Launch(#[from] launch::LaunchError),
+    /// What was asked for cannot be done.
+    #[error("{0}")]
+    Usage(String),
+    /// It began and failed.
+    #[error("{0}")]
+    Failed(String),
+    /// A file cannot be written.
+    #[error("{path}: {source}")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+impl RunError {
+    /// 2 for wrong use or configuration, 1 for a run that failed.
+    #[must_use]
+    pub const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Document(_) | Self::Bus(_) | Self::Launch(_) | Self::Usage(_) => 2,
+            Self::Failed(_) | Self::Write { .. } => 1,
+        }
+    }
+}
+
+/// Runs a bench to its end, or until SIGINT or SIGTERM. Of a run that fails there is a summary too, which says why.
+///
+/// # Errors
+/// When it cannot begin because of wrong use or configuration; cells and buses that were started are ended again.
+pub fn run(options: &Options) -> Result<Summary, RunError> {
+    let mut bench = match start::start(options) {
+        Ok(bench) => bench,
+        Err(error) if error.exit_code() == 1 => {
+            return Ok(Summary::of_no_run(&options.skin, error.to_string()));
+        }
+        Err(error) => return Err(error),
+    };
+    match bench.begin() {
+        Ok(()) => Ok(bench.watch()),
+        Err(error) => bench.give_up(error),
+    }
+}

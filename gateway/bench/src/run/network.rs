@@ -1,0 +1,395 @@
+//! The networks of a run's cells, as the main thread sees them: who has no way, and who is to be told when to speak.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, Request};
+use protocol::packet::WORDS;
+use protocol::parameters::{Cuts, Parameter, Reply as Words, Slots};
+use protocol::skin::{Reply, Skin, Wires};
+use protocol::wire::PORTS;
+
+use super::receiver::View;
+use model::network::check::{self, Difference};
+use model::network::tree::{Places, places};
+
+/// A cell that does not answer is told again after this.
+const AGAIN: Duration = Duration::from_millis(200);
+/// Cells have so long to find another way before people hear of it.
+const GRACE: Duration = Duration::from_millis(300);
+
+/// The network of one bus.
+#[derive(Debug)]
+pub(super) struct Network {
+    name: String,
+    wires: Wires,
+    slots: Slots,
+    period_us: u16,
+    /// When each cell was told last.
+    told: BTreeMap<CellId, Instant>,
+    /// Ports that are to hear nothing, a bit each, and when their cell was told last.
+    deaf: BTreeMap<CellId, (u8, Option<Instant>)>,
+    /// Cells that speak and have no way, and since when.
+    without: BTreeMap<CellId, Instant>,
+    /// Cells that people have heard of as without a way, and since when they are; until they have one again.
+    said: BTreeMap<CellId, Instant>,
+    said_too_deep: bool,
+    /// How long a cell was without a way, at most.
+    pub(super) longest: Duration,
+    /// From the time when all cells were ready until all had a way.
+    pub(super) organised: Option<Duration>,
+    /// What was different from the description at the start.
+    pub(super) differences: Vec<Difference>,
+}
+
+/// What a look at a network comes to.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Look {
+    /// What is to be said to cells.
+    pub(super) messages: Vec<Message>,
+    /// What people are to know.
+    pub(super) notes: Vec<String>,
+}
+
+impl Network {
+    /// That of a bus; `None` where cells answer with their own torques.
+    pub(super) fn of(skin: &Skin, bus: usize) -> Option<Self> {
+        let described = skin.buses.get(bus)?;
+        let Reply::Sum { slot_us, carry } = described.reply else { return None };
+        Some(Self {
+            name: described.name.clone(),
+            wires: skin.wires(bus),
+            slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
+            period_us: skin.period_us().unwrap_or(u16::MAX),
+            told: BTreeMap::new(),
+            deaf: BTreeMap::new(),
+            without: BTreeMap::new(),
+            said: BTreeMap::new(),
+            said_too_deep: false,
+            longest: Duration::ZERO,
+            organised: None,
+            differences: Vec::new(),
+        })
+    }
+
+    /// The depth of the deepest cell that there is a slot for.
+    pub(super) const fn deepest(&self) -> u8 {
+        self.slots.deepest
+    }
+
+    /// The bus' name.
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Cells that speak and have no way, at the last look.
+    pub(super) fn without_way(&self) -> impl Iterator<Item = u8> {
+        self.without.keys().map(|cell| cell.get())
+    }
+
+    fn places(view: &View) -> Places {
+        places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
+    }
+
+    /// How many cells have a way, and whether all do that speak, with pages that agree.
+    pub(super) fn progress(view: &View) -> (usize, bool) {
+        let places = Self::places(view);
+        (places.depths.len(), places.without_way.is_empty() && places.agree)
+    }
+
+    /// What is different from the description.
+    pub(super) fn check(&self, view: &View) -> Vec<Difference> {
+        check::differences(&self.wires, &view.network)
+    }
+
+    /// Makes slots for the tree as it is.
+    ///
+    /// # Errors
+    /// When they do not fit between two joints; says what would.
+    pub(super) fn fit(&mut self, view: &View) -> Result<(), String> {
+        let deepest = Self::places(view).deepest().unwrap_or(0);
+        let slots = u32::from(deepest) + 1;
+        let (slot_us, period) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
+        if slots * slot_us > period {
+            let greatest = period.checked_div(slots).unwrap_or(0);
+            let at_most = period.checked_div(slot_us).unwrap_or(0).saturating_sub(1);
+            return Err(format!(
+                "the tree of {} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the \
+                 {period} us from joints to joints; slot_us = {greatest} would, or more roots, so that no cell is \
+                 deeper than {at_most}",
+                self.name
+            ));
+        }
+        self.slots.deepest = deepest;
+        Ok(())
+    }
+
+    fn words(&self) -> [i16; WORDS] {
+        Words::Sum(self.slots).words()
+    }
+
+    fn tell(&self, to: Node) -> Message {
+        let request = Request::Write { number: Parameter::Reply.number(), words: self.words() };
+        Message::Configure { to, tag: self.slots.deepest, request }
+    }
+
+    /// Tells everyone how deep the tree is.
+    pub(super) fn tell_everyone(&mut self, now: Instant, view: &View) -> Message {
+        self.told.extend(view.network.iter().map(|cell| (cell.node, now)));
+        self.tell(Node::Everyone)
+    }
+
+    /// The cells that do not speak in slots for this tree and could.
+    pub(super) fn untold(&self, view: &View) -> Vec<CellId> {
+        let words = Some(self.words());
+        let untold = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
+        untold.filter_map(|cell| CellId::new(cell.node.into()).ok()).collect()
+    }
+
+    /// What is to be said to those who have not answered for a while.
+    pub(super) fn tell_again(&mut self, now: Instant, view: &View) -> Vec<Message> {
+        let untold = self.untold(view);
+        let due = |cell: &CellId| self.told.get(cell).is_none_or(|at| now.duration_since(*at) >= AGAIN);
+        let due: Vec<_> = untold.into_iter().filter(due).collect();
+        self.told.extend(due.iter().map(|&cell| (cell, now)));
+        due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
+    }
+
+    /// Cuts the wires from one cell to another, or mends them.
+    pub(super) fn set_cut(&mut self, cut: bool, from: CellId, to: CellId) {
+        let ends = (0_u8..)
+            .zip(0..PORTS)
+            .filter(|&(_, port)| self.wires.other_end(to, port).is_some_and(|(other, _)| other == from));
+        let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
+        let (deaf, told) = self.deaf.entry(to).or_insert((0, None));
+        *deaf = if cut { *deaf | bits } else { *deaf & !bits };
+        *told = None;
+    }
+
+    /// What is to be said to those whose ports are to hear nothing, or to hear again.
+    fn tell_cuts(&mut self, now: Instant, view: &View) -> Vec<Message> {
+        let mut messages = Vec::new();
+        for (&cell, (deaf, told)) in &mut self.deaf {
+            let Some(known) = view.cells.iter().find(|it| it.node == cell.get() && it.ready) else {
+                continue;
+            };
+            let waits = told.is_some_and(|at| now.duration_since(at) < AGAIN);
+            if known.deaf != *deaf && !waits {
+                *told = Some(now);
+                let words = Cuts { deaf: *deaf }.words();
+                let request = Request::Write { number: Parameter::Cuts.number(), words };
+                messages.push(Message::Configure { to: Node::Cell(cell), tag: *deaf, request });
+            }
+        }
+        messages
+    }
+
+    /// Looks at the network while the loop runs.
+    pub(super) fn look(&mut self, now: Instant, view: &View) -> Look {
+        let mut look = Look::default();
+        let places = Self::places(view);
+        if places.deepest().is_some_and(|deepest| deepest > self.slots.deepest) {
+            match self.fit(view) {
+                Ok(()) => look.messages.push(self.tell_everyone(now, view)),
+                Err(why) if !self.said_too_deep => {
+                    self.said_too_deep = true;
+                    look.notes.push(format!("{why}; what is deeper speaks too early, and is late"));
+                }
+                Err(_) => {}
+            }
+        }
+        look.messages.extend(self.tell_again(now, view));
+        look.messages.extend(self.tell_cuts(now, view));
+        let without: BTreeSet<_> = places.without_way.into_iter().collect();
+        self.without.retain(|cell, since| {
+            self.longest = self.longest.max(now.duration_since(*since));
+            without.contains(cell)
+        });
+        let mut back = Vec::new();
+        self.said.retain(|cell, since| {
+            let has_one = places.depths.contains_key(cell);
+            if has_one {
+                back.push((*cell, now.duration_since(*since)));
+            }
+            !has_one
+        });
+        for &cell in &without {
+            self.without.entry(cell).or_insert(now);
+        }
+        let news = |(cell, since): (&CellId, &Instant)| {
+            (now.duration_since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
+        };
+        let news: Vec<_> = self.without.iter().filter_map(news).collect();
+        if let Some(oldest) = news.iter().map(|(_, since)| now.duration_since(*since)).max() {
+            self.said.extend(news.iter().copied());
+            let cells: Vec<_> = news.into_iter().map(|(cell, _)| cell).collect();
+            let (has, them) = if cells.len() == 1 { ("has", "it") } else { ("have", "them") };
+            look.notes.push(format!(
+                "{} on {} {has} no way to a root: no sum holds {them} since {:.1} s",
+                check::names(&cells),
+                self.name,
+                oldest.as_secs_f64()
+            ));
+        }
+        if let Some(longest) = back.iter().map(|(_, length)| *length).max() {
+            let cells: Vec<_> = back.into_iter().map(|(cell, _)| cell).collect();
+            let has = if cells.len() == 1 { "has" } else { "have" };
+            look.notes.push(format!(
+                "{} on {} {has} a way to a root again, after {:.1} s",
+                check::names(&cells),
+                self.name,
+                longest.as_secs_f64()
+            ));
+        }
+        look
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::receiver::CellView;
+    use model::network::check::Seen;
+    use model::table::{SWITCHES, Said};
+    use protocol::message::Tree;
+    use protocol::packet::Epoch;
+
+    fn network() -> Network {
+        let head = model::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 5000");
+        let (head, one) = head.split_at(head.find("[[cell]]").unwrap());
+        let cell = |node: u8, root: bool, neighbors: &str| {
+            one.replace("node = 1", &format!("node = {node}\nroot = {root}\nneighbors = {neighbors}"))
+        };
+        let cells =
+            [cell(1, true, "[2, 3, 0, 0]"), cell(2, false, "[1, 3, 0, 0]"), cell(3, false, "[1, 2, 0, 0]")];
+        let text = format!("{head}{}", cells.concat());
+        Network::of(&Skin::parse("skin.toml", &text).unwrap(), 0).unwrap()
+    }
+
+    /// Cells that say who their parents are and how deep they are; one that says nothing is dead.
+    fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
+        let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
+            node: u8::try_from(at + 1).unwrap(),
+            heard: true,
+            dead: tree.is_none(),
+            ready: tree.is_some(),
+            halted: false,
+            unconfigured: false,
+            other: false,
+            last_joints: Epoch(0),
+            said: Said::default(),
+            reply,
+            deaf: 0,
+            lacks: [None; SWITCHES],
+        });
+        let network = trees.iter().enumerate().map(|(at, tree)| Seen {
+            node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
+            serial: Some(1),
+            configuration: 0,
+            heartbeat: None,
+            alive: tree.is_some(),
+            tree: tree.map(|(parent, depth)| {
+                let up = if parent == Some(0) { 4 } else { 0 };
+                Tree { parent, up, depth, ..Tree::default() }
+            }),
+            ports: None,
+        });
+        View { cells: cells.collect(), commands: 0, network: network.collect() }
+    }
+
+    #[test]
+    fn a_tree_that_grows_deeper_gets_more_slots_as_far_as_they_fit() {
+        let mut network = network();
+        let flat = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(1), 1))];
+        network.fit(&view(&flat, None)).unwrap();
+        let now = Instant::now();
+        let words = Some(network.words());
+        assert_eq!(network.look(now, &view(&flat, words)), Look::default());
+        let deep = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
+        let look = network.look(now, &view(&deep, words));
+        let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
+        assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
+        assert_eq!(network.deepest(), 2);
+        // Who has not answered is told alone, and not at once.
+        assert_eq!(network.look(now, &view(&deep, words)), Look::default());
+        let look = network.look(now + AGAIN, &view(&deep, words));
+        assert_eq!(look.messages.len(), 3, "{look:?}");
+        let new = Some(network.words());
+        assert_eq!(network.look(now + AGAIN * 2, &view(&deep, new)), Look::default());
+        // A cell that started anew has forgotten it.
+        let look = network.look(now + AGAIN * 3, &view(&deep, None));
+        assert_eq!(look.messages.len(), 3, "{look:?}");
+        // 4 slots of 5 ms are more than 16 ms.
+        let deeper = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2)), Some((Some(3), 3))];
+        let look = network.look(now + AGAIN * 3, &view(&deeper, new));
+        let [note] = look.notes.as_slice() else { panic!("{look:?}") };
+        assert!(note.contains("slot_us = 4000 would") && note.contains("deeper than 2"), "{note}");
+    }
+
+    #[test]
+    fn a_cut_is_told_to_the_end_that_is_to_hear_nothing_until_it_says_so_and_again_after_a_start() {
+        let mut network = network();
+        let trees = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
+        network.fit(&view(&trees, None)).unwrap();
+        let words = Some(network.words());
+        let cell = |number| CellId::new(number).unwrap();
+        let mut now = Instant::now();
+        let mut look = |network: &mut Network, deaf| {
+            now += AGAIN;
+            let mut view = view(&trees, words);
+            view.cells[1].deaf = deaf;
+            let told = |message: &Message| {
+                let Message::Configure {
+                    to: Node::Cell(to),
+                    request: Request::Write { number: 9, words },
+                    ..
+                } = *message
+                else {
+                    panic!("{message:?}")
+                };
+                (to.get(), Cuts::from_words(words).deaf)
+            };
+            network.look(now, &view).messages.iter().map(told).collect::<Vec<_>>()
+        };
+        network.set_cut(true, cell(3), cell(2));
+        assert_eq!(look(&mut network, 0), [(2, 0b10)]);
+        assert_eq!(look(&mut network, 0), [(2, 0b10)], "it did not answer");
+        assert_eq!(look(&mut network, 0b10), []);
+        network.set_cut(true, cell(1), cell(2));
+        assert_eq!(look(&mut network, 0b10), [(2, 0b11)]);
+        network.set_cut(false, cell(3), cell(2));
+        assert_eq!(look(&mut network, 0b11), [(2, 0b01)]);
+        assert_eq!(look(&mut network, 0b01), []);
+        assert_eq!(look(&mut network, 0), [(2, 0b01)], "it started anew");
+    }
+
+    #[test]
+    fn who_has_no_way_is_named_once_and_again_when_it_has_one() {
+        let mut network = network();
+        let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
+        network.fit(&view(&whole, None)).unwrap();
+        let words = Some(network.words());
+        let mut at = Instant::now();
+        let mut look = |network: &mut Network, trees: &[_]| {
+            at += Duration::from_millis(200);
+            network.look(at, &view(trees, words)).notes
+        };
+        assert_eq!(look(&mut network, &whole), Vec::<String>::new());
+        let cut = [Some((Some(0), 0)), Some((None, 0)), Some((Some(2), 1))];
+        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
+        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
+        assert_eq!(
+            look(&mut network, &cut),
+            ["cells 2, 3 on vcan0 have no way to a root: no sum holds them since 0.4 s"]
+        );
+        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
+        assert_eq!(network.without_way().collect::<Vec<_>>(), [2, 3]);
+        // One dies, which somebody else says; the other is there again.
+        let half = [Some((Some(0), 0)), None, Some((Some(1), 1))];
+        assert_eq!(look(&mut network, &half), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
+        assert_eq!(network.without_way().count(), 0);
+        assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a way to a root again, after 1.0 s"]);
+        assert_eq!(network.longest, Duration::from_millis(800));
+    }
+}

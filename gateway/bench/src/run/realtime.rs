@@ -1,0 +1,99 @@
+//! The clock of the control loop: absolute deadlines, and what the machine allows a thread that keeps
+//! them.
+
+use std::sync::atomic::Ordering;
+
+use hdrhistogram::Histogram;
+use protocol::can::Frame;
+use protocol::time::Micros;
+use rustix::mm::{MlockAllFlags, mlockall};
+use rustix::thread::{ClockId, clock_nanosleep_absolute};
+use rustix::time::{Timespec, clock_gettime};
+
+use control::cycle::Tick;
+use control::cycle::turn::{Shared, Turn};
+use model::quantiles::histogram;
+
+/// The loop's priority: above ordinary threads, below the kernel's own.
+const PRIORITY: i32 = 40;
+/// A receiver's: simulated cells that share its processor must not keep it from reading what they send.
+const RECEIVER_PRIORITY: i32 = 30;
+
+/// What the machine granted.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Granted {
+    /// `SCHED_FIFO`.
+    pub fifo: bool,
+    /// All memory locked.
+    pub locked: bool,
+}
+
+/// Makes the calling thread as punctual as the machine allows.
+pub fn prepare() -> Granted {
+    let granted = Granted {
+        fifo: super::io::set_fifo(PRIORITY),
+        // Only what is touched is locked, or every thread's whole stack would count.
+        locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
+    };
+    super::io::set_timer_slack(1);
+    granted
+}
+
+/// The same for a receiver's thread, which may be a little late.
+pub(crate) fn prepare_receiver() {
+    super::io::set_fifo(RECEIVER_PRIORITY);
+}
+
+/// The monotonic clock in ns.
+#[must_use]
+pub fn now() -> u64 {
+    let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic);
+    u64::try_from(tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(tv_nsec).unwrap_or(0)
+}
+
+/// Sleeps until the monotonic clock reads `deadline` ns; a signal wakes nobody early.
+pub(crate) fn sleep_until(deadline: u64) {
+    let seconds = i64::try_from(deadline / 1_000_000_000).unwrap_or(i64::MAX);
+    let nanos = i64::try_from(deadline % 1_000_000_000).unwrap_or(0);
+    let until = Timespec { tv_sec: seconds, tv_nsec: nanos };
+    while clock_nanosleep_absolute(ClockId::Monotonic, &until)
+        .is_err_and(|errno| errno == rustix::io::Errno::INTR)
+    {}
+}
+
+/// How late this machine wakes a thread that has nothing to do, in ns, `count` times.
+#[must_use]
+pub fn idle_lateness(period_ns: u64, count: u32) -> Histogram<u64> {
+    let mut histogram = histogram();
+    let mut deadline = now();
+    for _ in 0..count {
+        deadline += period_ns;
+        sleep_until(deadline);
+        // It grows by itself; it cannot refuse.
+        let _ = histogram.record(now().saturating_sub(deadline));
+    }
+    histogram
+}
+
+/// Runs ticks until there were `ticks` of them or someone says stop. Whole periods that were missed are
+/// skipped; the phase is never reset.
+pub fn run(
+    turn: &mut Turn,
+    shared: &Shared,
+    period_ns: u64,
+    ticks: u64,
+    mut send: impl FnMut(usize, &[Frame]) -> bool,
+) {
+    let start = now() + period_ns;
+    let mut number = 0;
+    while number < ticks && !shared.stop_loop.load(Ordering::Relaxed) {
+        let mut due = start + number * period_ns;
+        sleep_until(due);
+        let skipped = now().saturating_sub(due) / period_ns;
+        number += skipped;
+        due += skipped * period_ns;
+        let tick = Tick { number, time: Micros((due - start) / 1_000) };
+        turn.turn(tick, skipped, due, now, &mut send);
+        number += 1;
+    }
+}

@@ -1,0 +1,385 @@
+//! The thread that receives on one bus: it keeps the table, and leaves snapshots for the tick.
+
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::bus::batch::BATCH;
+use protocol::bus::{BusError, Inbox, Received};
+use protocol::id::Kind;
+use protocol::message::State;
+use protocol::packet::{Epoch, WORDS};
+use protocol::time::Micros;
+
+use super::link::{Ear, Outages};
+use super::roots::Roots;
+use crate::record::feed::{Outlet, Touched, Unrecorded};
+use crate::record::force::Seen;
+use control::cycle::turn::Shared;
+use model::network::check::Seen as SeenCell;
+use model::table::{Notice, SWITCHES, Said, Snapshot, Status, Switch, Table};
+
+/// How often time is let pass when nothing comes, and the view is renewed.
+const LOOK: Duration = Duration::from_millis(20);
+/// The pause while an interface is down.
+const DOWN: Duration = Duration::from_millis(50);
+/// From one try to open a bus that is gone to the next.
+const REOPEN: Duration = Duration::from_millis(100);
+
+/// What a receiver tells the main thread at once.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum News {
+    /// Of a cell, or another gateway.
+    Notice(Notice),
+    /// The bus does not work for now.
+    Down(String),
+    /// It works again.
+    Up,
+    /// The bus is gone: it has to be opened anew, which its receiver tries.
+    Lost(String),
+    /// It is there and cannot be opened.
+    Refused(String),
+}
+
+/// The state of a bus' cells, renewed every 20 ms.
+#[derive(Clone, Debug, Default)]
+pub struct View {
+    /// Each cell, in the bus' order.
+    pub cells: Vec<CellView>,
+    /// Commands of our own that were read back from the bus, or were lost with it.
+    pub commands: u64,
+    /// What is known of the network's cells, those that are not described among them; nobody where cells answer
+    /// with their own torques.
+    pub network: Vec<SeenCell>,
+}
+
+/// The state of one cell.
+#[derive(Clone, Copy, Debug)]
+pub struct CellView {
+    /// Its number.
+    pub node: u8,
+    /// Whether it has been heard of.
+    pub heard: bool,
+    /// Whether it has fallen silent.
+    pub dead: bool,
+    /// Whether it can be expected to answer, once nobody halts it.
+    pub ready: bool,
+    /// Whether it waits for a resume.
+    pub halted: bool,
+    /// Whether it is there for good and has no parameters to compute with.
+    pub unconfigured: bool,
+    /// Whether its configuration is not the skin's.
+    pub other: bool,
+    /// The joints that it had taken last.
+    pub last_joints: Epoch,
+    /// What it has said since it was asked.
+    pub said: Said,
+    /// What it answers joints with, as it said last.
+    pub reply: Option<[i16; WORDS]>,
+    /// Ports that hear nothing because it was told so, as it said last.
+    pub deaf: u8,
+    /// What it is to be switched to and has not confirmed.
+    pub lacks: [Option<Switch>; SWITCHES],
+}
+
+/// One bus, as its receiver sees it.
+#[derive(Debug)]
+pub struct Receiver {
+    /// Where this bus stands among the skin's.
+    pub index: usize,
+    /// The bus.
+    pub ear: Ear,
+    /// So long frames are left to gather, so that one wake-up takes many: a tick, as nobody looks more often.
+    pub gather: Duration,
+    /// What is known of it.
+    pub table: Table,
+    /// The wires to its roots, where cells answer with sums.
+    pub roots: Option<Roots>,
+    /// Where snapshots go.
+    pub snapshots: triple_buffer::Input<Snapshot>,
+    /// Unrounded positions of the broadcasts.
+    pub positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+    /// Where everything goes that is to be recorded, if it is.
+    pub outlet: Option<Outlet>,
+    /// What everyone looks at.
+    pub shared: Arc<Shared>,
+    /// What the main thread sees.
+    pub view: Arc<Mutex<View>>,
+    /// What it is told at once.
+    pub news: Sender<(usize, News)>,
+}
+
+/// What a receiver leaves at the end.
+#[derive(Debug)]
+pub struct Left {
+    /// All that is known of the bus.
+    pub table: Table,
+    /// Frames that the bus dropped because we did not take them in time.
+    pub dropped: u64,
+    /// What did not fit into the recorder's queues.
+    pub unrecorded: Unrecorded,
+    /// Bytes that were no frame.
+    pub unreadable: u64,
+    /// How often the bus was lost, and for how long.
+    pub outages: Outages,
+}
+
+/// What came through the sockets of a bus so far.
+#[derive(Debug, Default)]
+struct Account {
+    /// Frames that the bus dropped, and bytes that were no frame, on sockets before this one.
+    before: (u64, u64),
+    /// What this socket had dropped when it was last told to the recorder.
+    told: u32,
+    /// The newest joints whose feelings the recorder has.
+    newest: Option<u64>,
+    outages: Outages,
+    /// Commands that the bus took and did not carry, because it was lost.
+    unread: u64,
+    /// When a bus that is gone is to be opened again.
+    retry: Option<Instant>,
+    /// Why it could not be, for people.
+    refused: String,
+}
+
+impl Receiver {
+    /// Receives until someone says stop. A bus that is lost is waited for, and opened again when it is gone.
+    #[must_use]
+    pub fn run(mut self) -> Left {
+        super::realtime::prepare_receiver();
+        let mut inbox = Inbox::new();
+        let mut account = Account::default();
+        let mut looked = Instant::now();
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            let count = if let Some(retry) = account.retry {
+                inbox.clear();
+                self.retry(&mut inbox, &mut account, retry);
+                0
+            } else {
+                self.take(&mut inbox, &mut account)
+            };
+            if count > 0 && self.ear.regain() {
+                account.outages.end(Instant::now());
+                self.tell(News::Up);
+            }
+            self.hear(&inbox);
+            if let Some(roots) = &mut self.roots {
+                if self.shared.explore.load(Ordering::Relaxed) {
+                    roots.explore();
+                }
+                roots.speak(&self.ear.bus);
+            }
+            self.record(&inbox, &mut account);
+            if count == 0 || looked.elapsed() >= LOOK {
+                looked = Instant::now();
+                self.look(&mut account);
+            }
+            self.publish();
+            // A full inbox has more behind it.
+            if (1..BATCH).contains(&count) {
+                std::thread::sleep(self.gather);
+            }
+        }
+        self.table.finish();
+        let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
+        let (dropped, unreadable) = account.before;
+        let (dropped, unreadable) = (dropped + u64::from(inbox.dropped()), unreadable + inbox.unreadable());
+        Left { table: self.table, dropped, unrecorded, unreadable, outages: account.outages }
+    }
+
+    /// Waits for frames and takes them; how many.
+    fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
+        let bus = &self.ear.bus;
+        inbox.clear();
+        let patience = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
+        let came = bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
+        came.unwrap_or_else(|error| {
+            self.lose(inbox, account, &error);
+            0
+        })
+    }
+
+    /// The bus is lost, for a while or until it is opened again.
+    fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: &BusError) {
+        let gone = !error.may_pass();
+        if gone {
+            account.retry = Some(Instant::now());
+            account.refused.clear();
+        }
+        if self.ear.lose(gone) {
+            account.outages.begin(Instant::now());
+            self.tell(if gone { News::Lost(error.to_string()) } else { News::Down(error.to_string()) });
+        }
+        if gone {
+            inbox.clear();
+            return self.table.interrupt();
+        }
+        std::thread::sleep(DOWN);
+        // What stood on it before is no sign that it works again.
+        loop {
+            match self.ear.bus.receive(inbox) {
+                Ok(1..) => {
+                    self.hear(inbox);
+                    self.record(inbox, account);
+                }
+                // An interface goes down before it is removed, and each is said once.
+                Err(error) if !error.may_pass() => return self.lose(inbox, account, &error),
+                Ok(0) | Err(_) => break,
+            }
+        }
+        inbox.clear();
+        self.table.interrupt();
+    }
+
+    /// Tries to open a bus that is gone, when it is time; time passes for the cells all the same.
+    fn retry(&mut self, inbox: &mut Inbox, account: &mut Account, retry: Instant) {
+        let now = Instant::now();
+        if now < retry {
+            return std::thread::sleep(LOOK.min(retry - now));
+        }
+        match self.ear.reopen() {
+            Ok(()) => {
+                let (dropped, unreadable) = &mut account.before;
+                *dropped += u64::from(inbox.dropped());
+                *unreadable += inbox.unreadable();
+                *inbox = Inbox::new();
+                (account.told, account.retry) = (0, None);
+            }
+            Err(error) => {
+                account.retry = Some(now + REOPEN);
+                let why = error.to_string();
+                if !is_absent(&error) && account.refused != why {
+                    self.tell(News::Refused(why.clone()));
+                }
+                account.refused = why;
+            }
+        }
+    }
+
+    /// Takes what came.
+    fn hear(&mut self, inbox: &Inbox) {
+        self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
+        for received in inbox.frames() {
+            if let Some(roots) = &mut self.roots
+                && roots.take(&received.frame)
+            {
+                for (root, feeds) in roots.changes() {
+                    self.table.set_feeds(root, feeds);
+                }
+                continue;
+            }
+            let at = Micros(received.at_nanos / 1_000);
+            let queue = &mut self.positions;
+            let mut positions = |epoch| positions_of(queue, epoch);
+            self.table.handle_frame(at, received.own, &received.frame, &mut positions);
+            if let Some(outlet) = &mut self.outlet {
+                let Received { frame, at_nanos, own } = received;
+                outlet.frame(Seen { at_nanos, own, frame });
+            }
+        }
+    }
+
+    /// Hands on what is no frame: what the bus dropped, and once an epoch what cells feel.
+    fn record(&mut self, inbox: &Inbox, account: &mut Account) {
+        let Some(outlet) = &mut self.outlet else { return };
+        let more = inbox.dropped().wrapping_sub(account.told);
+        if more > 0 {
+            account.told = inbox.dropped();
+            outlet.dropped(wall_nanos(), more.into());
+        }
+        let Some((number, epoch, at)) = self.table.newest() else { return };
+        if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
+            let cells = self.table.felt(at).collect();
+            outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
+        }
+    }
+
+    fn publish(&mut self) {
+        let comparing = self.shared.comparing.load(Ordering::Relaxed);
+        self.snapshots.input_buffer_mut().take(self.table.snapshot(), comparing);
+        self.snapshots.publish();
+    }
+
+    /// Lets time pass, and shows the main thread how things are.
+    fn look(&mut self, account: &mut Account) {
+        let now = Micros(wall_nanos() / 1_000);
+        self.table.handle_time(now);
+        let notices: Vec<_> = self.table.notices().collect();
+        for notice in notices {
+            self.tell(News::Notice(notice));
+        }
+        let cells = self.table.statuses(now).map(|(cell, status)| {
+            let state = cell.heartbeat.map(|heartbeat| heartbeat.state);
+            let alive = !matches!(status, Status::Dead | Status::Unknown);
+            let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
+            let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
+            CellView {
+                node: cell.node.get(),
+                heard: state.is_some(),
+                dead: status == Status::Dead,
+                ready,
+                halted: ready && !cell.is_ready(),
+                unconfigured: settled.is_some() && !ready,
+                other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+                last_joints: cell.last_joints,
+                said: cell.said(),
+                reply: cell.reply,
+                deaf: cell.deaf,
+                lacks: cell.lacks(),
+            }
+        });
+        let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
+        if !self.ear.link.is_there() {
+            // What it took and has not carried by now it will not carry.
+            account.unread = self.ear.link.commands().load(Ordering::Relaxed).saturating_sub(read);
+        }
+        let commands = read + account.unread;
+        let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
+        if let Ok(mut view) = self.view.lock() {
+            *view = View { cells, commands, network };
+        }
+    }
+
+    fn tell(&self, news: News) {
+        // Nobody listens any more when the run ends.
+        let _ = self.news.send((self.index, news));
+    }
+}
+
+/// Whether a bus that does not open is just not there.
+const fn is_absent(error: &BusError) -> bool {
+    matches!(
+        error,
+        BusError::NoInterface { .. }
+            | BusError::Down { .. }
+            | BusError::Gone { .. }
+            | BusError::NotServed { .. }
+            | BusError::Closed { .. }
+    )
+}
+
+/// Says what did not fit; the recorder makes room as long as a receiver is there.
+fn last_words(outlet: &mut Outlet) -> Unrecorded {
+    let give_up = Instant::now() + Duration::from_secs(1);
+    while !outlet.tell(wall_nanos()) && Instant::now() < give_up {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    outlet.unrecorded()
+}
+
+/// The wall clock in ns since 1970.
+fn wall_nanos() -> u64 {
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.
+fn positions_of(queue: &mut rtrb::Consumer<(Epoch, [f64; WORDS])>, epoch: Epoch) -> Option<[f64; WORDS]> {
+    while let Ok((of, q)) = queue.pop() {
+        if of == epoch {
+            return Some(q);
+        }
+    }
+    None
+}

@@ -1,0 +1,241 @@
+//! A receiver's end of the wires between a bus' roots and the gateway.
+
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, Filter};
+use protocol::can::{EXTENDED, Frame, REMOTE};
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::packet;
+use protocol::skin::{Reply, Skin};
+use protocol::time::Micros;
+use protocol::wire::{FLAG, Lane};
+
+use model::network::Uplinks;
+
+/// The wires of a bus' roots, and what is said over them.
+#[derive(Debug)]
+pub struct Roots {
+    uplinks: Uplinks,
+    /// Each root, with the lane on which the gateway speaks to it, and whether its sums are for the gateway.
+    roots: Vec<(CellId, Lane, bool)>,
+    began: Instant,
+    /// Whether the gateway speaks: where it begins before its cells are all there, the first ones make a tree
+    /// that is deeper than it has to be.
+    explores: bool,
+}
+
+/// A bus' roots and the lanes on which the gateway speaks to them; none where cells answer with their own torques.
+fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, Lane)> {
+    let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
+    if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
+}
+
+/// What a gateway receives of a bus.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Ears {
+    /// What its socket lets pass.
+    pub filters: Vec<Filter>,
+    /// Whether sums of cells that are no roots pass.
+    pub all_sums: bool,
+}
+
+impl Ears {
+    /// Everything, but of simulated wires only those that lead to the gateway; and unless `everything` is wanted, of
+    /// sums only those of roots.
+    #[must_use]
+    pub fn of(skin: &Skin, bus: usize, everything: bool) -> Self {
+        let roots = roots(skin, bus);
+        if roots.is_empty() {
+            return Self { filters: vec![Filter::ALL], all_sums: true };
+        }
+        let standard = |id, mask| Filter { id, mask: mask | EXTENDED };
+        let sums_of_roots = || {
+            // All kinds but that of sums, remote frames of any, and each root's.
+            let kinds = [standard(0x000, 0x700), standard(0x200, 0x600), standard(0x400, 0x400)];
+            let remote = Filter { id: REMOTE, mask: EXTENDED | REMOTE };
+            let roots = roots.iter().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(*root))));
+            kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
+        };
+        // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
+        let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
+        let wires = roots.iter().map(|(_, lane)| Filter::lane(lane.reversed()));
+        let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
+        let few = sums_of_roots();
+        let all_sums = everything || few.len() + others.len() > Filter::MAX;
+        let standard = if all_sums { vec![standard(0, 0)] } else { few };
+        Self { filters: standard.into_iter().chain(others).collect(), all_sums }
+    }
+}
+
+impl Roots {
+    /// Those of a bus; `None` where cells answer with their own torques.
+    #[must_use]
+    pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
+        let roots: Vec<_> = roots(skin, bus).into_iter().map(|(root, lane)| (root, lane, false)).collect();
+        // Whoever was there before counted its walks too, and nobody knows how far.
+        let walk = std::process::id().to_le_bytes()[0];
+        (!roots.is_empty()).then(|| Self {
+            uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
+            roots,
+            began: Instant::now(),
+            explores: false,
+        })
+    }
+
+    /// The gateway speaks from now on.
+    pub const fn explore(&mut self) {
+        self.explores = true;
+    }
+
+    /// Roots whose sums are for the gateway now and were not, or the other way round, since the last call.
+    pub fn changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
+        let uplinks = &self.uplinks;
+        self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {
+            let now = uplinks.is_child(place);
+            (core::mem::replace(feeds, now) != now).then_some((*root, now))
+        })
+    }
+
+    fn now(&self) -> Micros {
+        Micros(u64::try_from(self.began.elapsed().as_micros()).unwrap_or(u64::MAX))
+    }
+
+    /// Takes a frame that came from the bus; whether it was one of a wire, which nobody else is to see.
+    pub fn take(&mut self, frame: &Frame) -> bool {
+        let Some(lane) = Lane::from_raw_id(frame.raw_id()) else {
+            if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
+                && let Node::Cell(cell) = Node::from_byte(node)
+            {
+                self.uplinks.claimed(cell);
+            }
+            return false;
+        };
+        let root = self.roots.iter().position(|(_, own, _)| own.reversed() == lane);
+        if let Some((root, message)) =
+            root.filter(|_| self.explores).and_then(|root| Some((root, lane.read(frame)?)))
+        {
+            let now = self.now();
+            self.uplinks.handle(now, root, message);
+        }
+        true
+    }
+
+    /// Says what there is to say.
+    pub fn speak(&mut self, bus: &Bus) {
+        if !self.explores {
+            return;
+        }
+        let now = self.now();
+        self.uplinks.handle_time(now);
+        while let Some((root, message)) = self.uplinks.poll_transmit() {
+            if let Some((_, lane, _)) = self.roots.get(root) {
+                // What the bus does not take is asked for again.
+                let _ = bus.offer(&[lane.frame(message)]);
+            }
+        }
+    }
+
+    /// How long nothing has to be said, if nothing comes.
+    #[must_use]
+    pub fn patience(&self) -> Duration {
+        if !self.explores {
+            return Duration::MAX;
+        }
+        Duration::from_micros(self.uplinks.poll_timeout().since(self.now()).0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::can::Format;
+    use protocol::message::{Message, VERSION};
+    use protocol::packet::Epoch;
+    use protocol::wire::{Hello, Label};
+
+    fn skin(reply: &str) -> Skin {
+        let head = model::testing::SKIN.replace("reply = \"torque\"", reply);
+        let (head, cell) = head.split_at(head.find("[[cell]]").unwrap());
+        let second = cell.replace("node = 1", "node = 2\nneighbors = [1, 0, 0, 0]");
+        let first = cell.replace("node = 1", "node = 1\nroot = true\nneighbors = [2, 0, 0, 0]");
+        Skin::parse("skin.toml", &format!("{head}{first}{second}")).unwrap()
+    }
+
+    fn passes(ears: &Ears, frame: &Frame) -> bool {
+        let id = frame.raw_id();
+        ears.filters.iter().any(|filter| id & filter.mask == filter.id & filter.mask)
+    }
+
+    fn sum(node: i64) -> Frame {
+        let message = Message::Sum {
+            from: CellId::new(node).unwrap(),
+            epoch: Epoch(0),
+            torque: Default::default(),
+            count: 1,
+        };
+        message.encode().frames(Format::Fd).next().unwrap()
+    }
+
+    #[test]
+    fn a_gateway_takes_sums_of_roots_and_its_own_wires_and_all_that_is_no_wire() {
+        let skin = skin("reply = \"sum\"\nslot_us = 1500");
+        // Wire 0 is between the cells, wire 1 is the root's.
+        let wire = |wire, back| Lane { wire, back }.frame(protocol::wire::PortMessage::Join);
+        for everything in [false, true] {
+            let ears = Ears::of(&skin, 0, everything);
+            assert_eq!(ears.all_sums, everything);
+            assert!(passes(&ears, &sum(1)) && passes(&ears, &wire(1, false)));
+            assert_eq!(passes(&ears, &sum(2)), everything);
+            for other in [wire(0, false), wire(0, true), wire(1, true)] {
+                assert!(!passes(&ears, &other), "{other:?}");
+            }
+            for kind in [0, 2, 3, 4, 5, 6, 7] {
+                let frame = Frame::classic(kind << 8 | 2, &[]).unwrap();
+                assert!(passes(&ears, &frame), "kind {kind}");
+            }
+            for foreign in [EXTENDED | 0x0FFF_FFFF, REMOTE | 0x102, EXTENDED | REMOTE | 5] {
+                let frame = if foreign & REMOTE == 0 {
+                    Frame::classic(foreign, &[]).unwrap()
+                } else {
+                    Frame::remote(foreign & !REMOTE, 0).unwrap()
+                };
+                assert!(passes(&ears, &frame), "{foreign:08X}");
+            }
+        }
+        let torque = Ears::of(&self::skin("reply = \"torque\""), 0, false);
+        assert_eq!(torque, Ears { filters: vec![Filter::ALL], all_sums: true });
+    }
+
+    #[test]
+    fn a_roots_question_is_answered_and_other_wires_are_kept_from_the_table() {
+        let skin = skin("reply = \"sum\"\nslot_us = 1500");
+        let mut roots = Roots::of(&skin, 0).unwrap();
+        let leave = Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
+        assert!(roots.take(&leave));
+        assert_eq!(roots.uplinks.poll_transmit(), None, "it does not speak yet");
+        roots.explore();
+        assert!(roots.take(&Lane { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
+        assert_eq!(roots.uplinks.poll_transmit(), None);
+        assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Join)));
+        let answer = roots.uplinks.poll_transmit();
+        assert!(matches!(answer, Some((0, protocol::wire::PortMessage::Grant(_)))), "{answer:?}");
+        let root = CellId::new(1).unwrap();
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [], "a grant may be lost");
+        let hello = Hello {
+            version: VERSION,
+            number: 1,
+            port: 4,
+            hears: true,
+            up: true,
+            unnumbered: false,
+            label: Some(Label { round: 1, depth: 1 }),
+        };
+        assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Hello(hello))));
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
+        assert_eq!(roots.changes().collect::<Vec<_>>(), []);
+        assert!(roots.take(&leave));
+        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, false)]);
+        assert!(!roots.take(&sum(1)));
+        assert!(Roots::of(&self::skin("reply = \"torque\""), 0).is_none());
+    }
+}

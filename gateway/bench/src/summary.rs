@@ -1,0 +1,538 @@
+//! What a run came to: the figures of the table at its end, and of `--summary`.
+//!
+//! The keys of the JSON are the names of the fields here; `docs/summary.md` says what they mean.
+
+use std::collections::BTreeMap;
+
+use protocol::id::Kind;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use serde::Serialize;
+
+pub use self::outcome::{Halted, Outcome, TickBefore};
+use model::quantiles::Quantiles;
+use model::table::{Accuracy, Contributions, Errors, Event, Replies, Status, SumCounts, Table, Uplink};
+pub use trace::recording::account::{Recording, Written};
+
+mod outcome;
+
+/// A whole run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// The skin's name.
+    pub skin: String,
+    /// Cells in it.
+    pub cells: usize,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Why it failed, if it did.
+    pub failure: Option<String>,
+    /// How long the loop ran, in s.
+    pub duration_s: f64,
+    /// Whether it was ended by a signal.
+    pub interrupted: bool,
+    /// Why the robot was halted at the end, if it was.
+    pub halted: Option<String>,
+    /// Each time that it was halted, oldest first.
+    pub halts: Vec<Halted>,
+    /// Halts beyond the first 100 that have ended.
+    pub further_halts: u64,
+    /// The ticks up to the last halt, oldest first.
+    pub before_halt: Vec<TickBefore>,
+    /// From the start of the program to the first broadcast, in s.
+    pub first_broadcast_s: f64,
+    /// The control loop.
+    #[serde(rename = "loop")]
+    pub control: Loop,
+    /// Distributed against central torques.
+    pub accuracy: AccuracySummary,
+    /// Packets of the whole machine, any interface's, that the kernel dropped before they came to a socket,
+    /// because a processor's backlog was full; none where it does not say.
+    pub backlog_dropped: Option<u64>,
+    /// Each bus.
+    pub buses: Vec<BusSummary>,
+    /// Processor time while the loop ran, in cores.
+    pub processor: Processor,
+    /// Private memory of the largest cell process in KiB, if cells were started.
+    pub cell_private_kib: Option<u64>,
+    /// What was recorded, and what did not make it there.
+    pub recording: Option<Recording>,
+}
+
+impl Summary {
+    /// Of a run that failed before any bus was opened.
+    #[must_use]
+    pub fn of_no_run(skin: &Skin, why: String) -> Self {
+        Self {
+            skin: skin.name.clone(),
+            cells: skin.cells.len(),
+            outcome: Outcome::Failed,
+            failure: Some(why),
+            duration_s: 0.0,
+            interrupted: false,
+            halted: None,
+            halts: Vec::new(),
+            further_halts: 0,
+            before_halt: Vec::new(),
+            first_broadcast_s: f64::NAN,
+            control: Loop::default(),
+            accuracy: Accuracy::default().into(),
+            backlog_dropped: None,
+            buses: Vec::new(),
+            processor: Processor::default(),
+            cell_private_kib: None,
+            recording: None,
+        }
+    }
+
+    /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
+    #[must_use]
+    pub fn judged(mut self, failure: Option<String>) -> Self {
+        // A bus that was lost may be why the robot was halted, and the halt says more.
+        let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
+        self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
+        self.outcome = match &self.failure {
+            Some(_) => Outcome::Failed,
+            None if self.halted.is_some() => Outcome::Halted,
+            None if self.interrupted => Outcome::Interrupted,
+            None => Outcome::Done,
+        };
+        self
+    }
+
+    /// What is to be said of its end, a line each and the reason of its exit code last; nothing when all is well.
+    #[must_use]
+    pub fn complaints(&self) -> Vec<String> {
+        // A run that failed has said which bus was lost.
+        let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
+        let lost = self.lost_buses().filter(|_| came_to_its_end);
+        let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
+            let Halted { at_s, epoch, reason, .. } = halted;
+            format!(
+                "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary FILE keeps \
+                 the ticks before it"
+            )
+        });
+        [lost, halted, self.failure.clone()].into_iter().flatten().collect()
+    }
+
+    fn lost_buses(&self) -> Option<String> {
+        let lost: Vec<_> = self.buses.iter().filter(|bus| bus.outages.at_end).collect();
+        let names = || lost.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        (!lost.is_empty()).then(|| format!("lost at the end of the run: {}", names()))
+    }
+
+    fn lost_frames(&self) -> Option<String> {
+        let Recording { errors, lost_write, .. } = self.recording.as_ref()?;
+        let first = errors.first().map_or("", String::as_str);
+        (!errors.is_empty() || *lost_write > 0)
+            .then(|| format!("the recording is not whole, {lost_write} frames were not written: {first}"))
+    }
+}
+
+/// The control loop.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Loop {
+    /// Ticks that happened.
+    pub ticks: u64,
+    /// Ticks that were skipped because the machine was not there in time.
+    pub ticks_skipped: u64,
+    /// Broadcasts sent.
+    pub broadcasts: u64,
+    /// Broadcasts skipped with their ticks.
+    pub broadcasts_skipped: u64,
+    /// Bad cycles, by reason.
+    pub bad_cycles: BTreeMap<String, u64>,
+    /// What an external controller's datagrams came to, by name; empty for other controllers.
+    pub controller: BTreeMap<String, u64>,
+    /// How late ticks began.
+    pub late_us: Quantiles,
+    /// How late the same machine wakes a thread when nothing else runs.
+    pub idle_late_us: Quantiles,
+    /// How long a tick took.
+    pub took_us: Quantiles,
+    /// How long the central computation took of that, in ticks that compared.
+    pub central_us: Quantiles,
+    /// How long a tick took in ticks that did not compare.
+    pub took_distributed_us: Quantiles,
+    /// Whether the machine granted SCHED_FIFO.
+    pub fifo: bool,
+    /// Whether it locked the memory.
+    pub memory_locked: bool,
+    /// Records of ticks that did not fit into their queue.
+    pub records_lost: u64,
+    /// Frames that a bus did not take.
+    pub unsent: u64,
+}
+
+/// Some errors, in Nm.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ErrorsSummary {
+    /// Mean absolute error; none when nothing was compared.
+    pub mean_nm: Option<f64>,
+    /// Greatest absolute error.
+    pub max_nm: f64,
+    /// Torques compared.
+    pub count: u64,
+}
+
+impl From<Errors> for ErrorsSummary {
+    fn from(errors: Errors) -> Self {
+        Self { mean_nm: errors.mean(), max_nm: errors.max(), count: errors.count() }
+    }
+}
+
+/// Distributed against central torques.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct AccuracySummary {
+    /// Single cells over loaded joints, on the same words.
+    pub single: ErrorsSummary,
+    /// Single cells over loaded joints, against unrounded angles, lengths and poses.
+    pub unquantised: ErrorsSummary,
+    /// The whole skin's torque, in epochs that all answered in time.
+    pub whole: ErrorsSummary,
+    /// A whole bus' torque that came as sums, over loaded joints, in epochs whose sums were complete in time.
+    pub sums: ErrorsSummary,
+    /// The same, averaged over 32 epochs in a row in which every cell felt the same.
+    pub sums_averaged: ErrorsSummary,
+    /// Words left out because they were saturated.
+    pub saturated: u64,
+}
+
+impl From<Accuracy> for AccuracySummary {
+    fn from(accuracy: Accuracy) -> Self {
+        let Accuracy { single, unquantised, whole, sums, sums_averaged, saturated, .. } = accuracy;
+        Self {
+            single: single.into(),
+            unquantised: unquantised.into(),
+            whole: whole.into(),
+            sums: sums.into(),
+            sums_averaged: sums_averaged.into(),
+            saturated,
+        }
+    }
+}
+
+/// Processor time while the loop ran, in cores.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Processor {
+    /// This program.
+    pub gateway: f64,
+    /// All cells together.
+    pub cells: f64,
+    /// Embedded buses.
+    pub buses: f64,
+}
+
+/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + unknown.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct UplinkSummary {
+    /// Sent, by the cells' own count, as of their last heartbeats.
+    pub sent: u64,
+    /// Arrived and understood.
+    pub delivered: u64,
+    /// Arrived and refused.
+    pub rejected: u64,
+    /// Sums for another cell, which this gateway did not take.
+    pub unheard: u64,
+    /// Sent and not arrived, because the bus dropped frames that we did not take in time.
+    pub dropped: u64,
+    /// Sent and not arrived, as far as drops of the kernel's backlog explain it.
+    pub backlog: u64,
+    /// Sent and not arrived, while the bus was lost.
+    pub outage: u64,
+    /// Sent and not arrived, and nobody knows why.
+    pub unknown: u64,
+    /// Arrived more often than sent.
+    pub surplus: u64,
+    /// Arrived of what a cell sent after its last heartbeat before it started anew: what else it sent then,
+    /// nobody knows.
+    pub in_doubt: u64,
+    /// Arrived after a cell's last heartbeat, which nothing can be compared with.
+    pub unsettled: u64,
+    /// Cells that started anew.
+    pub restarts: u32,
+}
+
+impl UplinkSummary {
+    /// Takes what is unknown for drops of the kernel's backlog, at most so many; how many it took.
+    pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
+        let explained = self.unknown.min(at_most);
+        self.unknown -= explained;
+        self.backlog += explained;
+        explained
+    }
+}
+
+/// Replies: due = in time + late + missing; missing = too late + skipped + not heard + lost + in doubt + unknown.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct RepliesSummary {
+    /// Epochs that cells had to answer.
+    pub due: u64,
+    /// Answered before the next broadcast.
+    pub in_time: u64,
+    /// Answered after it.
+    pub late: u64,
+    /// Dropped, because they came when their epoch was long over.
+    pub too_late: u64,
+    /// Skipped by the cell, because the joints were older than a period when it got to them.
+    pub skipped: u64,
+    /// Not heard by the cell.
+    pub not_heard: u64,
+    /// Sent by the cell and lost or damaged on the way.
+    pub lost: u64,
+    /// Of cells that were dead or started anew, or whose bus was lost.
+    pub in_doubt: u64,
+    /// Missing, and nobody knows why.
+    pub unknown: u64,
+    /// Torques that nobody waited for: ends of contacts, and cells whose sensors are unknown.
+    pub unasked: u64,
+}
+
+/// Sums along the cells' tree: received = first + resent + overheard + stale.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct SumsSummary {
+    /// Cells that are wired to the gateway's side.
+    pub roots: usize,
+    /// Sums that came.
+    pub received: u64,
+    /// A root's first one for an epoch.
+    pub first: u64,
+    /// A root's further ones for an epoch.
+    pub resent: u64,
+    /// Of cells that are no roots.
+    pub overheard: u64,
+    /// Of epochs that had passed.
+    pub stale: u64,
+    /// Cells that were to be in sums, and were: due = in time + late + missing.
+    pub contributions: ContributionsSummary,
+}
+
+/// Cells in sums: due = in time + late + missing.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct ContributionsSummary {
+    /// That were to be in an epoch's sums.
+    pub due: u64,
+    /// In them before the next joints.
+    pub in_time: u64,
+    /// In them after that.
+    pub late: u64,
+    /// Not in them.
+    pub missing: u64,
+    /// In them and not due.
+    pub unasked: u64,
+}
+
+/// How often a bus was lost, and for how long.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct OutagesSummary {
+    /// How often.
+    pub times: u64,
+    /// For how long in all, in s: from when it was noticed to the first frame after it.
+    pub lost_s: f64,
+    /// Whether it was lost at the end.
+    pub at_end: bool,
+    /// Ticks that had to do without it.
+    pub ticks: u64,
+}
+
+/// The network of a bus' cells.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct NetworkSummary {
+    /// From the time when all cells were ready until all had a way to a root, in s; none when some never had.
+    pub organised_s: Option<f64>,
+    /// The depth of the deepest cell that there was a slot for; a root's is 0.
+    pub deepest: u8,
+    /// What was different from the description at the start.
+    pub differences: Vec<String>,
+    /// Cells that spoke and had no way to a root at the end.
+    pub without_way: Vec<u8>,
+    /// The longest time that a cell spoke and had none while the loop ran, in s.
+    pub longest_without_way_s: f64,
+    /// How often a cell's parent changed, by the cells' own count.
+    pub parent_changes: u64,
+}
+
+/// What the cells of a bus told of what they feel.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct SensorsSummary {
+    /// Frames, of either page.
+    pub frames: u64,
+    /// Touches in them.
+    pub touches: u64,
+    /// Releases in them.
+    pub releases: u64,
+    /// Frames a second of the cell with the fewest, of those that sent at least two.
+    pub least_hz: Option<f64>,
+    /// The mean over these cells.
+    pub mean_hz: Option<f64>,
+    /// Of the cell with the most.
+    pub greatest_hz: Option<f64>,
+}
+
+/// One bus.
+#[derive(Clone, Debug, Serialize)]
+pub struct BusSummary {
+    /// Its name.
+    pub name: String,
+    /// socketcan or embedded.
+    pub kind: String,
+    /// Bytes that the socket may hold.
+    pub receive_buffer: usize,
+    /// How often it was lost.
+    pub outages: OutagesSummary,
+    /// Cells by status at the end.
+    pub cells: BTreeMap<&'static str, usize>,
+    /// Cells that were dead or never heard at the end.
+    pub silent_cells: Vec<u8>,
+    /// Packets from the cells.
+    pub uplink: UplinkSummary,
+    /// Replies of cells that answer themselves.
+    pub replies: RepliesSummary,
+    /// Sums, where cells answer with them.
+    pub sums: Option<SumsSummary>,
+    /// The network that they go along.
+    pub network: Option<NetworkSummary>,
+    /// What cells told of what they feel.
+    pub sensors: SensorsSummary,
+    /// Epochs that somebody had to answer, and those that everybody answered in time.
+    pub epochs_due: u64,
+    /// See above.
+    pub epochs_complete: u64,
+    /// Packets by kind, received from others.
+    pub received: BTreeMap<&'static str, u64>,
+    /// Packets by kind, sent by this gateway as read back from the bus.
+    pub sent: BTreeMap<&'static str, u64>,
+    /// What was odd, by reason; zeros are left out.
+    pub events: BTreeMap<&'static str, u64>,
+    /// Frames that the bus dropped because we did not take them in time.
+    pub dropped_by_bus: u64,
+    /// From a broadcast to its last reply in time, by the kernel's time stamps.
+    pub last_reply_us: Quantiles,
+}
+
+impl BusSummary {
+    /// The figures of a bus whose run is over.
+    #[must_use]
+    pub fn new(
+        name: &str,
+        kind: &str,
+        receive_buffer: usize,
+        table: &Table,
+        dropped: u64,
+        now: Micros,
+    ) -> Self {
+        let mut cells = BTreeMap::new();
+        let mut silent_cells = Vec::new();
+        for (cell, status) in table.statuses(now) {
+            *cells.entry(status.name()).or_default() += 1;
+            if matches!(status, Status::Dead | Status::Unknown) {
+                silent_cells.push(cell.node.get());
+            }
+        }
+        let counters = table.counters();
+        let kinds = |count: &dyn Fn(Kind) -> u64| {
+            Kind::ALL
+                .into_iter()
+                .map(|kind| (kind.name(), count(kind)))
+                .filter(|(_, count)| *count > 0)
+                .collect()
+        };
+        let events = Event::ALL.into_iter().map(|event| (event.name(), counters.events(event)));
+        Self {
+            name: name.to_owned(),
+            kind: kind.to_owned(),
+            receive_buffer,
+            outages: OutagesSummary::default(),
+            cells,
+            silent_cells,
+            uplink: uplink(table, dropped),
+            replies: replies(table),
+            sums: sums(table),
+            network: None,
+            sensors: sensors(table),
+            epochs_due: counters.epochs_due,
+            epochs_complete: counters.epochs_complete,
+            received: kinds(&|kind| counters.received(kind)),
+            sent: kinds(&|kind| counters.sent(kind)),
+            events: events.filter(|(_, count)| *count > 0).collect(),
+            dropped_by_bus: dropped,
+            last_reply_us: Quantiles::of(table.last_reply(), 1.0),
+        }
+    }
+}
+
+fn sensors(table: &Table) -> SensorsSummary {
+    let told = || table.cells().iter().map(|cell| cell.sensed);
+    let rates: Vec<f64> = told().filter_map(|sensed| sensed.rate_hz()).collect();
+    let cells = u32::try_from(rates.len()).ok().filter(|&cells| cells > 0);
+    SensorsSummary {
+        frames: told().map(|sensed| sensed.frames).sum(),
+        touches: told().map(|sensed| sensed.touches).sum(),
+        releases: told().map(|sensed| sensed.releases).sum(),
+        least_hz: rates.iter().copied().reduce(f64::min),
+        mean_hz: cells.map(|cells| rates.iter().sum::<f64>() / f64::from(cells)),
+        greatest_hz: rates.iter().copied().reduce(f64::max),
+    }
+}
+
+fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
+    let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink));
+    let unexplained = total.lost - total.outage;
+    let dropped = unexplained.min(dropped_by_bus);
+    UplinkSummary {
+        sent: total.sent,
+        delivered: total.delivered,
+        rejected: total.rejected,
+        unheard: total.unheard,
+        dropped,
+        backlog: 0,
+        outage: total.outage,
+        unknown: unexplained - dropped,
+        surplus: total.surplus,
+        in_doubt: total.in_doubt,
+        unsettled: total.unsettled(),
+        restarts: total.restarts,
+    }
+}
+
+fn sums(table: &Table) -> Option<SumsSummary> {
+    let (counts, contributions) = table.sums()?;
+    let SumCounts { received, first, resent, overheard, stale } = counts;
+    let Contributions { due, in_time, late, missing, unasked } = contributions;
+    Some(SumsSummary {
+        roots: table.cells().iter().filter(|cell| cell.root).count(),
+        received,
+        first,
+        resent,
+        overheard,
+        stale,
+        contributions: ContributionsSummary { due, in_time, late, missing, unasked },
+    })
+}
+
+/// Finds for each cell's missing replies what is known to have become of them.
+fn replies(table: &Table) -> RepliesSummary {
+    let mut summary = RepliesSummary::default();
+    for cell in table.cells() {
+        let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
+        let mut rest = missing.saturating_sub(in_doubt);
+        let mut explain = |count: u64| {
+            let explained = rest.min(count);
+            rest -= explained;
+            explained
+        };
+        let (skipped, not_heard) = cell.unanswered().unwrap_or((0, 0));
+        summary.due += due;
+        summary.in_time += in_time;
+        summary.late += late;
+        summary.too_late += explain(too_late);
+        summary.skipped += explain(skipped);
+        summary.not_heard += explain(not_heard);
+        summary.lost += explain(cell.uplink.lost + cell.uplink.rejected);
+        summary.in_doubt += in_doubt;
+        summary.unknown += rest;
+        summary.unasked += unasked;
+    }
+    summary
+}

@@ -1,0 +1,354 @@
+//! What turns torques into motion, once a tick.
+//!
+//! ```text
+//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─> Step::Move(joint velocities)
+//!                                                                └─> Step::Bad(why)
+//! ```
+//!
+//! [`Kinesthetic`] lets the arm give way to who pushes it. [`Hold`] and [`Sine`] are motions of a
+//! scenario that do not listen to torques. [`crate::external::External`] asks another program.
+
+use core::f64::consts::TAU;
+
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{ControllerKind, Skin};
+use protocol::time::Micros;
+use thiserror::Error;
+
+/// What a controller is told in a tick. Joints that the robot does not have are zero.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Input {
+    /// The number of the tick.
+    pub tick: u64,
+    /// When it began, since the run's start.
+    pub time: Micros,
+    /// Joint positions in rad.
+    pub q: [f64; MAX_JOINTS],
+    /// Joint velocities in rad/s.
+    pub qdot: [f64; MAX_JOINTS],
+    /// The skin's torque in Nm.
+    pub torque: [f64; MAX_JOINTS],
+    /// Epochs since the oldest contribution to the torque.
+    pub age: u32,
+    /// Cells that contribute to the torque.
+    pub contributing: u32,
+    /// Whether the torque may be used.
+    pub valid: bool,
+    /// Buses that are lost, whose cells are not in the torque, or fade from it: bit n is bus n of the skin, bit 31
+    /// stands for all from there on.
+    pub missing: u32,
+    /// Whether the robot is halted: nothing that a controller asks for is done.
+    pub halted: bool,
+}
+
+/// What a controller answers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Step {
+    /// Joint velocities in rad/s until the next tick; finite, and within the limits of speed.
+    Move([f64; MAX_JOINTS]),
+    /// It has no answer: a bad cycle. What the robot then does is the caller's to decide.
+    Bad(BadCycle),
+}
+
+/// Why a cycle is bad.
+#[derive(Clone, Copy, Debug, Eq, Error, Hash, Ord, PartialEq, PartialOrd)]
+pub enum BadCycle {
+    /// The torque must not be used, or is not a number.
+    #[error("the torque is not valid")]
+    Torque,
+    /// An external controller has not yet said hello, or has gone.
+    #[error("no external controller is connected")]
+    NoPeer,
+    /// An external controller's answer to the last tick is not there.
+    #[error("the external controller's answer is missing")]
+    NoAnswer,
+    /// An external controller sent something that is no answer.
+    #[error("the external controller sent nonsense")]
+    Nonsense,
+}
+
+/// Turns torques into joint velocities.
+pub trait Controller: Send {
+    /// One tick. Must not block, allocate, lock or log.
+    fn step(&mut self, input: &Input) -> Step;
+
+    /// What it has counted, with names for people: for the end of a run, not for the tick.
+    fn counts(&self) -> Vec<(String, u64)> {
+        Vec::new()
+    }
+}
+
+/// `M q'' + D q' = tau`, joint by joint.
+///
+/// It has no state of its own: it starts from the velocity that the robot reports, so that a joint
+/// which stands at its limit, or a robot that was halted, begins from rest.
+///
+/// Integrated exactly for a torque that is constant over the tick, which is stable whatever M, D and
+/// the tick are: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Kinesthetic {
+    joints: [Admittance; MAX_JOINTS],
+}
+
+/// One joint.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Admittance {
+    /// 1/D in rad/s per Nm.
+    mobility: f64,
+    /// What is left of a velocity after a tick: `e^(-D/M T)`.
+    keep: f64,
+    max_speed: f64,
+}
+
+impl Kinesthetic {
+    /// The controller that the skin describes; `None` when that is another kind.
+    #[must_use]
+    pub fn new(skin: &Skin) -> Option<Self> {
+        match &skin.controller.kind {
+            ControllerKind::Kinesthetic { inertia, damping } => Some(Self::with(skin, inertia, damping)),
+            ControllerKind::External { .. } => None,
+        }
+    }
+
+    pub(crate) fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
+        let tick = 1.0 / skin.timing.control_hz;
+        let mut joints = [Admittance::default(); MAX_JOINTS];
+        let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed_rad_s);
+        for (joint, ((inertia, damping), &max_speed)) in joints.iter_mut().zip(given) {
+            *joint =
+                Admittance { mobility: damping.recip(), keep: (-damping / inertia * tick).exp(), max_speed };
+        }
+        Self { joints }
+    }
+}
+
+impl Controller for Kinesthetic {
+    fn step(&mut self, input: &Input) -> Step {
+        if input.halted {
+            return Step::Move([0.0; MAX_JOINTS]);
+        }
+        if !input.valid || !input.torque.iter().chain(&input.qdot).all(|value| value.is_finite()) {
+            return Step::Bad(BadCycle::Torque);
+        }
+        let mut velocity = input.qdot;
+        for ((velocity, torque), joint) in velocity.iter_mut().zip(input.torque).zip(&self.joints) {
+            // Held finite, or the difference below would be none.
+            let settled = (torque * joint.mobility).clamp(f64::MIN, f64::MAX);
+            let next = settled + (*velocity - settled) * joint.keep;
+            *velocity = next.clamp(-joint.max_speed, joint.max_speed);
+        }
+        Step::Move(velocity)
+    }
+}
+
+/// Goes to a position, as quickly as the joints may, and stays there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hold {
+    at: [f64; MAX_JOINTS],
+    pace: Pace,
+}
+
+impl Hold {
+    /// Holds `at`, in rad.
+    #[must_use]
+    pub fn new(skin: &Skin, at: [f64; MAX_JOINTS]) -> Self {
+        Self { at, pace: Pace::of(skin) }
+    }
+}
+
+impl Controller for Hold {
+    fn step(&mut self, input: &Input) -> Step {
+        Step::Move(self.pace.towards(&self.at, input))
+    }
+}
+
+/// Swings every joint about a position: `start + amplitude sin(2 pi t / period)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sine {
+    start: [f64; MAX_JOINTS],
+    amplitude: [f64; MAX_JOINTS],
+    period_s: f64,
+    pace: Pace,
+}
+
+impl Sine {
+    /// Swings about `start` by `amplitude`, both in rad, once in `period_s`.
+    #[must_use]
+    pub fn new(skin: &Skin, start: [f64; MAX_JOINTS], amplitude: [f64; MAX_JOINTS], period_s: f64) -> Self {
+        Self { start, amplitude, period_s, pace: Pace::of(skin) }
+    }
+
+    /// Where it is `seconds` after the run's start, in rad.
+    #[must_use]
+    pub fn at(&self, seconds: f64) -> [f64; MAX_JOINTS] {
+        let swing = (TAU * seconds / self.period_s).sin();
+        let mut at = self.start;
+        for (at, amplitude) in at.iter_mut().zip(self.amplitude) {
+            *at += amplitude * swing;
+        }
+        at
+    }
+}
+
+impl Controller for Sine {
+    /// Aims at where it has to be when the next tick begins, so that it neither lags nor drifts.
+    fn step(&mut self, input: &Input) -> Step {
+        let next = self.at(seconds(input.time) + self.pace.tick);
+        Step::Move(self.pace.towards(&next, input))
+    }
+}
+
+/// How quickly joints may go, and how long a tick is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Pace {
+    /// Length of a tick in s.
+    tick: f64,
+    max_speed: [f64; MAX_JOINTS],
+}
+
+impl Pace {
+    pub(crate) fn of(skin: &Skin) -> Self {
+        let mut max_speed = [0.0; MAX_JOINTS];
+        for (max_speed, given) in max_speed.iter_mut().zip(&skin.controller.max_speed_rad_s) {
+            *max_speed = *given;
+        }
+        Self { tick: 1.0 / skin.timing.control_hz, max_speed }
+    }
+
+    /// The velocities that bring the robot to `goal` by the next tick, as far as speed allows; none
+    /// while it is halted.
+    pub(crate) fn towards(&self, goal: &[f64; MAX_JOINTS], input: &Input) -> [f64; MAX_JOINTS] {
+        let mut velocity = *goal;
+        for (velocity, q) in velocity.iter_mut().zip(input.q) {
+            *velocity = (*velocity - q) / self.tick;
+        }
+        self.limited(velocity, input)
+    }
+
+    /// The velocities, held within the limits of speed; none while the robot is halted.
+    pub(crate) fn limited(&self, mut velocity: [f64; MAX_JOINTS], input: &Input) -> [f64; MAX_JOINTS] {
+        for (velocity, max_speed) in velocity.iter_mut().zip(self.max_speed) {
+            *velocity = if input.halted { 0.0 } else { velocity.clamp(-max_speed, max_speed) };
+        }
+        velocity
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+fn seconds(time: Micros) -> f64 {
+    time.0 as f64 * 1e-6
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
+mod tests {
+    use super::*;
+    use crate::robot::{Robot, SimulatedArm};
+    use model::testing::skin;
+    use proptest::prelude::*;
+
+    const TICK: f64 = 0.002;
+
+    fn kinesthetic() -> Kinesthetic {
+        Kinesthetic::new(&skin()).unwrap()
+    }
+
+    fn moved(step: Step) -> [f64; MAX_JOINTS] {
+        match step {
+            Step::Move(velocity) => velocity,
+            Step::Bad(why) => panic!("{why}"),
+        }
+    }
+
+    fn pushed(torque: [f64; MAX_JOINTS]) -> Input {
+        Input { torque, valid: true, ..Input::default() }
+    }
+
+    /// Runs the controller on a simulated arm and returns where it ends.
+    fn run(controller: &mut impl Controller, start: [f64; 6], ticks: u64, torque: [f64; 6]) -> SimulatedArm {
+        let mut arm = SimulatedArm::new(&skin(), start);
+        for tick in 0..ticks {
+            let (q, qdot) = (arm.positions(), arm.velocities());
+            let input = Input { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(torque) };
+            arm.step(&moved(controller.step(&input)), TICK);
+        }
+        arm
+    }
+
+    #[test]
+    fn a_constant_torque_gives_the_exact_velocity() {
+        let mut controller = kinesthetic();
+        let arm = run(&mut controller, [0.0; 6], 250, [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]);
+        // M = 1, D = 4, so after half a second v = tau/D (1 - e^-2).
+        let wanted = 0.5 * (1.0 - (-2.0_f64).exp());
+        let [v1, v2, v3, ..] = arm.velocities();
+        assert!((v1 - wanted).abs() < 1e-12 && (v2 + wanted / 2.0).abs() < 1e-12 && v3.abs() < 1e-12);
+        // The position is a sum of the velocities at the ticks' ends: at most a tick ahead.
+        let exact = 0.5 * (0.5 - 0.25 * (1.0 - (-2.0_f64).exp()));
+        assert!((arm.positions()[0] - exact).abs() < wanted * TICK);
+    }
+
+    #[test]
+    fn without_torque_the_arm_comes_to_rest() {
+        let mut controller = kinesthetic();
+        let input = Input { qdot: [1.0; 6], ..pushed([0.0; 6]) };
+        for velocity in moved(controller.step(&input)) {
+            assert!(velocity > 0.99 && velocity < 1.0);
+        }
+    }
+
+    #[test]
+    fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
+        let mut controller = kinesthetic();
+        assert_eq!(controller.step(&Input::default()), Step::Bad(BadCycle::Torque));
+        assert_eq!(controller.step(&pushed([f64::NAN; 6])), Step::Bad(BadCycle::Torque));
+        let halted = Input { halted: true, qdot: [1.0; 6], ..pushed([5.0; 6]) };
+        assert_eq!(controller.step(&halted), Step::Move([0.0; 6]));
+    }
+
+    #[test]
+    fn hold_stays_and_returns_no_quicker_than_it_may() {
+        let at = [0.1, -0.2, 0.3, 0.0, 0.0, 0.0];
+        let mut hold = Hold::new(&skin(), at);
+        assert_eq!(moved(hold.step(&Input { q: at, ..Input::default() })), [0.0; 6]);
+        assert_eq!(moved(hold.step(&Input::default()))[..3], [2.0, -2.0, 2.0]);
+        let arm = run(&mut hold, [0.0; 6], 200, [50.0; 6]);
+        for (got, wanted) in arm.positions().iter().zip(at) {
+            assert!((got - wanted).abs() < 1e-12, "torques do not move it");
+        }
+    }
+
+    #[test]
+    fn sine_is_where_it_should_be_at_every_tick() {
+        let start = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
+        let mut sine = Sine::new(&skin(), start, [0.2, 0.1, 0.0, 0.0, 0.0, 0.3], 4.0);
+        for ticks in [1_u32, 7, 500, 4_321] {
+            let arm = run(&mut sine, start, ticks.into(), [0.0; 6]);
+            let wanted = sine.at(f64::from(ticks) * TICK);
+            for (got, wanted) in arm.positions().iter().zip(wanted) {
+                assert!((got - wanted).abs() < 1e-9, "after {ticks} ticks {got} is not {wanted}");
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn no_torque_makes_it_quicker_than_it_may_or_unstable(
+            torque in any::<[f64; 6]>(), qdot in proptest::array::uniform6(-5.0..5.0),
+        ) {
+            let mut controller = kinesthetic();
+            let input = Input { qdot, ..pushed(torque) };
+            match controller.step(&input) {
+                Step::Bad(why) => {
+                    prop_assert_eq!(why, BadCycle::Torque);
+                    prop_assert!(torque.iter().any(|torque| !torque.is_finite()));
+                }
+                Step::Move(velocity) => {
+                    for (velocity, limit) in velocity.iter().zip([2.0, 2.0, 2.0, 3.0, 3.0, 3.0]) {
+                        prop_assert!(velocity.abs() <= limit, "{}", velocity);
+                    }
+                }
+            }
+        }
+    }
+}

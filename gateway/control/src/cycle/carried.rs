@@ -1,0 +1,62 @@
+//! What of a bus' torque counts in a tick.
+//!
+//! Torques are let go by the broadcasts that a bus carries. On one that carries none nothing would ever be let go, so
+//! the loop itself does it, by the same rule as for a cell that is silent: held for some epochs, then less and less.
+
+use protocol::packet::Epoch;
+use protocol::skin::Safety;
+
+use model::table::Sums;
+
+/// One bus, as a tick is told of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Heard<'a> {
+    /// What its table knows.
+    pub sums: &'a Sums,
+    /// Whether it works, as its receiver sees it.
+    pub works: bool,
+}
+
+/// The bit that stands for a bus in a mask of buses.
+#[must_use]
+pub fn bit(bus: usize) -> u32 {
+    1 << bus.min(31)
+}
+
+/// How far a bus has carried the broadcasts.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Carried {
+    /// The last one that was read back.
+    last: Option<Epoch>,
+    /// Its number, from 1.
+    number: u64,
+}
+
+impl Carried {
+    /// Broadcasts that should have been read back and were not, when `last` is the last one that was, and `epoch` the
+    /// newest of `broadcasts`. The newest one may still be on its way.
+    pub(super) fn missed(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
+        // Epochs come round again, so they are compared once, when they are new.
+        if let Some(read) = last.filter(|_| last != self.last) {
+            self.number = broadcasts.saturating_sub(u64::try_from(epoch.since(read)).unwrap_or(0));
+            self.last = last;
+        }
+        broadcasts.saturating_sub(self.number + 1)
+    }
+}
+
+/// The part of the last torque that still counts.
+pub(super) fn part(missed: u64, safety: &Safety) -> f64 {
+    let hold = u64::from(safety.hold_epochs);
+    if missed <= hold {
+        return 1.0;
+    }
+    let over = u32::try_from(missed - hold).unwrap_or(u32::MAX);
+    let left = safety.decay_epochs.saturating_sub(over);
+    if left == 0 { 0.0 } else { f64::from(left) / f64::from(safety.decay_epochs) }
+}
+
+/// Whether a bus that has missed so many broadcasts carries nothing any more.
+pub(super) fn is_lost(missed: u64, safety: &Safety) -> bool {
+    missed > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
+}

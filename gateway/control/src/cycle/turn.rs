@@ -1,0 +1,247 @@
+//! What happens in one tick outside the pure cycle: reading what the receivers left, encoding, sending,
+//! and handing a record on. Nothing here allocates, locks, logs or waits.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use protocol::can::{Format, Frame};
+use protocol::id::Command;
+use protocol::message::Message;
+use protocol::packet::{Epoch, Packet, WORDS};
+
+use crate::cycle::carried::Heard;
+use crate::cycle::{Cycle, Record, Tick};
+use model::central::Felt;
+use model::scenario::{Mode, Scenario};
+use model::table::Snapshot;
+
+/// While the robot is halted, cells are told again before every so many joints.
+const HALT_AGAIN: u8 = 8;
+
+/// What all threads of a run look at.
+#[derive(Debug, Default)]
+pub struct Shared {
+    /// Set once: the loop ends.
+    pub stop_loop: AtomicBool,
+    /// Set once, after the loop's end: the receivers end.
+    pub stop: AtomicBool,
+    /// Set once, when all cells are there: the gateway speaks to roots.
+    pub explore: AtomicBool,
+    /// Whether torques are compared with central ones.
+    pub comparing: AtomicBool,
+    /// Broadcasts sent so far.
+    pub broadcasts: AtomicU64,
+    /// Records that did not fit into their queue.
+    pub records_lost: AtomicU64,
+    /// Records that did not fit into the queue to the recorder.
+    pub records_unrecorded: AtomicU64,
+    /// Broadcasts that were skipped with their ticks.
+    pub broadcasts_skipped: AtomicU64,
+    /// Frames that a bus did not take.
+    pub unsent: AtomicU64,
+}
+
+/// A record and its times.
+#[derive(Clone, Copy, Debug)]
+pub struct Timed {
+    /// What the tick was like.
+    pub record: Record,
+    /// When it should have begun, in ns of the monotonic clock.
+    pub due_ns: u64,
+    /// How long after that it began, in ns.
+    pub late_ns: u64,
+    /// How long it took, in ns.
+    pub took_ns: u64,
+    /// How long the central computation took of that, in ns, and its result.
+    pub central: Option<(u64, Felt)>,
+}
+
+/// One bus, as a tick sees it.
+#[derive(Debug)]
+pub struct Line {
+    /// One FD frame a packet, or two classic ones.
+    pub format: Format,
+    /// What the receiver left.
+    pub snapshot: triple_buffer::Output<Snapshot>,
+    /// Positions in rad of each broadcast, for the receiver to compare with.
+    pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
+    /// Whether the bus works, as the receiver sees it.
+    pub works: Arc<AtomicBool>,
+    /// Commands that the bus took, joints among them.
+    pub commands: Arc<AtomicU64>,
+    /// Set when cells are back on the bus after it was lost.
+    pub returned: Arc<AtomicBool>,
+}
+
+/// The control loop between two looks at the clock.
+#[derive(Debug)]
+pub struct Turn {
+    cycle: Cycle,
+    lines: Vec<Line>,
+    scenario: Arc<Scenario>,
+    shared: Arc<Shared>,
+    records: rtrb::Producer<Timed>,
+    /// The same for the recorder, if there is one.
+    recorded: Option<rtrb::Producer<Timed>>,
+    /// The halt or resume that each bus has not taken yet: its cells would else not be as the robot is.
+    owed: Vec<Option<Message>>,
+    /// Whether each bus worked in the tick before.
+    worked: Vec<bool>,
+}
+
+impl Turn {
+    /// A loop over some buses that has not begun.
+    #[must_use]
+    pub fn new(
+        cycle: Cycle,
+        lines: Vec<Line>,
+        scenario: Arc<Scenario>,
+        shared: Arc<Shared>,
+        records: rtrb::Producer<Timed>,
+    ) -> Self {
+        let (owed, worked) = (vec![None; lines.len()], vec![true; lines.len()]);
+        Self { cycle, lines, scenario, shared, records, recorded: None, owed, worked }
+    }
+
+    /// Hands every tick to a recorder too.
+    #[must_use]
+    pub fn recorded(mut self, queue: Option<rtrb::Producer<Timed>>) -> Self {
+        self.recorded = queue;
+        self
+    }
+
+    /// What the controller has counted, by name.
+    #[must_use]
+    pub fn counts(&self) -> Vec<(String, u64)> {
+        self.cycle.counts()
+    }
+
+    /// One tick. `now` is a monotonic clock in ns, `due` when the tick should have begun by it; `send`
+    /// puts frames on the bus of an index and says whether it took them.
+    pub fn turn(
+        &mut self,
+        tick: Tick,
+        skipped: u64,
+        due: u64,
+        now: impl Fn() -> u64,
+        mut send: impl FnMut(usize, &[Frame]) -> bool,
+    ) {
+        let began = now();
+        let mode = self.scenario.mode_at(tick.time);
+        self.shared.comparing.store(mode == Mode::Compare, Ordering::Relaxed);
+        for line in &mut self.lines {
+            line.snapshot.update();
+        }
+        let snapshots = || self.lines.iter().map(|line| line.snapshot.output_buffer());
+        let heard = self.lines.iter().map(|line| Heard {
+            sums: &line.snapshot.output_buffer().sums,
+            works: line.works.load(Ordering::Relaxed),
+        });
+        let outcome = self.cycle.tick(tick, skipped, heard);
+        let central = (mode == Mode::Compare).then(|| {
+            let before = now();
+            let felt = self.cycle.central(snapshots());
+            // Nobody else needs the result, and without anybody the compiler could leave out the work.
+            (now().saturating_sub(before), std::hint::black_box(felt))
+        });
+        self.owe_to_returned_buses(outcome.record.halted.is_some());
+        if let Some((epoch, joints)) = outcome.joints {
+            // A cell that started anew, or did not hear it, would go on answering.
+            if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
+                self.owed.fill(Some(Message::Halt));
+            }
+            self.say_what_is_owed(&mut send);
+            for line in &mut self.lines {
+                // A full queue costs the receiver the unrounded positions, and nothing else.
+                let _ = line.positions.push((epoch, outcome.record.q));
+            }
+            self.say(&Message::Joints { epoch, joints }, &mut send);
+            self.shared.broadcasts.fetch_add(1, Ordering::Release);
+            self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
+        }
+        match outcome.command {
+            Some(Command::Halt) => self.command(Message::Halt, &mut send),
+            Some(Command::Resume) => self.command(Message::Resume, &mut send),
+            Some(Command::Joints | Command::Sync | Command::Report) | None => {}
+        }
+        let timed = Timed {
+            record: outcome.record,
+            due_ns: due,
+            late_ns: began.saturating_sub(due),
+            took_ns: now().saturating_sub(began),
+            central,
+        };
+        if self.records.push(timed).is_err() {
+            self.shared.records_lost.fetch_add(1, Ordering::Relaxed);
+        }
+        if let Some(queue) = &mut self.recorded
+            && queue.push(timed).is_err()
+        {
+            self.shared.records_unrecorded.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// What a bus took just before it was lost, or before its cells were back on it, they have not heard: once it works
+    /// and once more when they are heard they are told to be as the robot is.
+    fn owe_to_returned_buses(&mut self, halted: bool) {
+        for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
+            let works = line.works.load(Ordering::Relaxed);
+            let returned = line.returned.swap(false, Ordering::Relaxed);
+            if (works && !*worked) || returned {
+                *owed = Some(if halted { Message::Halt } else { Message::Resume });
+            }
+            *worked = works;
+        }
+    }
+
+    /// Tells every bus to halt or to resume; one that does not take it is told before each of its next joints.
+    fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        self.owed.fill(Some(message));
+        self.say_what_is_owed(send);
+    }
+
+    fn say_what_is_owed(&mut self, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        for (bus, (line, owed)) in self.lines.iter().zip(&mut self.owed).enumerate() {
+            owed.take_if(|message| line.say(bus, message, &self.shared, send));
+        }
+    }
+
+    /// Sends joints on every bus.
+    fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        for (bus, line) in self.lines.iter().enumerate() {
+            line.say(bus, message, &self.shared, send);
+        }
+    }
+}
+
+impl Line {
+    /// Sends a command on this bus, and counts it; whether the bus took it.
+    fn say(
+        &self,
+        bus: usize,
+        message: &Message,
+        shared: &Shared,
+        send: &mut impl FnMut(usize, &[Frame]) -> bool,
+    ) -> bool {
+        let (frames, count) = frames(&message.encode(), self.format);
+        let frames = frames.get(..count).unwrap_or_default();
+        let taken = send(bus, frames);
+        if taken {
+            self.commands.fetch_add(1, Ordering::Relaxed);
+        } else {
+            shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+        }
+        taken
+    }
+}
+
+/// A packet's frames in place: an array, and how many of it are used.
+fn frames(packet: &Packet, format: Format) -> ([Frame; 2], usize) {
+    let mut frames = [Frame::EMPTY; 2];
+    let mut count = 0;
+    for (place, frame) in frames.iter_mut().zip(packet.frames(format)) {
+        *place = frame;
+        count += 1;
+    }
+    (frames, count)
+}

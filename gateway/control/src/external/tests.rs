@@ -1,0 +1,277 @@
+use std::os::unix::net::UnixDatagram;
+use std::path::{Path, PathBuf};
+
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+use super::datagram::{ANSWER_BYTES, Heard, STATE_BYTES};
+use super::*;
+use crate::controller::{BadCycle, Controller, Input, Step};
+use model::testing::skin;
+
+const HELLO: &[u8] = b"SKBC\x01\x00\x03\x00";
+
+fn listen(path: &Path) -> Result<External, SocketError> {
+    External::listen(path, &skin())
+}
+
+/// A folder, the gateway's socket in it, and the gateway.
+fn gateway() -> (TempDir, PathBuf, External) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("controller.sock");
+    let gateway = listen(&path).unwrap();
+    (folder, path, gateway)
+}
+
+/// Another program, with the gateway's socket as its peer.
+fn program(folder: &TempDir, name: &str) -> UnixDatagram {
+    let socket = UnixDatagram::bind(folder.path().join(name)).unwrap();
+    socket.connect(folder.path().join("controller.sock")).unwrap();
+    socket.set_nonblocking(true).unwrap();
+    socket
+}
+
+fn input(tick: u64) -> Input {
+    Input { tick, valid: true, ..Input::default() }
+}
+
+fn velocity(tick: u64, first: f64) -> [u8; ANSWER_BYTES] {
+    let command = Command::Velocity([first, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    Answer { tick, command }.encode()
+}
+
+fn state(socket: &UnixDatagram) -> State {
+    let mut bytes = [0; STATE_BYTES + 1];
+    let length = socket.recv(&mut bytes).unwrap();
+    State::decode(&bytes[..length]).unwrap()
+}
+
+fn count(gateway: &External, name: &str) -> u64 {
+    gateway.counts().into_iter().find(|(known, _)| known == name).unwrap().1
+}
+
+#[test]
+fn a_state_is_the_bytes_of_the_documented_table() {
+    let input = Input {
+        tick: 0x0102,
+        time: protocol::time::Micros(516_000),
+        q: [1.0, 0.0, 0.0, 0.0, 0.0, -2.0],
+        qdot: [0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        torque: [0.0, 0.0, 0.0, 0.0, 0.0, 0.25],
+        age: 3,
+        contributing: 20,
+        valid: true,
+        missing: 0b101,
+        halted: true,
+    };
+    let bytes = State { input, joints: 6 }.encode();
+    assert_eq!(bytes[..16], *b"SKBC\x01\x00\x01\x00\x02\x01\0\0\0\0\0\0");
+    assert_eq!(bytes[16..40], *b"\xa0\xdf\x07\0\0\0\0\0\x03\0\0\0\x14\0\0\0\x03\0\x05\0\x06\0\0\0");
+    assert_eq!(bytes[40..48], *b"\0\0\0\0\0\0\xf0\x3f");
+    assert_eq!(bytes[80..96], *b"\0\0\0\0\0\0\0\xc0\0\0\0\0\0\0\xe0\x3f");
+    assert_eq!(bytes[176..], *b"\0\0\0\0\0\0\xd0\x3f");
+    assert_eq!(State::decode(&bytes), Ok(State { input, joints: 6 }));
+}
+
+#[test]
+fn buses_beyond_the_16th_share_its_bit() {
+    let said = |missing| {
+        let bytes = State { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
+        State::decode(&bytes).unwrap().input.missing
+    };
+    assert_eq!([1, 1 << 15, 1 << 16, 1 << 31].map(said), [1, 1 << 15, 1 << 15, 1 << 15]);
+}
+
+#[test]
+fn an_answer_is_the_bytes_of_the_documented_table() {
+    let command = Command::Position([-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    let bytes = Answer { tick: 7, command }.encode();
+    assert_eq!(bytes[..24], *b"SKBC\x01\x00\x02\x00\x07\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0");
+    assert_eq!(bytes[24..32], *b"\0\0\0\0\0\0\0\xc0");
+    assert_eq!(bytes[64..], *b"\0\0\0\0\0\0\xf0\x3f");
+    assert_eq!(Heard::decode(&bytes), Ok(Heard::Answer(Answer { tick: 7, command })));
+}
+
+#[test]
+fn what_the_answer_asks_for_is_done_in_the_next_tick() {
+    let (folder, _, mut gateway) = gateway();
+    assert_eq!(gateway.step(&input(0)), Step::Bad(BadCycle::NoPeer));
+    let program = program(&folder, "program");
+    program.send(HELLO).unwrap();
+    assert_eq!(gateway.step(&input(1)), Step::Bad(BadCycle::NoPeer), "it was not asked yet");
+    assert_eq!(state(&program), State { input: input(1), joints: 6 });
+    program.send(&velocity(1, 0.5)).unwrap();
+    assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    let command = Command::Position([0.001, 0.0, 0.0, 0.0, 0.0, -9.0]);
+    program.send(&Answer { tick: 2, command }.encode()).unwrap();
+    let Step::Move([first, .., last]) = gateway.step(&input(3)) else { panic!("an answer was there") };
+    assert!((first - 0.5).abs() < 1e-12, "a thousandth of a radian in 2 ms");
+    assert!((last + 3.0).abs() < 1e-12, "no quicker than it may");
+    program.send(&velocity(3, 99.0)).unwrap();
+    assert_eq!(gateway.step(&input(4)), Step::Move([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    program.send(&velocity(4, 1.0)).unwrap();
+    let halted = Input { halted: true, ..input(5) };
+    assert_eq!(gateway.step(&halted), Step::Move([0.0; 6]), "a halted robot stays");
+    assert_eq!((count(&gateway, "answers"), count(&gateway, "missing")), (4, 0));
+}
+
+#[test]
+fn a_missing_answer_is_a_bad_cycle_and_a_late_one_is_none() {
+    let (folder, _, mut gateway) = gateway();
+    let program = program(&folder, "program");
+    program.send(HELLO).unwrap();
+    gateway.step(&input(1));
+    assert_eq!(gateway.step(&input(2)), Step::Bad(BadCycle::NoAnswer));
+    program.send(&velocity(1, 0.5)).unwrap();
+    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoAnswer), "an old tick");
+    program.send(&velocity(2, 0.5)).unwrap();
+    program.send(&velocity(3, 0.25)).unwrap();
+    program.send(&velocity(3, 0.75)).unwrap();
+    let step = gateway.step(&input(7));
+    assert_eq!(step, Step::Move([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), "the first answer to the last tick");
+    assert_eq!((count(&gateway, "missing"), count(&gateway, "late")), (2, 2));
+    assert_eq!(count(&gateway, "repeated"), 1);
+}
+
+#[test]
+fn nonsense_is_counted_by_reason_and_makes_the_cycle_bad() {
+    let (folder, _, mut gateway) = gateway();
+    let program = program(&folder, "program");
+    program.send(HELLO).unwrap();
+    gateway.step(&input(0));
+    let bent = |at: usize, byte| {
+        let mut bytes = velocity(0, 0.5);
+        bytes[at] = byte;
+        bytes.to_vec()
+    };
+    let cases = [
+        ("wrong length", b"SKBC".to_vec()),
+        ("wrong length", bent(0, b'S')[..71].to_vec()),
+        ("wrong length", [bent(0, b'S'), vec![0]].concat()),
+        ("wrong magic", bent(0, b's')),
+        ("wrong version", bent(4, 2)),
+        ("unknown kind", bent(6, 1)),
+        ("unknown command", bent(16, 3)),
+        ("not finite", velocity(0, f64::NAN).to_vec()),
+        ("not finite", velocity(0, f64::INFINITY).to_vec()),
+        ("tick ahead", velocity(u64::MAX, 0.5).to_vec()),
+    ];
+    for (tick, (why, bytes)) in (1..).zip(&cases) {
+        let before = count(&gateway, &format!("nonsense: {why}"));
+        program.send(&velocity(tick - 1, 0.5)).unwrap();
+        program.send(bytes).unwrap();
+        assert_eq!(gateway.step(&input(tick)), Step::Bad(BadCycle::Nonsense), "{why}");
+        assert_eq!(count(&gateway, &format!("nonsense: {why}")), before + 1);
+    }
+    program.send(&velocity(10, 0.5)).unwrap();
+    assert!(matches!(gateway.step(&input(11)), Step::Move(_)), "and then it goes on");
+}
+
+#[test]
+fn who_says_hello_last_is_the_peer_and_nobody_else_is_heard() {
+    let (folder, _, mut gateway) = gateway();
+    let [first, second] = ["first", "second"].map(|name| program(&folder, name));
+    first.send(HELLO).unwrap();
+    gateway.step(&input(1));
+    second.send(b"nonsense").unwrap();
+    second.send(&velocity(1, 1.0)).unwrap();
+    first.send(&velocity(1, 0.5)).unwrap();
+    assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    assert_eq!(count(&gateway, "strangers"), 2);
+    second.send(HELLO).unwrap();
+    first.send(&velocity(2, 0.5)).unwrap();
+    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer), "the new one was not asked yet");
+    second.send(HELLO).unwrap();
+    second.send(&velocity(3, 0.25)).unwrap();
+    let step = gateway.step(&input(4));
+    assert_eq!(step, Step::Move([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), "a second hello changes nothing");
+}
+
+#[test]
+fn a_peer_that_goes_away_is_noticed_and_may_come_back() {
+    let (folder, _, mut gateway) = gateway();
+    let first = program(&folder, "program");
+    first.send(HELLO).unwrap();
+    gateway.step(&input(1));
+    drop(first);
+    assert_eq!(gateway.step(&input(2)), Step::Bad(BadCycle::NoAnswer));
+    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer));
+    assert_eq!(count(&gateway, "gone"), 1);
+    std::fs::remove_file(folder.path().join("program")).unwrap();
+    let again = program(&folder, "program");
+    again.send(HELLO).unwrap();
+    gateway.step(&input(4));
+    again.send(&velocity(4, 0.5)).unwrap();
+    assert!(matches!(gateway.step(&input(5)), Step::Move(_)));
+}
+
+#[test]
+fn a_peer_that_does_not_read_holds_nothing_up() {
+    let (folder, _, mut gateway) = gateway();
+    let program = program(&folder, "program");
+    program.send(HELLO).unwrap();
+    for tick in 0..10_000 {
+        gateway.step(&input(tick));
+    }
+    assert!(count(&gateway, "unsent") > 9_000, "{:?}", gateway.counts());
+    assert_eq!(count(&gateway, "missing"), 9_999);
+}
+
+#[test]
+fn a_flood_takes_no_more_than_its_share_of_a_tick() {
+    let (folder, path, mut gateway) = gateway();
+    let flood = UnixDatagram::unbound().unwrap();
+    flood.set_nonblocking(true).unwrap();
+    let mut sent = 0;
+    while sent < 1_000 && flood.send_to(b"SKBC", &path).is_ok() {
+        sent += 1;
+    }
+    gateway.step(&input(0));
+    assert_eq!(count(&gateway, "failed"), sent.min(16), "senders without a name cannot be answered");
+    assert!(folder.path().exists());
+}
+
+#[test]
+fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
+    let (folder, path, gateway) = gateway();
+    let error = listen(&path).unwrap_err().to_string();
+    assert!(
+        error.ends_with("another program listens on this socket; end it, or name another path"),
+        "{error}"
+    );
+    drop(gateway);
+    assert!(!path.exists());
+    drop(UnixDatagram::bind(&path).unwrap());
+    assert!(path.exists(), "a dead socket's file stays");
+    drop(listen(&path).unwrap());
+    std::fs::write(&path, "notes").unwrap();
+    let error = listen(&path).unwrap_err().to_string();
+    assert!(error.ends_with("exists and is no socket; it is left alone"), "{error}");
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "notes");
+    let nowhere = folder.path().join("none/controller.sock");
+    assert!(listen(&nowhere).unwrap_err().to_string().ends_with("cannot listen on this socket"));
+}
+
+#[test]
+fn another_socket_under_the_same_name_is_not_removed() {
+    let (_folder, path, gateway) = gateway();
+    std::fs::remove_file(&path).unwrap();
+    let _other = UnixDatagram::bind(&path).unwrap();
+    drop(gateway);
+    assert!(path.exists());
+}
+
+proptest! {
+    #[test]
+    fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        let _ = Heard::decode(&bytes);
+        let _ = State::decode(&bytes);
+    }
+
+    #[test]
+    fn an_answer_comes_back(tick: u64, values in proptest::array::uniform6(-1e9..1e9), which: bool) {
+        let command = if which { Command::Velocity(values) } else { Command::Position(values) };
+        let answer = Answer { tick, command };
+        prop_assert_eq!(Heard::decode(&answer.encode()), Ok(Heard::Answer(answer)));
+    }
+}

@@ -1,0 +1,54 @@
+//! Which controller a motion of a scenario asks for.
+
+use std::path::Path;
+
+use protocol::skin::{ControllerKind, Skin};
+
+use crate::controller::{Controller, Hold, Kinesthetic, Sine};
+use crate::external::{External, SocketError};
+use model::scenario::{Motion, MotionKind};
+
+/// What moves the robot in this motion of a scenario: hold, sine, or the skin's controller.
+///
+/// # Errors
+/// When the skin's controller is another program, and there is no socket to listen on for it.
+pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
+    let start = motion.start_rad;
+    Ok(match (motion.kind, &skin.controller.kind) {
+        (MotionKind::Hold, _) => Box::new(Hold::new(skin, start)),
+        (MotionKind::Sine { amplitude_rad, period_s }, _) => {
+            Box::new(Sine::new(skin, start, amplitude_rad, period_s))
+        }
+        (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
+            Box::new(Kinesthetic::with(skin, inertia, damping))
+        }
+        (MotionKind::Kinesthetic, ControllerKind::External { socket }) => {
+            Box::new(External::listen(Path::new(socket), skin)?)
+        }
+    })
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
+mod tests {
+    use super::*;
+    use crate::controller::{Input, Step};
+    use model::testing::skin;
+
+    #[test]
+    fn the_scenario_says_who_moves_the_robot() {
+        let mut motion = Motion { start_rad: [0.25; 6], kind: MotionKind::Hold };
+        let mut step = |kind, torque| {
+            motion.kind = kind;
+            let input = Input { q: [0.25; 6], torque: [torque; 6], valid: true, ..Input::default() };
+            match controller_of(&skin(), &motion).unwrap().step(&input) {
+                Step::Move(velocities) => velocities[0],
+                Step::Bad(why) => panic!("{why}"),
+            }
+        };
+        assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
+        assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
+        assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "gives way");
+        assert!(step(MotionKind::Sine { amplitude_rad: [0.1; 6], period_s: 4.0 }, 0.0) > 0.0);
+    }
+}

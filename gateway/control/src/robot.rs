@@ -1,0 +1,130 @@
+//! What is moved: a robot that takes joint velocities, and a simulated one.
+
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::Skin;
+
+/// A robot that is told joint velocities. Joints that it does not have stand at zero.
+pub trait Robot {
+    /// Moves for `seconds` with these joint velocities in rad/s. Called once a tick: must not block,
+    /// allocate, lock or log.
+    fn step(&mut self, velocity: &[f64; MAX_JOINTS], seconds: f64) -> Moved;
+
+    /// Joint positions in rad, as far as the joints have turned: they may exceed half a turn.
+    fn positions(&self) -> [f64; MAX_JOINTS];
+
+    /// Joint velocities in rad/s.
+    fn velocities(&self) -> [f64; MAX_JOINTS];
+}
+
+/// What became of a step.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Moved {
+    /// Joints that stand at a limit and were told to go on, one bit each, joint 1 lowest.
+    pub at_limit: u8,
+    /// Whether a velocity was not finite and was taken as zero.
+    pub refused: bool,
+}
+
+/// An arm whose positions follow the commanded velocities exactly, up to its joints' limits.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SimulatedArm {
+    positions: [f64; MAX_JOINTS],
+    velocities: [f64; MAX_JOINTS],
+    limits: [[f64; 2]; MAX_JOINTS],
+}
+
+impl SimulatedArm {
+    /// The skin's robot, at rest at `start` (in rad), held within its limits.
+    #[must_use]
+    pub fn new(skin: &Skin, start: [f64; MAX_JOINTS]) -> Self {
+        let mut arm =
+            Self { positions: start, velocities: [0.0; MAX_JOINTS], limits: [[0.0; 2]; MAX_JOINTS] };
+        for (limits, given) in arm.limits.iter_mut().zip(&skin.robot.limits_rad) {
+            *limits = *given;
+        }
+        for (position, [least, greatest]) in arm.positions.iter_mut().zip(arm.limits) {
+            *position = position.clamp(least, greatest);
+        }
+        arm
+    }
+}
+
+impl Robot for SimulatedArm {
+    fn step(&mut self, velocity: &[f64; MAX_JOINTS], seconds: f64) -> Moved {
+        let mut moved = Moved::default();
+        let joints = self.positions.iter_mut().zip(&mut self.velocities).zip(&self.limits);
+        for (joint, (((position, velocity), &[least, greatest]), &wanted)) in joints.zip(velocity).enumerate()
+        {
+            let finite = wanted.is_finite();
+            moved.refused |= !finite;
+            *velocity = if finite { wanted } else { 0.0 };
+            let goal = *position + *velocity * seconds;
+            *position = goal.clamp(least, greatest);
+            if goal < least || goal > greatest {
+                *velocity = 0.0;
+                moved.at_limit |= 1 << joint;
+            }
+        }
+        moved
+    }
+
+    fn positions(&self) -> [f64; MAX_JOINTS] {
+        self.positions
+    }
+
+    fn velocities(&self) -> [f64; MAX_JOINTS] {
+        self.velocities
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "what is held at a limit is exactly there")]
+mod tests {
+    use super::*;
+    use model::testing::skin;
+    use proptest::prelude::*;
+
+    #[test]
+    fn positions_follow_velocities_beyond_half_a_turn() {
+        let mut arm = SimulatedArm::new(&skin(), [0.5; 6]);
+        for _ in 0..2_000 {
+            assert_eq!(arm.step(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0], 0.002), Moved::default());
+        }
+        let [q1, q2, q3, ..] = arm.positions();
+        assert!((q1 - 4.5).abs() < 1e-9 && (q2 + 3.5).abs() < 1e-9 && q3 == 0.5);
+        assert_eq!(arm.velocities()[..2], [1.0, -1.0]);
+    }
+
+    #[test]
+    fn the_arm_stops_at_a_limit_says_so_and_comes_back() {
+        let mut skin = skin();
+        skin.robot.limits_rad[2] = [-1.0, 0.5];
+        let mut arm = SimulatedArm::new(&skin, [0.0, 0.0, 0.499, 0.0, 0.0, 0.0]);
+        let moved = arm.step(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0], 0.002);
+        assert_eq!(moved, Moved { at_limit: 0b100, refused: false });
+        assert_eq!((arm.positions()[2], arm.velocities()[2]), (0.5, 0.0));
+        assert_eq!(arm.step(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], 0.002), Moved::default());
+        assert!(arm.positions()[2] < 0.5);
+    }
+
+    #[test]
+    fn a_velocity_that_is_no_number_moves_nothing() {
+        let mut arm = SimulatedArm::new(&skin(), [0.25; 6]);
+        assert!(arm.step(&[f64::NAN, f64::INFINITY, 0.0, 0.0, 0.0, 0.0], 0.002).refused);
+        assert_eq!(arm.positions(), [0.25; 6]);
+    }
+
+    proptest! {
+        #[test]
+        fn no_joint_ever_leaves_its_limits(steps in proptest::collection::vec(any::<[f64; 6]>(), 1..50)) {
+            let skin = skin();
+            let mut arm = SimulatedArm::new(&skin, [0.0; 6]);
+            for step in steps {
+                arm.step(&step, 0.002);
+                for (position, [least, greatest]) in arm.positions().iter().zip(&skin.robot.limits_rad) {
+                    prop_assert!(least <= position && position <= greatest);
+                }
+            }
+        }
+    }
+}

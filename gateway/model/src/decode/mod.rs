@@ -1,0 +1,375 @@
+//! What frames mean, in words for people: `gateway dump` shows it beside the raw frame.
+//!
+//! ```text
+//!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text
+//!                          └ for each identifier of each bus: a waiting half, and whether packets come under it
+//! ```
+//!
+//! A frame is ours as a whole packet with the right CRC, or as one of its two classic halves. Every other frame is
+//! foreign; one under an identifier that carries packets is damaged. Each line begins with a verdict of one word:
+//! `ok`, `half` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
+//! that says nothing known: `meaning`.
+
+pub mod json;
+pub mod parameter;
+pub mod pick;
+pub mod settle;
+mod switch;
+mod text;
+mod wires;
+
+use protocol::can::{Format, Frame};
+use protocol::fixed::Q;
+use protocol::id::Id;
+use protocol::message::{Message, MessageError, NetworkPage, SensorPage, State};
+use protocol::packet::{Half, Packet, PacketError, Paired, WORDS, data_id};
+use protocol::time::Micros;
+use protocol::wire::{self, PortMessage};
+use thiserror::Error;
+
+/// Buses that are told apart at the same time: of more, the oldest is forgotten, or they are taken together.
+pub const BUSES: usize = 64;
+/// Identifiers of 11 bits.
+const IDS: usize = 0x800;
+
+/// What a frame is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Decoded {
+    /// No frame of this protocol.
+    Foreign(Foreign),
+    /// What a cell, or the gateway's side, says over a simulated wire. It is on no real bus.
+    Wire(wire::Lane, PortMessage),
+    /// The first half of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
+    Half {
+        /// Its identifier.
+        id: Id,
+    },
+    /// No packet, under an identifier that carries packets.
+    Damaged {
+        /// Its identifier.
+        id: Id,
+        /// Why it is no packet.
+        fault: Fault,
+    },
+    /// A packet that says nothing this version knows.
+    Meaningless {
+        /// The packet.
+        packet: Packet,
+        /// Why.
+        error: MessageError,
+    },
+    /// A packet and its meaning.
+    Message(Message),
+}
+
+/// Why a frame is none of this protocol's.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+pub enum Foreign {
+    /// 29 bits.
+    #[error("29-bit identifier")]
+    Extended,
+    /// It asks for data.
+    #[error("remote frame")]
+    Remote,
+    /// The driver's report of an error.
+    #[error("error frame of the driver")]
+    Error,
+    /// A data frame with an 11-bit identifier under which no packets come.
+    #[error("no packet: {0}")]
+    Data(Fault),
+}
+
+/// Why a data frame with an 11-bit identifier is no packet.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+pub enum Fault {
+    /// Another length or format than that of a packet.
+    #[error("{got} data bytes, not {expected}")]
+    Length {
+        /// Bytes that the format has.
+        expected: usize,
+        /// Bytes that came.
+        got: usize,
+    },
+    /// Wrong checksum.
+    #[error("CRC {got:04X}, not {expected:04X}")]
+    Crc {
+        /// What the bytes give.
+        expected: u16,
+        /// What the frame says.
+        got: u16,
+    },
+    /// A classic frame that gives no packet with the one before it or the one after it.
+    #[error("no other half")]
+    Incomplete,
+}
+
+impl Fault {
+    /// One word for it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Length { .. } => "length",
+            Self::Crc { .. } => "CRC",
+            Self::Incomplete => "incomplete",
+        }
+    }
+}
+
+impl From<PacketError> for Fault {
+    fn from(error: PacketError) -> Self {
+        match error {
+            PacketError::Length { expected, got } => Self::Length { expected, got },
+            PacketError::Crc { expected, got } => Self::Crc { expected, got },
+            PacketError::Foreign | _ => Self::Incomplete,
+        }
+    }
+}
+
+impl Foreign {
+    const fn of(frame: &Frame) -> Self {
+        if frame.is_error() {
+            Self::Error
+        } else if frame.is_remote() {
+            Self::Remote
+        } else {
+            Self::Extended
+        }
+    }
+}
+
+impl Decoded {
+    /// The verdict, as a line begins with it.
+    #[must_use]
+    pub const fn verdict(&self) -> &'static str {
+        match self {
+            Self::Message(_) | Self::Wire(..) => "ok",
+            Self::Half { .. } => "half",
+            Self::Foreign(_) => "foreign",
+            Self::Damaged { fault, .. } => fault.name(),
+            Self::Meaningless { .. } => "meaning",
+        }
+    }
+
+    /// Whether a word of a torque or a sum means *saturated*.
+    #[must_use]
+    pub fn is_saturated(&self) -> bool {
+        match self {
+            Self::Message(Message::Torque { torque, .. }) => torque.iter().copied().any(Q::is_saturated),
+            Self::Message(Message::Sum { torque, .. }) => torque.iter().copied().any(Q::is_saturated),
+            Self::Message(_)
+            | Self::Foreign(_)
+            | Self::Wire(..)
+            | Self::Half { .. }
+            | Self::Damaged { .. }
+            | Self::Meaningless { .. } => false,
+        }
+    }
+}
+
+impl Decoded {
+    /// Whether this tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact
+    /// force or a proximity, a heartbeat of an active cell.
+    #[must_use]
+    pub fn is_contact(&self) -> bool {
+        let felt = |page: &SensorPage| match page {
+            SensorPage::Skin(skin) => skin.contact != [Q::ZERO; 3] || skin.proximity != Q::ZERO,
+            SensorPage::Acceleration(_) => false,
+        };
+        match self {
+            Self::Message(message) => match message {
+                Message::Torque { torque, .. } => *torque != [Q::ZERO; WORDS],
+                Message::Sum { torque, .. } => *torque != [Q::ZERO; WORDS],
+                Message::Sensors { page, .. } | Message::Stimulus { page, .. } => felt(page),
+                Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                    heartbeat.state.has(State::ACTIVE)
+                }
+                Message::Network { .. }
+                | Message::Halt
+                | Message::Joints { .. }
+                | Message::Sync
+                | Message::Resume
+                | Message::Report
+                | Message::Configure { .. }
+                | Message::Configured { .. } => false,
+            },
+            Self::Foreign(_)
+            | Self::Wire(..)
+            | Self::Half { .. }
+            | Self::Damaged { .. }
+            | Self::Meaningless { .. } => false,
+        }
+    }
+}
+
+/// What a frame says over a simulated wire. One whose identifier or CRC says otherwise is anybody's: 29 bits are
+/// common on other buses.
+#[must_use]
+pub fn wired(frame: &Frame) -> Option<(wire::Lane, PortMessage)> {
+    let lane = wire::Lane::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
+    Some((lane, lane.read(frame)?))
+}
+
+/// What has come under an identifier, and so whether it is one of ours.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Traffic {
+    packets: u64,
+    others: u64,
+}
+
+impl Traffic {
+    /// So many packets are enough: chance makes one of two frames in 65 536.
+    const PACKETS: u64 = 2;
+    /// For each packet there may be so many frames that are none.
+    const OTHERS: u64 = 32;
+
+    /// A packet came.
+    pub const fn packet(&mut self) {
+        self.packets += 1;
+    }
+
+    /// A frame came that is no packet, nor half of one.
+    pub const fn other(&mut self) {
+        self.others += 1;
+    }
+
+    /// Whether the identifier carries packets: then what is no packet is damaged, else it is foreign.
+    #[must_use]
+    pub const fn carries_packets(self) -> bool {
+        self.packets >= Self::PACKETS && self.others <= Self::OTHERS * self.packets
+    }
+}
+
+/// Tells what frames are, pairing halves on the way.
+#[derive(Debug)]
+pub struct Decoder {
+    format: Option<Format>,
+    buses: Vec<Bus>,
+    /// Buses seen, also those that are forgotten.
+    seen: u64,
+}
+
+/// A bus as it is followed.
+#[derive(Debug)]
+struct Bus {
+    name: String,
+    /// Another one than that of any bus before it.
+    number: u64,
+    ids: Vec<Slot>,
+}
+
+/// An identifier of a bus.
+#[derive(Clone, Copy, Debug, Default)]
+struct Slot {
+    half: Half,
+    /// The number of the frame that waits.
+    waiting: Option<u64>,
+    traffic: Traffic,
+}
+
+impl Slot {
+    /// A frame that is no packet, nor half of one.
+    const fn refuse(&mut self, id: Id, fault: Fault) -> Decoded {
+        self.traffic.other();
+        if self.traffic.carries_packets() {
+            Decoded::Damaged { id, fault }
+        } else {
+            Decoded::Foreign(Foreign::Data(fault))
+        }
+    }
+}
+
+/// What came of a frame, and with it of the one that waited under its identifier.
+struct Taken {
+    decoded: Decoded,
+    /// On which bus it waits for its other half.
+    waits: Option<u64>,
+    /// The number of a frame that waited, and what it was.
+    older: Option<(u64, Decoded)>,
+}
+
+impl From<Decoded> for Taken {
+    fn from(decoded: Decoded) -> Self {
+        Self { decoded, waits: None, older: None }
+    }
+}
+
+impl Decoder {
+    /// For buses of one format; with `None` each frame is taken for what it is.
+    #[must_use]
+    pub const fn new(format: Option<Format>) -> Self {
+        Self { format, buses: Vec::new(), seen: 0 }
+    }
+
+    /// Takes the next frame. What a classic frame is may come out only later: it is told as a [`Decoded::Half`]
+    /// until then; [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
+    pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
+        self.take(0, at, bus, frame).decoded
+    }
+
+    /// Takes the next frame under a number.
+    fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> Taken {
+        let Ok(id) = data_id(frame) else {
+            let wired = wired(frame).map(|(lane, message)| Decoded::Wire(lane, message));
+            return wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame))).into();
+        };
+        let format = self.format.unwrap_or_else(|| frame.format());
+        let bus = self.bus(bus);
+        let on = bus.number;
+        let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits");
+        let (packet, older) = match format {
+            Format::Fd => (Packet::from_fd(frame), None),
+            Format::Classic if frame.format() == Format::Fd => {
+                (Err(PacketError::Length { expected: 8, got: frame.data().len() }), None)
+            }
+            Format::Classic => match slot.half.push(at, id, frame.data()) {
+                Ok(Paired::Waiting | Paired::Incomplete) => {
+                    let older = slot.waiting.replace(number);
+                    let older = older.map(|older| (older, slot.refuse(id, Fault::Incomplete)));
+                    return Taken { decoded: Decoded::Half { id }, waits: Some(on), older };
+                }
+                Ok(Paired::Whole(packet)) => {
+                    (Ok(packet), slot.waiting.take().map(|older| (older, Decoded::Half { id })))
+                }
+                Err(error) => (Err(error), None),
+            },
+        };
+        let decoded = match packet {
+            Ok(packet) => {
+                slot.traffic.packet();
+                match Message::decode(&packet) {
+                    Ok(message) => Decoded::Message(message),
+                    Err(error) => Decoded::Meaningless { packet, error },
+                }
+            }
+            Err(error) => slot.refuse(id, error.into()),
+        };
+        Taken { decoded, waits: None, older }
+    }
+
+    /// What a frame is whose other half does not come any more.
+    fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
+        let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
+        let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));
+        let Some(slot) = slot.filter(|slot| slot.waiting == Some(number)) else {
+            return Decoded::Foreign(Foreign::Data(Fault::Incomplete));
+        };
+        (slot.half, slot.waiting) = (Half::NONE, None);
+        slot.refuse(id, Fault::Incomplete)
+    }
+
+    fn bus(&mut self, name: &str) -> &mut Bus {
+        let at = self.buses.iter().position(|bus| bus.name == name).unwrap_or_else(|| {
+            if self.buses.len() == BUSES {
+                self.buses.remove(0);
+            }
+            self.seen += 1;
+            let ids = vec![Slot::default(); IDS];
+            self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids });
+            self.buses.len() - 1
+        });
+        self.buses.get_mut(at).expect("found, or just made")
+    }
+}
+
+#[cfg(test)]
+mod tests;

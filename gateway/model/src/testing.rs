@@ -1,0 +1,70 @@
+//! A small skin that the tests of these crates begin with.
+
+use protocol::skin::Skin;
+
+/// A UR5 with one cell on joint 3.
+pub const SKIN: &str = r#"version = 1
+name = "bare"
+
+[robot]
+name = "UR5"
+joints = [
+  { a = 0.0, alpha = 1.5707963267948966, d = 0.089159, theta_offset = 0.0 },
+  { a = -0.425, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
+  { a = -0.39225, alpha = 0.0, d = 0.0, theta_offset = 0.0 },
+  { a = 0.0, alpha = 1.5707963267948966, d = 0.10915, theta_offset = 0.0 },
+  { a = 0.0, alpha = -1.5707963267948966, d = 0.09465, theta_offset = 0.0 },
+  { a = 0.0, alpha = 0.0, d = 0.0823, theta_offset = 0.0 },
+]
+
+[timing]
+control_hz = 500.0
+joint_broadcast_hz = 62.5
+
+[contact]
+alpha_c = 1.0
+alpha_p = 2.0
+contact_threshold_n = 0.1
+proximity_threshold = 0.25
+force_threshold_n = 0.3
+
+[[bus]]
+name = "vcan0"
+reply = "torque"
+format = "fd"
+
+[controller]
+kind = "kinesthetic"
+inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
+damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]
+max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
+
+[[cell]]
+bus = "vcan0"
+node = 1
+joint = 3
+position = [0.2, 0.01, 0.15]
+orientation = [0.7071068, 0.0, 0.0, 0.7071068]
+"#;
+
+/// [`SKIN`] with a second bus like the first one.
+///
+/// # Panics
+/// Never: the skin is sound.
+#[must_use]
+pub fn two_buses() -> Skin {
+    let bus = SKIN.find("[[bus]]").zip(SKIN.find("[controller]")).and_then(|(from, to)| SKIN.get(from..to));
+    let cell = SKIN.find("[[cell]]").and_then(|from| SKIN.get(from..));
+    let more = bus.into_iter().chain(cell).map(|part| format!("\n{}", part.replace("vcan0", "vcan1")));
+    let text = SKIN.to_owned() + &more.collect::<String>();
+    Skin::parse("skin.toml", &text).expect("the tests' skin is sound")
+}
+
+/// [`SKIN`], checked.
+///
+/// # Panics
+/// Never: the skin is sound.
+#[must_use]
+pub fn skin() -> Skin {
+    Skin::parse("skin.toml", SKIN).expect("the tests' skin is sound")
+}

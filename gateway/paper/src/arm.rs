@@ -1,0 +1,118 @@
+//! The bench of Fig. 6 to 8: an arm with 253 cells that gives way to touches.
+
+use protocol::skin::Skin;
+
+use super::Effort;
+use model::generate::{self, Wanted, generate};
+
+/// What cells answer with.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Reply {
+    /// Each its own torque, Q3.12.
+    Torque,
+    /// Sums along the tree, Q7.8.
+    Sum,
+}
+
+impl Reply {
+    /// How files of its run are called.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Torque => "single",
+            Self::Sum => "sum",
+        }
+    }
+}
+
+/// Cells of the paper's arm.
+const CELLS: usize = 253;
+/// Cells of a quick one.
+const FEW: usize = 24;
+/// Strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
+const TOUCHES: &str = include_str!("../../examples/demo.toml");
+/// A touch of all cells at once; the central computation is off from 1.2 s on.
+const TOUCH: &str = "# A hand closes around the arm and lets go.
+version = 1
+duration_s = 2.4
+seed = 1
+
+[motion]
+kind = \"kinesthetic\"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+
+[[mode]]
+at_s = 0.0
+kind = \"compare\"
+
+[[mode]]
+at_s = 1.2
+kind = \"distributed\"
+
+[[touch]]
+at_s = 0.2
+for_s = 2.0
+all = true
+force_n = 2.0
+profile = \"half-sine\"
+";
+
+/// The arm's `skin.toml`.
+///
+/// # Panics
+/// Never: so many cells fit.
+#[must_use]
+pub fn skin(reply: Reply, effort: Effort) -> String {
+    let cells = match effort {
+        Effort::Quick => FEW,
+        Effort::Full => CELLS,
+    };
+    let reply = match reply {
+        Reply::Torque => generate::Reply::Torque,
+        Reply::Sum => generate::Reply::Sum,
+    };
+    generate(&Wanted { cells, reply, ..Wanted::default() }).expect("so many cells fit on the arm")
+}
+
+/// The paper's arm, whose cells answer with torques.
+///
+/// # Panics
+/// Never: what is generated can be read.
+#[must_use]
+pub fn paper() -> Skin {
+    Skin::parse("skin.toml", &skin(Reply::Torque, Effort::Full)).expect("it has been generated")
+}
+
+/// Its `scenario.toml`.
+#[must_use]
+pub const fn scenario(effort: Effort) -> &'static str {
+    match effort {
+        Effort::Quick => TOUCH,
+        Effort::Full => TOUCHES,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use model::scenario::{Mode, Scenario};
+    use protocol::time::Micros;
+
+    #[test]
+    fn the_arm_is_that_of_the_demonstration_and_its_scenarios_fit_it() {
+        let text = skin(Reply::Torque, Effort::Full);
+        assert_eq!(text, include_str!("../../examples/ur5-253.toml"));
+        for (reply, effort) in [
+            (Reply::Torque, Effort::Full),
+            (Reply::Sum, Effort::Full),
+            (Reply::Torque, Effort::Quick),
+            (Reply::Sum, Effort::Quick),
+        ] {
+            let skin = Skin::parse("skin.toml", &skin(reply, effort)).unwrap();
+            let scenario = Scenario::parse("scenario.toml", scenario(effort), &skin).unwrap();
+            let switched = if effort == Effort::Full { 5_700_000 } else { 1_200_000 };
+            assert_eq!(scenario.mode_at(Micros(switched - 1)), Mode::Compare);
+            assert_eq!(scenario.mode_at(Micros(switched)), Mode::Distributed);
+        }
+    }
+}

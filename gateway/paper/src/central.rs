@@ -1,0 +1,394 @@
+//! Fig. 9 and 10: what the central computation costs, over cells and over active cells.
+//!
+//! What is timed is [`Central::frames`] and [`Central::feel`], which a comparing tick runs for each bus, here over one
+//! list of cells. Every measurement is of several computations in a row, so reading the clock does not count, and
+//! code and data lie in the caches as well as they can.
+
+use std::hint::black_box;
+
+use protocol::fixed::Q1_14;
+use protocol::message::SkinSensors;
+use protocol::skin::Skin;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use super::line::{Line, Weighted, count, quantile};
+use super::samples;
+use super::ticks::{POSE, nanos, touch};
+use analysis::paper;
+use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
+use model::central::Central;
+
+/// Computations between two looks at the clock.
+const IN_A_ROW: u32 = 16;
+/// Looks at one touch; the least of them counts.
+const LOOKS: usize = 5;
+
+/// How much is measured.
+#[derive(Clone, Copy, Debug)]
+pub struct Extent {
+    /// From one number of cells to the next.
+    pub step: usize,
+    /// How often each number of cells is measured.
+    pub rounds: usize,
+    /// Touches of the skin, each of a number of cells drawn at random.
+    pub touches: usize,
+}
+
+/// T_skin over cells none of which is active.
+#[derive(Clone, Debug)]
+pub struct OverCells {
+    /// Cells, median, 25th and 75th percentile in ns.
+    pub points: Vec<[f64; 4]>,
+    /// T_skin in ns over cells.
+    pub line: Line,
+}
+
+/// T_skin over active cells of a skin.
+#[derive(Clone, Debug)]
+pub struct OverActive {
+    /// Cells of the skin.
+    pub cells: usize,
+    /// Active cells, T_skin in ns, and of how many touches that is the median.
+    pub points: Vec<Weighted>,
+    /// T_skin in ns over active cells, by the number of touches.
+    pub line: Line,
+}
+
+/// One computation of so many in a row, in ns.
+fn timed(central: &Central, felt: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
+    let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
+    let began = now();
+    for _ in 0..IN_A_ROW {
+        let frames = central.frames(black_box(&joints));
+        black_box(central.feel(&frames, black_box(felt)));
+    }
+    nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
+}
+
+/// Measures T_skin over 0 to all cells of a skin, none of them active. `None` for fewer than three numbers of cells.
+#[must_use]
+pub fn over_cells(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverCells> {
+    let central = Central::new(skin);
+    let felt = vec![SkinSensors::default(); skin.cells.len()];
+    let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
+    let measured = samples::interleaved(cells.len(), extent.rounds, 9, |place| {
+        let felt = cells.get(place).and_then(|&cells| felt.get(..cells)).unwrap_or_default();
+        timed(&central, felt, &now)
+    });
+    let points = cells.iter().zip(&measured).map(|(&cells, values)| {
+        let at = |part| quantile(&mut values.clone(), part);
+        [count(cells), at(0.5), at(0.25), at(0.75)]
+    });
+    let points: Vec<_> = points.collect();
+    let line = Line::through_equals(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
+    Some(OverCells { points, line })
+}
+
+/// Measures T_skin over active cells of a skin. A touch is a patch: cells that follow each other in the skin's order,
+/// as neighbours do, from a cell drawn at random, as many as are drawn at random.
+#[must_use]
+pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverActive> {
+    let central = Central::new(skin);
+    let cells = skin.cells.len();
+    let mut dice = Pcg64Mcg::seed_from_u64(10);
+    let mut by_active = vec![Vec::new(); cells + 1];
+    for _ in 0..extent.touches {
+        let (active, first) = (dice.random_range(0..=cells), dice.random_range(0..cells.max(1)));
+        let mut felt = vec![SkinSensors::default(); cells];
+        felt.iter_mut().take(active).for_each(|felt| *felt = touch());
+        felt.rotate_right(first);
+        let least = (0..LOOKS).map(|_| timed(&central, &felt, &now)).fold(f64::INFINITY, f64::min);
+        if let Some(values) = by_active.get_mut(active) {
+            values.push(least);
+        }
+    }
+    let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
+    let points = points.map(|(active, values)| Weighted {
+        x: count(active),
+        y: quantile(values, 0.5),
+        weight: count(values.len()),
+    });
+    let points: Vec<_> = points.collect();
+    Some(OverActive { cells, line: Line::through(&points)?, points })
+}
+
+/// The quality of a law that the bar asks for.
+const QUALITY: f64 = 0.99;
+
+fn quality(line: &Line, paper: f64) -> Finding {
+    Finding::more_is_better(
+        "quality of the fit, R²",
+        Quantity::new(paper, ""),
+        Quantity::new(line.quality, ""),
+    )
+    .must(format!("at least {QUALITY}"), line.quality >= QUALITY)
+}
+
+/// A slope or a start in ns beside the paper's in s, as it is and as a ratio.
+fn cost(what: &str, ours: Quantity, paper_s: f64) -> [Finding; 2] {
+    let ratio = ours.value / (paper_s * 1e9);
+    [
+        Finding::less_is_better(what, Quantity::new(paper_s * 1e9, "ns"), ours),
+        Finding::told(format!("{what}: ours by the paper's"), Quantity::new(ratio, "")),
+    ]
+}
+
+fn slope(line: &Line) -> Quantity {
+    Quantity::new(line.slope, "ns").plus_minus(line.slope_half)
+}
+
+/// Fig. 9 with Eq. 29.
+#[must_use]
+pub fn fig9(over: &OverCells) -> Section {
+    let OverCells { points, line } = over;
+    let most = points.last().map_or(0.0, |point| point[0]);
+    let micros =
+        |place: fn(&[f64; 4]) -> f64| points.iter().map(move |point| (point[0], place(point) * 1e-3));
+    let band = micros(|point| point[2]).chain(micros(|point| point[3]).collect::<Vec<_>>().into_iter().rev());
+    let figure = |name: &str, title: &str, series| Figure {
+        name: name.to_owned(),
+        title: title.to_owned(),
+        x: Axis::new("cells, none active", ""),
+        y: Axis::new("T_skin", "µs"),
+        series,
+        ..Figure::default()
+    };
+    let law = |at: &dyn Fn(f64) -> f64| vec![(0.0, at(0.0)), (most, at(most))];
+    let ours = law(&|cells| line.at(cells) * 1e-3);
+    let beside = Figure {
+        y: Axis::new("T_skin", "µs").log().between(0.1, 10_000.0),
+        ..figure(
+            "fig9-paper",
+            "The same beside the paper's law (Eq. 29)",
+            vec![
+                Series::new("measured", Shape::Points, micros(|point| point[1]).collect()),
+                Series::new(
+                    "the paper's law",
+                    Shape::Dashed,
+                    steps(most, |cells| (paper::CELL_S * cells + paper::FIXED_S) * 1e6),
+                ),
+            ],
+        )
+    };
+    let limit = paper::most_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
+    let mut findings = Vec::new();
+    findings.extend(cost("T_skin for each cell (slope of Eq. 29)", slope(line), paper::CELL_S));
+    findings.extend(cost("T_skin without a cell", Quantity::new(line.intercept, "ns"), paper::FIXED_S));
+    findings.push(quality(line, paper::CELLS_QUALITY));
+    findings.push(Finding::more_is_better(
+        "most cells at 500 Hz, none active, with 0.2 ms for the rest of a cycle",
+        Quantity::new(paper::LIMIT, "cells"),
+        Quantity::new(limit, "cells"),
+    ));
+    Section {
+        name: "fig9".to_owned(),
+        title: "Fig. 9: central computation over the number of cells".to_owned(),
+        text: vec![
+            "Whoever computes the skin's torques in the loop has to look at every cell in every cycle, also when none is \
+             touched. Timed is the gateway's own central computation, the code that a comparing tick runs; the medians of \
+             many rounds in random order, with the middle half of the measurements as a band."
+                .to_owned(),
+            format!(
+                "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on a computer \
+                 and in a program of its own: that the line is straight is the claim, how steep it is says how quick \
+                 the computer and the loop are.",
+                number(line.slope),
+                number(line.intercept),
+                line.quality
+            ),
+            format!(
+                "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer would hold {limit} cells; its law \
+                 leads to 2163, which the paper rounds to 2160.",
+            ),
+        ],
+        figures: vec![
+            figure(
+                "fig9",
+                "T_skin over cells, none active",
+                vec![
+                    Series::new("middle half", Shape::Band, band.collect()),
+                    Series::new("median", Shape::Points, micros(|point| point[1]).collect()),
+                    Series::new("least squares", Shape::Line, ours),
+                ],
+            ),
+            beside,
+        ],
+        findings,
+        tables: Vec::new(),
+    }
+}
+
+/// A law as a polyline that is smooth on a logarithmic axis too.
+fn steps(most: f64, at: impl Fn(f64) -> f64) -> Vec<(f64, f64)> {
+    (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, at(x))).collect()
+}
+
+/// Fig. 10 with Eq. 30 and 31, and the limits of both laws.
+#[must_use]
+pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
+    let OverActive { points, line, cells: of } = over;
+    let most = count(*of);
+    let of_cells = cells.line;
+    let limit = |active| {
+        paper::most_cells(of_cells.slope * 1e-9, of_cells.intercept * 1e-9, line.slope * 1e-9, active)
+    };
+    let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
+    let figure = |name: &str, title: String, series| Figure {
+        name: name.to_owned(),
+        title,
+        x: Axis::new("active cells", ""),
+        y: Axis::new("T_skin", "µs"),
+        series,
+        ..Figure::default()
+    };
+    let mut findings = Vec::new();
+    findings.extend(cost("T_skin for each active cell (slope of Eq. 30)", slope(line), paper::ACTIVE_S));
+    findings.extend(cost(
+        &format!("T_skin of {of} cells, none active"),
+        Quantity::new(line.intercept, "ns"),
+        paper::NONE_ACTIVE_S,
+    ));
+    findings.push(quality(line, paper::ACTIVE_QUALITY));
+    findings.push(
+        Finding::told(
+            format!("T_skin of {of} cells, all active (Eq. 31)"),
+            Quantity::new((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
+        )
+        .beside(Quantity::new((paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6, "µs")),
+    );
+    let limits = [(0.0, paper::LIMIT), (paper::LIMIT_AT, paper::LIMIT_ACTIVE)];
+    findings.extend(limits.map(|(active, paper)| {
+        Finding::more_is_better(
+            format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle"),
+            Quantity::new(paper, "cells"),
+            Quantity::new(limit(active), "cells"),
+        )
+    }));
+    let touches: f64 = points.iter().map(|point| point.weight).sum();
+    Section {
+        name: "fig10".to_owned(),
+        title: "Fig. 10: central computation over the number of active cells".to_owned(),
+        text: vec![
+            format!(
+                "{of} cells, {touches} touches, each of a patch of cells of random size at a random place; the line is \
+                 weighted with the number of touches, as the paper's is with the number of samples."
+            ),
+            format!(
+                "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
+                number(line.slope),
+                number(of_cells.slope),
+                number(of_cells.intercept)
+            ),
+        ],
+        figures: vec![
+            figure(
+                "fig10",
+                format!("T_skin over active cells, of {of}"),
+                vec![
+                    Series::new("median of touches", Shape::Points, micros.clone()),
+                    Series::new(
+                        "least squares",
+                        Shape::Line,
+                        vec![(0.0, line.at(0.0) * 1e-3), (most, line.at(most) * 1e-3)],
+                    ),
+                ],
+            ),
+            Figure {
+                y: Axis::new("T_skin", "µs").log().between(0.1, 10_000.0),
+                ..figure(
+                    "fig10-paper",
+                    "The same beside the paper's law (Eq. 30)".to_owned(),
+                    vec![
+                        Series::new("measured", Shape::Points, micros),
+                        Series::new(
+                            "the paper's law",
+                            Shape::Dashed,
+                            steps(most, |active| (paper::ACTIVE_S * active + paper::NONE_ACTIVE_S) * 1e6),
+                        ),
+                    ],
+                )
+            },
+        ],
+        findings,
+        tables: vec![Table {
+            title: "Laws".to_owned(),
+            head: ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"].map(str::to_owned).to_vec(),
+            rows: [
+                ("cells (Eq. 29)", of_cells, paper::CELL_S),
+                ("active cells (Eq. 30)", *line, paper::ACTIVE_S),
+            ]
+            .map(|(name, line, paper)| {
+                vec![
+                    name.to_owned(),
+                    number(line.slope),
+                    number(line.intercept),
+                    format!("{:.4}", line.quality),
+                    number(paper * 1e9),
+                ]
+            })
+            .to_vec(),
+        }],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ticks;
+    use analysis::report::figure::Verdict;
+
+    fn line(slope: f64, intercept: f64) -> Line {
+        Line { slope, intercept, quality: 0.999, slope_half: 0.1 }
+    }
+
+    /// What is found where the law is the paper's own, in ns.
+    #[test]
+    fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
+        let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
+        let points = [0.0, 1500.0, 3000.0].map(|cells| [cells, law.at(cells), law.at(cells), law.at(cells)]);
+        let cells = OverCells { points: points.to_vec(), line: law };
+        let over = line(paper::ACTIVE_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
+        let points = [0.0, 100.0, 253.0].map(|x| Weighted { x, y: over.at(x), weight: 3.0 });
+        let active = OverActive { cells: 253, points: points.to_vec(), line: over };
+        let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
+        let all = || nine.findings.iter().chain(&ten.findings);
+        for finding in all().filter(|finding| finding.what.ends_with("ours by the paper's")) {
+            assert!((finding.ours.value - 1.0).abs() < 1e-9, "{finding:?}");
+        }
+        let limits: Vec<_> = all().filter(|finding| finding.what.starts_with("most cells")).collect();
+        assert_eq!(
+            limits.iter().map(|limit| limit.ours.value.to_string()).collect::<Vec<_>>(),
+            ["2163", "2163", "2067"]
+        );
+        assert!(limits.iter().all(|limit| limit.verdict == Verdict::Same));
+        let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
+        assert_eq!(of("T_skin for each cell").verdict, Verdict::Same);
+        assert_eq!(of("quality").verdict, Verdict::Better, "above the bar");
+        let steep = OverCells { line: Line { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
+        let worse = fig9(&steep).findings.iter().filter(|finding| finding.verdict == Verdict::Worse).count();
+        assert_eq!(worse, 3, "slope, quality and limit");
+    }
+
+    /// On a clock that goes on by 16 ns at each look every computation takes 1 ns, however many cells it is of.
+    #[test]
+    fn every_number_of_cells_and_of_active_cells_is_measured() {
+        let skin = ticks::skin(40, 1).unwrap();
+        let clock = std::cell::Cell::new(0);
+        let now = || {
+            clock.set(clock.get() + 16);
+            clock.get()
+        };
+        let extent = Extent { step: 10, rounds: 3, touches: 200 };
+        let cells = over_cells(&skin, extent, now).unwrap();
+        assert_eq!(
+            cells.points.iter().map(|point| point[0].to_string()).collect::<Vec<_>>(),
+            ["0", "10", "20", "30", "40"]
+        );
+        assert!(cells.points.iter().all(|point| (point[1] - 1.0).abs() < 1e-9));
+        let active = over_active(&skin, extent, now).unwrap();
+        assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
+        assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
+        assert!(over_cells(&skin, Extent { step: 40, ..extent }, now).is_none(), "two numbers make no law");
+    }
+}

@@ -1,0 +1,280 @@
+//! What the distributed way costs: the loop's ticks over cells and over active cells, the central computation in the
+//! same ticks, and what no paper counts: receiving.
+//!
+//! The skin lies on a fixed number of buses, so that only its cells become more. A tick of the distributed way is the
+//! whole tick, not only its part that has to do with the skin: taking the receivers' sums, controller, robot, encoding
+//! and handing on the joints.
+
+use std::hint::black_box;
+
+use protocol::can::{Format, Frame};
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::message::{Joints, Message};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use super::line::{Line, count};
+use super::samples;
+use super::ticks::{BUSES, Ticks, nanos, spread};
+use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, number};
+use model::scenario::Mode;
+use model::table::Table;
+
+/// How much is measured.
+#[derive(Clone, Copy, Debug)]
+pub struct Extent {
+    /// Numbers of cells beside one on each bus, and of active cells beside 0.
+    pub steps: usize,
+    /// How often each is measured.
+    pub rounds: usize,
+}
+
+/// Times of ticks over something, and their laws; all in ns.
+#[derive(Clone, Debug)]
+pub struct Over {
+    /// How many, a tick of the distributed way, the central computation in a comparing one.
+    pub points: Vec<[f64; 3]>,
+    /// Of distributed ticks.
+    pub distributed: Line,
+    /// Of central computations.
+    pub central: Line,
+}
+
+impl Over {
+    /// The upper end of the distributed slope's 95 % interval, by the central slope.
+    #[must_use]
+    pub fn share(&self) -> f64 {
+        self.distributed.slope_at_most() / self.central.slope
+    }
+}
+
+/// All that is measured.
+#[derive(Clone, Debug)]
+pub struct Distributed {
+    /// Over cells, none active.
+    pub cells: Over,
+    /// Over active cells of the whole skin.
+    pub active: Over,
+    /// Distributed ticks over the number of buses, in ns.
+    pub buses: Line,
+    /// Cells of the whole skin.
+    pub of: usize,
+    /// What the receiver's thread needs for a torque, from the frame to the sum, in ns.
+    pub receiving: f64,
+}
+
+/// Measures everything on parts of a skin. `None` for fewer than two steps.
+#[must_use]
+pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
+    let most = skin.cells.len();
+    let step = |step| most * step / extent.steps.max(1);
+    // A bus without cells has no robot to compute, so that there is one cell at least on each.
+    let least = skin.buses.len().min(most);
+    let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(least)).collect();
+    let active: Vec<usize> = (0..=extent.steps).map(step).collect();
+    let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
+    let over = |numbers: &[usize], ticks: &dyn Fn(usize, Mode) -> Ticks, seed| {
+        let (distributed, central) = (Mode::Distributed, Mode::Compare);
+        let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
+        let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
+        let measured = samples::interleaved(loops.len(), extent.rounds, seed, |thing| {
+            let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
+            // Once to find code and data in the caches, as after the loop before it.
+            ticks.epoch(now);
+            let took = ticks.epoch(now);
+            if *mode == distributed { took.tick } else { took.central }
+        });
+        let medians = samples::medians(&measured);
+        let pairs = numbers.iter().zip(medians.as_chunks().0);
+        let points: Vec<_> =
+            pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
+        let line = |place: fn(&[f64; 3]) -> f64| {
+            Line::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
+        };
+        Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
+    };
+    let of_part = |place: usize, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode);
+    let of_touch = |place: usize, mode| Ticks::new(skin, active.get(place).copied().unwrap_or(0), mode);
+    let (cells, active) = (over(&cells, &of_part, 11)?, over(&active, &of_touch, 12)?);
+    Some(Distributed {
+        cells,
+        active,
+        buses: over_buses(skin, extent, now)?,
+        of: most,
+        receiving: receiving(&skin.part_on(0), extent.rounds, now),
+    })
+}
+
+/// Distributed ticks over the first buses of a skin without cells.
+fn over_buses(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Line> {
+    let bare = |buses: usize| Skin {
+        buses: skin.buses.iter().take(buses).cloned().collect(),
+        cells: Vec::new(),
+        ..skin.clone()
+    };
+    let numbers: Vec<usize> = (1..=skin.buses.len()).collect();
+    let mut loops: Vec<_> =
+        numbers.iter().map(|&buses| Ticks::new(&bare(buses), 0, Mode::Distributed)).collect();
+    let measured = samples::interleaved(loops.len(), extent.rounds, 13, |thing| {
+        let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
+        ticks.epoch(now);
+        ticks.epoch(now).tick
+    });
+    let medians = samples::medians(&measured);
+    Line::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
+}
+
+/// What handling a torque costs, in ns: its packet is checked and read, and its torque takes the place of the cell's
+/// one before in the sum. Every cell of a bus answers in every epoch, each time with another torque.
+fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
+    let mut table = Table::new(skin, 0);
+    let mut epoch = Epoch(0);
+    let mut took = Vec::with_capacity(rounds);
+    for round in 0..rounds {
+        epoch = epoch.next();
+        let at = Micros(16_000 * round as u64);
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let frames = |message: Message| message.encode().frames(Format::Fd).collect::<Vec<Frame>>();
+        for frame in frames(Message::Joints { epoch, joints }) {
+            table.handle_frame(at, true, &frame, &mut |_| None);
+        }
+        let torque = [Q3_12::from_bits(if round % 2 == 0 { 409 } else { -77 }); WORDS];
+        let replies =
+            skin.cells.iter().flat_map(|cell| frames(Message::Torque { from: cell.node, epoch, torque }));
+        let replies: Vec<Frame> = replies.collect();
+        let began = now();
+        for frame in &replies {
+            table.handle_frame(at, false, black_box(frame), &mut |_| None);
+        }
+        took.push(nanos(now().saturating_sub(began)) / count(replies.len()));
+        debug_assert_eq!(
+            table.snapshot().sums.contributing as usize,
+            skin.cells.len(),
+            "everybody is in the sum"
+        );
+    }
+    super::line::quantile(&mut took, 0.5)
+}
+
+/// The bar: the distributed slope at most so much of the central one.
+const SHARE: f64 = 0.01;
+
+fn of_share(what: &str, over: &Over) -> [Finding; 3] {
+    let Over { distributed, central, .. } = over;
+    let slope = |line: &Line| Quantity::new(line.slope, "ns").plus_minus(line.slope_half);
+    [
+        Finding::told(format!("central T_skin for each {what}"), slope(central)),
+        Finding::told(format!("distributed tick for each {what}"), slope(distributed))
+            .beside(Quantity::new(0.0, "ns")),
+        Finding::told(
+            format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
+            Quantity::new(over.share() * 100.0, "%"),
+        )
+        .must(format!("at most {} %", SHARE * 100.0), over.share() <= SHARE),
+    ]
+}
+
+/// Times over cells and over active cells.
+#[must_use]
+pub fn section(measured: &Distributed) -> Section {
+    let Distributed { cells, active, buses, of, receiving } = measured;
+    let figure = |name: &str, title: String, what: &str, over: &Over| {
+        let micros = |place: fn(&[f64; 3]) -> f64| {
+            over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
+        };
+        let most = over.points.last().map_or(0.0, |point| point[0]);
+        let law = |line: &Line| vec![(0.0, line.at(0.0) * 1e-3), (most, line.at(most) * 1e-3)];
+        Figure {
+            name: name.to_owned(),
+            title,
+            x: Axis::new(what, ""),
+            y: Axis::new("time in a tick", "µs"),
+            series: vec![
+                Series::new("central T_skin", Shape::Points, micros(|point| point[2])),
+                Series::new("distributed: the whole tick", Shape::Points, micros(|point| point[1])),
+                Series::new("", Shape::Line, law(&over.central)),
+                Series::new("", Shape::Line, law(&over.distributed)),
+            ],
+            ..Figure::default()
+        }
+    };
+    let mut findings = Vec::new();
+    findings.extend(of_share("cell", cells));
+    findings.extend(of_share("active cell", active));
+    findings.push(Finding::told(
+        "distributed tick for each further bus",
+        Quantity::new(buses.slope, "ns").plus_minus(buses.slope_half),
+    ));
+    findings.push(Finding::told(
+        "the same by the most cells that a bus has numbers for",
+        Quantity::new(buses.slope / 254.0, "ns"),
+    ));
+    findings.push(Finding::told(
+        "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
+        Quantity::new(*receiving, "ns"),
+    ));
+    findings.push(Finding::told(
+        "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
+        Quantity::new(receiving / (8.0 * active.central.slope), ""),
+    ));
+    Section {
+        name: "distributed".to_owned(),
+        title: "The distributed way over cells and active cells".to_owned(),
+        text: vec![
+            format!(
+                "Up to {of} cells on {BUSES} buses. Of the distributed way the whole tick is timed: sums of all buses, controller, \
+                 robot, joints. Of the central way only T_skin, the part that computes torques. Both in the same run, \
+                 in random order. The robot is held where it is.",
+            ),
+            format!(
+                "A tick of the distributed way is given one sum of each bus and nothing of its cells, so only buses make it \
+                 longer: {} ns each, whether they have cells or not. What becomes more with the cells is the receivers' work, in \
+                 threads of their own: {} ns for a torque that came, once an epoch, and only of cells in contact. What the \
+                 kernel takes to bring a frame to the receiver is not in that.",
+                number(buses.slope),
+                number(*receiving)
+            ),
+        ],
+        figures: vec![
+            figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
+            figure("distributed-active", format!("Over active cells, of {of}"), "active cells", active),
+        ],
+        findings,
+        tables: Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ticks;
+
+    /// A clock that every look moves on by 1 ns: a tick of the distributed way looks twice, whatever the cells.
+    #[test]
+    fn both_ways_are_measured_over_both_numbers() {
+        let skin = ticks::skin(48, BUSES).unwrap();
+        let clock = std::cell::Cell::new(0);
+        let now = || {
+            clock.set(clock.get() + 1);
+            clock.get()
+        };
+        let measured = measure(&skin, Extent { steps: 4, rounds: 3 }, now).unwrap();
+        for (over, wanted) in [
+            (&measured.cells, ["12", "12", "24", "36", "48"]),
+            (&measured.active, ["0", "12", "24", "36", "48"]),
+        ] {
+            let numbers: Vec<_> = over.points.iter().map(|point| point[0].to_string()).collect();
+            assert_eq!(numbers, wanted);
+            assert!(
+                over.points
+                    .iter()
+                    .all(|[_, tick, central]| (tick - 1.0).abs() + (central - 1.0).abs() < 1e-9)
+            );
+        }
+        assert!((measured.receiving - 0.25).abs() < 1e-9, "four cells between two looks");
+        let section = section(&measured);
+        assert_eq!(section.figures.len(), 2);
+        assert!(measure(&skin, Extent { steps: 1, rounds: 3 }, now).is_none());
+    }
+}

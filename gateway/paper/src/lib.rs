@@ -1,0 +1,287 @@
+//! The paper's experiments, and some beyond it: measured, drawn and judged.
+//!
+//! ```text
+//!   Lab (a clock, whole benches) ─┐
+//!                                 ├─> Session::perform ─> Section: figures, findings with verdicts, tables
+//!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
+//! ```
+//!
+//! What is computed here is pure but for the clock; benches of processes are run by whoever implements [`Lab`].
+//! Verdicts are computed from what was measured and stand nowhere.
+//!
+//! This module alone, of all the gateway, calls the cells' code: to count its operations and to sum without a bus. The
+//! gateway meets cells on the bus only, and `tests/cells.rs` holds it to that.
+
+pub mod arithmetic;
+pub mod arm;
+pub mod central;
+pub mod distributed;
+pub mod files;
+pub mod line;
+pub mod load;
+pub mod moving;
+pub mod recorded;
+pub mod samples;
+pub mod sums;
+pub mod ticks;
+pub mod tree;
+
+use std::fmt;
+use std::str::FromStr;
+
+use protocol::skin::Skin;
+
+use analysis::report::figure::Section;
+use arm::Reply;
+use moving::Run;
+
+/// One experiment.
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+pub enum Experiment {
+    /// Torques of the moving arm.
+    Fig6,
+    /// Its velocities and active cells.
+    Fig7,
+    /// Its cycle times.
+    Fig8,
+    /// Central computation over cells.
+    Fig9,
+    /// Central computation over active cells.
+    Fig10,
+    /// The distributed way over both.
+    Distributed,
+    /// Errors of sums.
+    Sums,
+    /// Errors of the sine.
+    Sine,
+    /// Operations of a Jacobian.
+    Kernels,
+    /// Bus load.
+    Load,
+}
+
+impl Experiment {
+    /// All of them, in the order of a page.
+    pub const ALL: [Self; 10] = [
+        Self::Fig6,
+        Self::Fig7,
+        Self::Fig8,
+        Self::Fig9,
+        Self::Fig10,
+        Self::Distributed,
+        Self::Sums,
+        Self::Sine,
+        Self::Kernels,
+        Self::Load,
+    ];
+
+    /// Its name on the command line and in files.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Fig6 => "fig6",
+            Self::Fig7 => "fig7",
+            Self::Fig8 => "fig8",
+            Self::Fig9 => "fig9",
+            Self::Fig10 => "fig10",
+            Self::Distributed => "distributed",
+            Self::Sums => "sums",
+            Self::Sine => "sine",
+            Self::Kernels => "kernels",
+            Self::Load => "load",
+        }
+    }
+
+    /// What it does, in a line.
+    #[must_use]
+    pub const fn about(self) -> &'static str {
+        match self {
+            Self::Fig6 => {
+                "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8"
+            }
+            Self::Fig7 => "joint velocities and active cells of the moving arm",
+            Self::Fig8 => "cycle times of the moving arm, the central computation switched off at 5.7 s",
+            Self::Fig9 => "central computation over 0 to 3000 cells, none active (Eq. 29)",
+            Self::Fig10 => "central computation over active cells (Eq. 30, 31), and the most cells at 500 Hz",
+            Self::Distributed => "the loop's ticks over cells and active cells, and the cost of receiving",
+            Self::Sums => "error of summed torques over active cells: cut off, rounded, carried",
+            Self::Sine => "error of the 16-bit sines over the whole circle",
+            Self::Kernels => "operations of one cell's Jacobian, by both kernels",
+            Self::Load => "bus load over cells for common bit rates",
+        }
+    }
+
+    /// About how long it takes, in s, beside what those before it have done already.
+    #[must_use]
+    pub const fn seconds(self, effort: Effort) -> u64 {
+        match (effort, self) {
+            (Effort::Full, Self::Fig6) => 32,
+            (Effort::Quick, Self::Fig6) => 10,
+            (Effort::Full, Self::Distributed) => 20,
+            (Effort::Full, Self::Sums) => 10,
+            (Effort::Full, Self::Fig9 | Self::Fig10) => 4,
+            (_, _) => 1,
+        }
+    }
+}
+
+impl fmt::Display for Experiment {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Experiment {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|experiment| experiment.name() == name);
+        found.ok_or_else(|| {
+            let names: Vec<_> = Self::ALL.iter().map(|experiment| experiment.name()).collect();
+            format!("there is no experiment of this name; there are all, {}", names.join(", "))
+        })
+    }
+}
+
+/// How much is measured.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Effort {
+    /// Enough to see that everything works; laws and errors are those of less.
+    Quick,
+    /// What the paper did.
+    Full,
+}
+
+/// What experiments need of the world.
+pub trait Lab {
+    /// Why a bench did not come to its end.
+    type Error;
+
+    /// A monotonic clock in ns.
+    fn now(&self) -> u64;
+
+    /// Runs a whole bench and reads what it recorded.
+    ///
+    /// # Errors
+    /// When it did not come to its end, or was not recorded whole.
+    fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Self::Error>;
+
+    /// Whether to go on; asked between two measurements.
+    ///
+    /// # Errors
+    /// When somebody wants it to end.
+    fn go_on(&mut self) -> Result<(), Self::Error>;
+}
+
+/// Some experiments, one after the other; what several of them need is measured once.
+#[derive(Debug)]
+pub struct Session {
+    effort: Effort,
+    single: Option<Run>,
+    over_cells: Option<central::OverCells>,
+    large: Option<Skin>,
+}
+
+impl Session {
+    /// Nothing measured yet.
+    #[must_use]
+    pub const fn new(effort: Effort) -> Self {
+        Self { effort, single: None, over_cells: None, large: None }
+    }
+
+    /// Does one experiment.
+    ///
+    /// # Errors
+    /// Those of the lab.
+    ///
+    /// # Panics
+    /// Never: skins that are generated here fit, and laws have points enough.
+    pub fn perform<L: Lab>(&mut self, experiment: Experiment, lab: &mut L) -> Result<Section, L::Error> {
+        lab.go_on()?;
+        Ok(match experiment {
+            Experiment::Fig6 => {
+                let single = self.single(lab)?.clone();
+                lab.go_on()?;
+                moving::fig6(&single, &lab.bench(Reply::Sum, self.effort)?)
+            }
+            Experiment::Fig7 => moving::fig7(self.single(lab)?),
+            Experiment::Fig8 => moving::fig8(self.single(lab)?),
+            Experiment::Fig9 => central::fig9(self.over_cells(lab)),
+            Experiment::Fig10 => {
+                let cells = self.over_cells(lab).clone();
+                lab.go_on()?;
+                let (cells_of_arm, extent) = (self.arm(), self.extent());
+                let active = central::over_active(&cells_of_arm, extent, || lab.now());
+                central::fig10(&active.expect("more than two numbers of active cells"), &cells)
+            }
+            Experiment::Distributed => {
+                let (steps, rounds) = self.pick((4, 10), (30, 200));
+                let extent = distributed::Extent { steps, rounds };
+                let now = || lab.now();
+                let measured = distributed::measure(self.large(), extent, now);
+                distributed::section(&measured.expect("more than two numbers of cells"))
+            }
+            Experiment::Sums => {
+                let (touches, epochs) = self.pick((2, 5), (20, 50));
+                let arm = self.arm();
+                let mut errors = Vec::new();
+                for active in sums::numbers(&arm) {
+                    lab.go_on()?;
+                    errors.push(sums::errors(&arm, active, sums::Extent { touches, epochs }));
+                }
+                sums::section(&arm, &errors)
+            }
+            Experiment::Sine => arithmetic::sine_section(),
+            Experiment::Kernels => {
+                let arm = self.arm();
+                arithmetic::kernels_section(&arm.robot.name, &arithmetic::Costs::of(&arm))
+            }
+            Experiment::Load => load::section(),
+        })
+    }
+
+    fn pick<T>(&self, quick: T, full: T) -> T {
+        match self.effort {
+            Effort::Quick => quick,
+            Effort::Full => full,
+        }
+    }
+
+    fn extent(&self) -> central::Extent {
+        self.pick(
+            central::Extent { step: 24, rounds: 20, touches: 100 },
+            central::Extent { step: 100, rounds: 1_000, touches: 8_000 },
+        )
+    }
+
+    /// The arm of the paper, or a small one.
+    fn arm(&self) -> Skin {
+        ticks::skin(self.pick(24, 253), 1).expect("so many cells fit on the arm")
+    }
+
+    /// As many cells as in Fig. 9, or fewer.
+    fn large(&mut self) -> &Skin {
+        let cells = self.pick(240, ticks::MOST_CELLS);
+        self.large.get_or_insert_with(|| {
+            ticks::skin(cells, ticks::BUSES).expect("so many cells fit on the arm and on so many buses")
+        })
+    }
+
+    fn over_cells<L: Lab>(&mut self, lab: &L) -> &central::OverCells {
+        let extent = self.extent();
+        if self.over_cells.is_none() {
+            self.over_cells = central::over_cells(self.large(), extent, || lab.now());
+        }
+        self.over_cells.as_ref().expect("more than two numbers of cells")
+    }
+
+    fn single<L: Lab>(&mut self, lab: &mut L) -> Result<&Run, L::Error> {
+        Ok(match &mut self.single {
+            Some(run) => run,
+            none => none.insert(lab.bench(Reply::Torque, self.effort)?),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests;

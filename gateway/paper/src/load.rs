@@ -1,0 +1,128 @@
+//! How much of a real bus the paper's arm needs, over the number of cells and by bit rate: the worst case of [`analysis::fit`].
+
+use super::arm;
+use super::line::count;
+use analysis::fit::limits::NODES;
+use analysis::fit::verdict::Answer;
+use analysis::fit::{self, COMPUTATION_NS, Row};
+use analysis::report::figure::{Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table};
+
+/// Cells in the figure.
+const MOST: u32 = 300;
+
+/// Loads over cells.
+#[must_use]
+pub fn section() -> Section {
+    let skin = arm::paper();
+    let rows = fit::table(&skin, None, COMPUTATION_NS);
+    let cells = skin.cells.len();
+    let series = |row: &Row| {
+        let case = &row.fullest.judged.case;
+        let points = (0..=MOST).step_by(10);
+        let points =
+            points.map(|cells| (f64::from(cells), 100.0 * case.with_cells(cells).load().total())).collect();
+        Series::new(Answer::worst_case(&row.fullest.judged).rates, Shape::Line, points)
+    };
+    // Nobody has chosen any of these rates, so none is judged.
+    let finding = |row: &Row| {
+        let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.judged);
+        let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
+        Finding::told(what, Quantity::new(100.0 * load, "%"))
+    };
+    Section {
+        name: "load".to_owned(),
+        title: "Bus load over the number of cells".to_owned(),
+        text: vec![
+            "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
+                 each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
+                 100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
+                 numbers of gateway fit, which says more about one skin."
+                .to_owned(),
+            format!(
+                "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
+                 the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
+            ),
+        ],
+        figures: vec![Figure {
+            name: "load".to_owned(),
+            title: "Load of one bus, every cell in contact, worst case".to_owned(),
+            x: Axis::new("cells", "").between(0.0, f64::from(MOST)),
+            y: Axis::new("load", "%").between(0.0, 200.0),
+            series: rows.iter().map(series).collect(),
+            marks: vec![
+                Mark { on: On::Y, at: 100.0, label: "full".to_owned() },
+                Mark { on: On::X, at: f64::from(NODES - 1), label: "nodes electrically".to_owned() },
+                Mark { on: On::X, at: count(cells), label: "the paper's arm".to_owned() },
+            ],
+            ..Figure::default()
+        }],
+        findings: rows.iter().map(finding).collect(),
+        tables: vec![table(&rows, cells)],
+    }
+}
+
+fn table(rows: &[Row], cells: usize) -> Table {
+    let row = |row: &Row| {
+        let judged = &row.fullest.judged;
+        let Answer { load, rates, .. } = Answer::worst_case(judged);
+        vec![
+            rates,
+            format!("{:.1}", judged.case.packet_ns() as f64 / 1e3),
+            format!("{:.1}", 100.0 * (load - judged.load.heartbeats)),
+            format!("{:.1}", 100.0 * load),
+            row.fullest.most.in_time().to_string(),
+            row.need.in_time().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),
+            row.need.in_short(),
+        ]
+    };
+    let head = [
+        "bit rates",
+        "packet, µs",
+        "joints and replies, %",
+        "with heartbeats, %",
+        "cells a bus",
+        "buses by time",
+        "buses needed",
+    ];
+    Table {
+        title: format!(
+            "Worst case: load of one bus with {cells} cells, cells that a bus has time for, buses for {cells} cells"
+        ),
+        head: head.map(str::to_owned).into(),
+        rows: rows.iter().map(row).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_buses_are_those_of_fit_and_no_rate_that_nobody_chose_is_judged() {
+        let section = section();
+        let column = |at: usize| section.tables[0].rows.iter().map(move |row| row[at].as_str());
+        let named: Vec<_> = column(0).zip(column(5)).zip(column(6)).collect();
+        assert_eq!(
+            named,
+            [
+                (("classic 500k", "10"), "10 time"),
+                (("classic 1M", "5"), "5 time"),
+                (("500k/2M", "3"), "3 time, nodes"),
+                (("500k/5M", "2"), "3 nodes"),
+                (("1M/2M", "3"), "3 time, nodes"),
+                (("1M/5M", "2"), "3 nodes"),
+                (("1M/8M", "1"), "3 nodes"),
+            ]
+        );
+        assert!(section.findings.iter().all(|finding| finding.bar.is_none()), "{:?}", section.findings);
+        let what = |at: usize| section.findings[at].what.as_str();
+        assert_eq!(
+            (what(5), what(6)),
+            (
+                "worst case of one bus at 1M/5M: does not fit: bandwidth (all 253 cells answer)",
+                "worst case of one bus at 1M/8M: in time, but 254 nodes (all 253 cells answer)"
+            )
+        );
+        assert!((section.findings[5].ours.value - 118.9).abs() < 0.05);
+    }
+}

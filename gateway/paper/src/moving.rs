@@ -1,0 +1,373 @@
+//! Fig. 6, 7 and 8: the moving arm, of recorded runs of a whole bench.
+
+use serde_json::Value;
+
+use super::line::{Line, Weighted, count, quantile};
+use super::recorded::Row;
+use analysis::paper;
+use analysis::report::figure::{
+    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
+};
+
+/// A run: its ticks, and the figures of its end ([`bench::summary::Summary`] as JSON).
+#[derive(Clone, Debug)]
+pub struct Run {
+    /// Its ticks, in the order of time.
+    pub rows: Vec<Row>,
+    /// What it came to.
+    pub summary: Value,
+    /// Joints of the robot.
+    pub joints: usize,
+}
+
+impl Run {
+    /// A figure of the summary by its keys; not a number where there is none.
+    #[must_use]
+    pub fn figure(&self, keys: &[&str]) -> f64 {
+        let value = keys.iter().try_fold(&self.summary, |value, key| match key.parse::<usize>() {
+            Ok(place) => value.get(place),
+            Err(_) => value.get(key),
+        });
+        value.and_then(Value::as_f64).unwrap_or(f64::NAN)
+    }
+
+    /// When the central computation was switched off, in s; `None` in a run that compared to its end.
+    fn switched_s(&self) -> Option<f64> {
+        let last = self.rows.iter().rposition(|row| row.central.is_some())?;
+        self.rows.get(last + 1).map(|row| row.time_s)
+    }
+
+    fn over_time(&self, value: impl Fn(&Row) -> f64) -> Vec<(f64, f64)> {
+        self.rows.iter().map(|row| (row.time_s, value(row))).collect()
+    }
+
+    fn switched(&self) -> Vec<Mark> {
+        let label = "central computation off".to_owned();
+        self.switched_s().map(|at| Mark { on: On::X, at, label }).into_iter().collect()
+    }
+
+    fn replies(&self) -> Finding {
+        let due = self.figure(&["buses", "0", "replies", "due"]);
+        let in_time = self.figure(&["buses", "0", "replies", "in_time"]);
+        Finding::told(format!("replies in time, of {due}"), Quantity::new(in_time, ""))
+    }
+}
+
+fn time() -> Axis {
+    Axis::new("time", "s")
+}
+
+/// Fig. 6: central against distributed torques of a run in which each cell answers itself, and the errors of that one
+/// and of one in which they answer with sums.
+#[must_use]
+pub fn fig6(single: &Run, summed: &Run) -> Section {
+    let joint = |joint: usize| Figure {
+        name: format!("fig6-joint{}", joint + 1),
+        title: format!("Joint {}", joint + 1),
+        size: Size::Half,
+        x: time(),
+        y: Axis::new("torque", "Nm"),
+        series: vec![
+            Series::new(
+                "central",
+                Shape::Line,
+                single.over_time(|row| row.central.map_or(f64::NAN, |torque| at(&torque, joint))),
+            ),
+            Series::new("distributed", Shape::Dashed, single.over_time(|row| at(&row.distributed, joint))),
+        ],
+        marks: single.switched(),
+    };
+    let error = |run: &Run, kind: &str, key: &str| run.figure(&["accuracy", kind, key]);
+    let (mean_single, mean_summed) = (error(single, "single", "mean_nm"), error(summed, "sums", "mean_nm"));
+    let nm = |value| Quantity::new(value, "Nm");
+    let [summed_due, summed_in] =
+        ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
+    let row = |name: &str, run: &Run, kind: &str| {
+        let [mean, greatest, torques] =
+            ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
+        vec![name.to_owned(), mean, greatest, torques]
+    };
+    Section {
+        name: "fig6".to_owned(),
+        title: "Fig. 6: torques of the moving arm, computed in the loop and on the cells".to_owned(),
+        text: vec![
+            format!(
+                "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm gives way to touches; up to {:.1} s \
+                 the loop computes the torques itself as well.",
+                single.figure(&["cells"]),
+                single.switched_s().unwrap_or(f64::NAN)
+            ),
+            "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
+             the cell loads, so they hold nothing of what was on its way; the curves are what the loop had at each tick. \
+             The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
+             compared."
+                .to_owned(),
+            bare(single),
+        ],
+        figures: (0..single.joints).map(joint).collect(),
+        findings: vec![
+            Finding::less_is_better("mean error of a cell's torque, Q3.12", nm(paper::SINGLE_NM), nm(mean_single))
+                .must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
+            Finding::less_is_better("mean error of the summed torque, Q7.8", nm(paper::SUMMED_NM), nm(mean_summed)),
+            single.replies(),
+            Finding::told(
+                format!("cells' torques that were in sums in time, of {summed_due}"),
+                Quantity::new(summed_in, ""),
+            ),
+        ],
+        tables: vec![Table {
+            title: "Errors against the central computation, Nm".to_owned(),
+            head: ["what", "mean", "greatest", "torques"].map(str::to_owned).to_vec(),
+            rows: vec![
+                row("single cells, Q3.12, loaded joints", single, "single"),
+                row("the same against unrounded parameters", single, "unquantised"),
+                row("the whole skin, sum of Q3.12 words", single, "whole"),
+                row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
+            ],
+        }],
+    }
+}
+
+/// Which joints bear nothing.
+fn bare(run: &Run) -> String {
+    let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
+    let bare: Vec<_> =
+        (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
+    if bare.is_empty() {
+        "Every joint bears something.".to_owned()
+    } else {
+        format!("No torque in joints {}, beyond which no cell sits.", bare.join(", "))
+    }
+}
+
+fn at(values: &[f64], joint: usize) -> f64 {
+    values.get(joint).copied().unwrap_or(f64::NAN)
+}
+
+/// Fig. 7: joint velocities and active cells.
+#[must_use]
+pub fn fig7(run: &Run) -> Section {
+    let velocity = |joint: usize| {
+        let label = format!("joint {}", joint + 1);
+        Series::new(label, Shape::Line, run.over_time(|row| at(&row.velocity, joint)))
+    };
+    let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
+    let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
+    Section {
+        name: "fig7".to_owned(),
+        title: "Fig. 7: joint velocities and active cells".to_owned(),
+        text: vec![
+            "The same run. The arm moves because the cells' torques say so: the loop uses theirs only."
+                .to_owned(),
+        ],
+        figures: vec![
+            Figure {
+                name: "fig7-velocities".to_owned(),
+                title: "Joint velocities".to_owned(),
+                x: time(),
+                y: Axis::new("velocity", "rad/s"),
+                series: (0..run.joints).map(velocity).collect(),
+                marks: run.switched(),
+                ..Figure::default()
+            },
+            Figure {
+                name: "fig7-active".to_owned(),
+                title: "Active cells".to_owned(),
+                x: time(),
+                y: Axis::new("cells in the torque", ""),
+                series: vec![Series::new(
+                    "active cells",
+                    Shape::Steps,
+                    run.over_time(|row| f64::from(row.contributing)),
+                )],
+                marks: run.switched(),
+                ..Figure::default()
+            },
+        ],
+        findings: vec![
+            Finding::told("most cells active at once", Quantity::new(f64::from(active), "cells")),
+            Finding::told("greatest joint velocity", Quantity::new(fastest, "rad/s")),
+        ],
+        tables: Vec::new(),
+    }
+}
+
+/// Cycles of which the median is drawn.
+const TOGETHER: usize = 25;
+
+/// The median of some ticks' times in µs.
+fn median<'a>(rows: impl Iterator<Item = &'a Row>, time: impl Fn(&Row) -> f64) -> f64 {
+    quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
+}
+
+/// Fig. 8: cycle times, and the central computation in them until it is switched off.
+#[must_use]
+pub fn fig8(run: &Run) -> Section {
+    let cells = run.figure(&["cells"]);
+    let before = || run.rows.iter().filter(|row| row.central.is_some());
+    let after = || run.rows.iter().filter(|row| row.central.is_none());
+    let none_active = {
+        let times: Vec<f64> =
+            before().filter(|row| row.contributing == 0).map(|row| row.central_us).collect();
+        times.iter().sum::<f64>() / count(times.len())
+    };
+    let total = [median(before(), |row| row.took_us), median(after(), |row| row.took_us)];
+    let off = after().map(|row| row.central_us).fold(0.0, f64::max);
+    let slope = over_active(after());
+    let top = {
+        let mut times: Vec<f64> = run.rows.iter().map(|row| row.took_us).collect();
+        2.0 * quantile(&mut times, 0.99)
+    };
+    let beyond = run.rows.iter().filter(|row| row.took_us > top).count();
+    let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
+    let us = |value| Quantity::new(value, "µs");
+    let figure = |name: &str, title: &str, top, series| Figure {
+        name: name.to_owned(),
+        title: title.to_owned(),
+        x: time(),
+        y: Axis::new("time in a cycle", "µs").between(0.0, top),
+        series,
+        marks: run.switched(),
+        ..Figure::default()
+    };
+    let medians = |time: &dyn Fn(&Row) -> f64| {
+        let pieces = run.rows.chunks(TOGETHER).filter_map(|rows| Some((rows.first()?.time_s, rows)));
+        pieces.map(|(at, rows)| (at, median(rows.iter(), time))).collect::<Vec<_>>()
+    };
+    let per_frame = {
+        let frames = run.figure(&["buses", "0", "uplink", "delivered"]);
+        run.figure(&["processor", "gateway"]) * run.figure(&["duration_s"]) * 1e6 / frames
+    };
+    let mut findings = vec![
+        Finding::less_is_better(
+            format!("mean T_skin while none of {cells} cells is active"),
+            us((paper::CELL_S * cells + paper::FIXED_S) * 1e6),
+            us(none_active),
+        ),
+        Finding::told("T_skin after the switch, greatest", us(off)).beside(us(0.0)).must("0", off <= 0.0),
+        Finding::told("T_total before the switch, median", us(total[0])),
+        Finding::less_is_better("T_total after the switch, median", us(paper::REST_S * 1e6), us(total[1]))
+            .must("less than before", total[1] < total[0]),
+    ];
+    findings.extend(slope.map(|line| {
+        let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
+        Finding::told("T_total after the switch for each active cell", slope)
+    }));
+    findings.push(Finding::told("ticks above 2 ms", Quantity::new(count(over), "")));
+    findings.push(Finding::told(
+        "all of the gateway's processor time by frames that came: socket, loop, recorder",
+        us(per_frame),
+    ));
+    Section {
+        name: "fig8".to_owned(),
+        title: format!("Fig. 8: cycle times, {cells} cells"),
+        text: vec![
+            "T_total is how long a tick took from reading the sums to handing on its record, T_skin the central computation in \
+             it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated."
+                .to_owned(),
+            format!(
+                "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine did something else, lie \
+                 beyond and are in the data.",
+                run.rows.len()
+            ),
+        ],
+        figures: vec![
+            figure(
+                "fig8",
+                "Cycle times",
+                top,
+                vec![
+                    Series::new("T_total", Shape::Line, run.over_time(|row| row.took_us)),
+                    Series::new("T_skin", Shape::Line, run.over_time(|row| row.central_us)),
+                ],
+            ),
+            figure(
+                "fig8-medians",
+                "The same, medians of 25 cycles",
+                top / 2.0,
+                vec![
+                    Series::new("T_total", Shape::Steps, medians(&|row| row.took_us)),
+                    Series::new("T_skin", Shape::Steps, medians(&|row| row.central_us)),
+                ],
+            ),
+        ],
+        findings,
+        tables: Vec::new(),
+    }
+}
+
+/// Median times of ticks over active cells, by the number of ticks.
+fn over_active<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<Line> {
+    let mut by_active = std::collections::BTreeMap::<u32, Vec<f64>>::new();
+    for row in rows {
+        by_active.entry(row.contributing).or_default().push(row.took_us);
+    }
+    let points = by_active.into_iter().map(|(active, mut times)| Weighted {
+        x: f64::from(active),
+        y: quantile(&mut times, 0.5),
+        weight: count(times.len()),
+    });
+    Line::through(&points.collect::<Vec<_>>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use analysis::report::figure::Verdict;
+    use serde_json::json;
+
+    /// A second of ticks: the central computation takes 3 µs and is off from 0.5 s on.
+    fn run() -> Run {
+        let row = |tick: u16| {
+            let central = (tick < 250).then_some([1.0; 6]);
+            let central_us = if central.is_some() { 3.0 } else { 0.0 };
+            Row {
+                time_s: f64::from(tick) * 0.002,
+                velocity: [0.1, -0.4, 0.0, 0.0, 0.0, 0.0],
+                distributed: [1.001; 6],
+                central,
+                contributing: u32::from(tick % 20),
+                took_us: 1.0 + central_us,
+                central_us,
+            }
+        };
+        let summary = json!({
+            "cells": 253, "duration_s": 1.0, "processor": { "gateway": 0.04 },
+            "accuracy": {
+                "single": { "mean_nm": 6e-5, "max_nm": 4e-4, "count": 1000 },
+                "sums": { "mean_nm": 0.004, "max_nm": 0.02, "count": 500 },
+            },
+            "buses": [{ "replies": { "due": 100, "in_time": 99 }, "uplink": { "delivered": 4000 } }],
+        });
+        Run { rows: (0..500).map(row).collect(), summary, joints: 6 }
+    }
+
+    #[test]
+    fn the_switch_is_found_and_what_came_before_it_and_after() {
+        let run = run();
+        assert_eq!(run.switched_s(), Some(0.5));
+        let section = fig8(&run);
+        let of = |what: &str| section.findings.iter().find(|finding| finding.what.starts_with(what)).unwrap();
+        assert!((of("mean T_skin").ours.value - 3.0).abs() < 1e-9);
+        assert!((of("T_total before").ours.value - 4.0).abs() < 1e-9);
+        assert!((of("T_total after the switch, median").ours.value - 1.0).abs() < 1e-9);
+        assert!(section.findings.iter().all(|finding| finding.verdict != Verdict::Worse));
+        assert!((of("all of the gateway's").ours.value - 10.0).abs() < 1e-9);
+        let mut never_off = run;
+        never_off.rows.iter_mut().for_each(|row| row.central_us = 3.0);
+        assert!(fig8(&never_off).findings.iter().any(|finding| finding.verdict == Verdict::Worse));
+    }
+
+    #[test]
+    fn every_joint_has_its_figure_and_errors_stand_beside_the_papers() {
+        let run = run();
+        let section = fig6(&run, &run);
+        assert_eq!(section.figures.len(), 6);
+        let central = &section.figures[0].series[0].points;
+        assert!(central[249].1.is_finite() && central[250].1.is_nan(), "a gap from the switch on");
+        assert!((section.findings[0].ours.value - 6e-5).abs() < 1e-12);
+        assert!((section.findings[1].ours.value - 0.004).abs() < 1e-12);
+        let section = fig7(&run);
+        assert_eq!((section.figures[0].series.len(), section.findings[0].ours.value), (6, 19.0));
+    }
+}

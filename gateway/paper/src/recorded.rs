@@ -1,0 +1,125 @@
+//! The ticks of a recorded run, as experiments look at them.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use protocol::packet::WORDS;
+
+use trace::capture::{CaptureError, Item, Items};
+use trace::ros2::Message;
+use trace::ros2::cdr::CdrError;
+use trace::ros2::read;
+use trace::ros2::skin::{LoopTiming, Torques};
+use trace::ros2::standard::JointState;
+
+/// A tick.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Row {
+    /// When it should have begun, in s since the first one.
+    pub time_s: f64,
+    /// Joint velocities in rad/s.
+    pub velocity: [f64; WORDS],
+    /// The sum of what cells said, in Nm.
+    pub distributed: [f64; WORDS],
+    /// The central torque in Nm, in ticks that compared.
+    pub central: Option<[f64; WORDS]>,
+    /// Cells in the cells' torque.
+    pub contributing: u32,
+    /// How long the tick took, in µs.
+    pub took_us: f64,
+    /// How long the central computation took of that, in µs.
+    pub central_us: f64,
+}
+
+/// Reads the ticks of a recording, in the order of time.
+///
+/// # Errors
+/// When it cannot be read, is damaged, or has no ticks.
+pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
+    let mut items = Items::open_all(&[path.to_path_buf()])?;
+    let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
+    while let Some(item) = items.next()? {
+        if let Item::Other(other) = item {
+            // What is not as it should be was written by somebody else: it is no tick of ours.
+            let _ = take(&mut rows, other.topic, other.schema, other.nanos, other.message);
+        }
+    }
+    let first = rows.keys().next().copied().unwrap_or(0);
+    Ok(rows.into_iter().map(|(nanos, row)| Row { time_s: seconds(nanos - first), ..row }).collect())
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a run's length, far below 2^53 ns")]
+fn seconds(nanos: u64) -> f64 {
+    nanos as f64 * 1e-9
+}
+
+/// Takes a message of a tick into its row; others are left alone.
+fn take(
+    rows: &mut BTreeMap<u64, Row>,
+    topic: &str,
+    schema: &str,
+    nanos: u64,
+    message: &[u8],
+) -> Result<(), CdrError> {
+    let is_states = schema == JointState::TYPE && topic.ends_with("/joint_states");
+    if is_states {
+        let joints = read::joints(message)?;
+        rows.entry(nanos).or_default().velocity = by_joint(&joints.velocity);
+    } else if schema == Torques::TYPE {
+        let torques = read::torques(message)?;
+        let row = rows.entry(nanos).or_default();
+        row.distributed = by_joint(&torques.distributed);
+        row.central = (!torques.central.is_empty()).then(|| by_joint(&torques.central));
+    } else if schema == LoopTiming::TYPE {
+        let timing = read::timing(message, nanos)?;
+        let row = rows.entry(nanos).or_default();
+        (row.took_us, row.central_us, row.contributing) =
+            (timing.took_us, timing.central_us, timing.contributing);
+    }
+    Ok(())
+}
+
+/// A number for each joint; 0 for those that the robot has not.
+fn by_joint(numbers: &[f64]) -> [f64; WORDS] {
+    core::array::from_fn(|joint| numbers.get(joint).copied().unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use trace::ros2::cdr::Writer;
+
+    #[test]
+    fn the_messages_of_a_tick_make_one_row() {
+        let mut rows = BTreeMap::new();
+        let mut say = |topic: &str, schema: &str, nanos, message: &dyn Fn(&mut Writer<'_>)| {
+            let mut bytes = Vec::new();
+            message(&mut Writer::new(&mut bytes));
+            take(&mut rows, topic, schema, nanos, &bytes).unwrap();
+        };
+        let names = ["joint1", "joint2"].map(str::to_owned);
+        let states = JointState {
+            nanos: 5,
+            names: &names,
+            position: &[9.0, 9.0],
+            velocity: &[0.5, -0.5],
+            effort: &[8.0, 8.0],
+        };
+        let commands = JointState { velocity: &[7.0, 7.0], ..states };
+        let torques = Torques { nanos: 5, distributed: &[1.0, 2.0], central: &[1.5, 2.5], active: 3 };
+        let timing =
+            LoopTiming { nanos: 5, took_us: 6.0, central_us: 4.0, contributing: 3, ..LoopTiming::default() };
+        say("/UR5/joint_commands", JointState::TYPE, 5, &|out| commands.write(out));
+        say("/UR5/joint_states", JointState::TYPE, 5, &|out| states.write(out));
+        say("/UR5/torques", Torques::TYPE, 5, &|out| torques.write(out));
+        say("/gateway/timing", LoopTiming::TYPE, 5, &|out| timing.write(out));
+        let without = Torques { nanos: 9, central: &[], active: 0, ..torques };
+        say("/UR5/torques", Torques::TYPE, 9, &|out| without.write(out));
+        assert_eq!(rows.len(), 2);
+        let row = rows[&5];
+        assert_eq!(row.velocity[..3], [0.5, -0.5, 0.0]);
+        assert_eq!((row.distributed[1], row.central.map(|central| central[0])), (2.0, Some(1.5)));
+        assert_eq!((row.took_us, row.central_us, row.contributing), (6.0, 4.0, 3));
+        assert_eq!(rows[&9].central, None);
+    }
+}

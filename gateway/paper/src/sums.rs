@@ -1,0 +1,239 @@
+//! How far sums of torques along a tree are from the central computation, over the number of active cells: when each
+//! cell cuts off, when it rounds, and when it carries what rounding took away into its next value.
+
+use protocol::fixed::Q5_10;
+use protocol::message::SkinSensors;
+use protocol::packet::WORDS;
+use protocol::skin::Skin;
+use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use super::line::count;
+use super::tree::{Came, Tree};
+use analysis::paper;
+use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
+
+/// Numbers of active cells; the paper's arm had about twenty.
+const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
+/// The number that the findings are of.
+const FOUND_AT: usize = 20;
+/// Epochs over which a constant touch is averaged.
+const AVERAGED: u32 = 32;
+/// Torques that Q7.8 cannot say are left out.
+const MOST_NM: f64 = 127.0;
+
+/// How much is measured.
+#[derive(Clone, Copy, Debug)]
+pub struct Extent {
+    /// Touches for each number of active cells.
+    pub touches: usize,
+    /// Epochs of each while the arm moves.
+    pub epochs: u32,
+}
+
+/// Mean absolute errors over loaded joints, in Nm.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Errors {
+    /// Active cells.
+    pub active: usize,
+    /// Every cell's torque cut off.
+    pub truncated: f64,
+    /// Rounded to the nearest.
+    pub rounded: f64,
+    /// Rounded, what that took away carried on.
+    pub carried: f64,
+    /// Rounded, the average over 32 epochs of a constant touch.
+    pub rounded_average: f64,
+    /// Carried, the average over 32 epochs of a constant touch.
+    pub carried_average: f64,
+}
+
+/// So many cells of a skin, drawn at random, each of which feels 0.6 to 6 N.
+fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
+    let mut places: Vec<usize> = (0..cells).collect();
+    places.shuffle(dice);
+    let felt = |place| {
+        let contact = [0; 3].map(|_| Q5_10::nearest(dice.random_range(0.2..2.0)));
+        (place, SkinSensors { contact, ..SkinSensors::default() })
+    };
+    places.into_iter().take(active).map(felt).collect()
+}
+
+/// The mean of absolute errors.
+#[derive(Clone, Copy, Debug, Default)]
+struct Mean {
+    sum: f64,
+    count: u32,
+}
+
+impl Mean {
+    /// Adds the errors of loaded joints.
+    fn add(&mut self, loaded: usize, got: &[f64; WORDS], wanted: &[f64; WORDS]) {
+        for (got, wanted) in got.iter().zip(wanted).take(loaded).filter(|(_, wanted)| wanted.abs() < MOST_NM)
+        {
+            self.sum += (got - wanted).abs();
+            self.count += 1;
+        }
+    }
+
+    fn mean(self) -> f64 {
+        self.sum / f64::from(self.count)
+    }
+}
+
+/// The numbers of active cells that a skin has cells for.
+pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
+    let cells = skin.cells.len();
+    ACTIVE.into_iter().filter(move |&active| active <= cells)
+}
+
+/// Measures the errors for a number of active cells; the same for the same skin and extent.
+#[must_use]
+pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
+    let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
+    let (mut rounding, mut carrying) = (Tree::new(skin, false), Tree::new(skin, true));
+    let [mut truncated, mut rounded, mut carried] = [Mean::default(); 3];
+    let [mut rounded_average, mut carried_average] = [Mean::default(); 2];
+    for _ in 0..extent.touches {
+        let touch = touched(&mut dice, skin.cells.len(), active);
+        let phase: [f64; WORDS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
+        for epoch in 0..extent.epochs {
+            let q = phase.map(|phase| (phase + f64::from(epoch) * 0.016).sin());
+            let (round, carry) = (rounding.turn(&q, &touch), carrying.turn(&q, &touch));
+            truncated.add(round.loaded, &round.truncated, &round.central);
+            rounded.add(round.loaded, &round.sum, &round.central);
+            carried.add(carry.loaded, &carry.sum, &carry.central);
+        }
+        let q = phase.map(|phase| 1.5 * phase.sin());
+        // Who carries begins with nothing to carry.
+        let mut fresh = Tree::new(skin, true);
+        for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
+            let (mean, last) = averaged(tree, &q, &touch);
+            average.add(last.loaded, &mean, &last.central);
+        }
+    }
+    Errors {
+        active,
+        truncated: truncated.mean(),
+        rounded: rounded.mean(),
+        carried: carried.mean(),
+        rounded_average: rounded_average.mean(),
+        carried_average: carried_average.mean(),
+    }
+}
+
+/// The average of the sums of a constant touch on an arm that stands.
+fn averaged(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> ([f64; WORDS], Came) {
+    let (mut mean, mut last) = ([0.0; WORDS], Came::default());
+    for _ in 0..AVERAGED {
+        last = tree.turn(q, touch);
+        for (mean, sum) in mean.iter_mut().zip(last.sum) {
+            *mean += sum / f64::from(AVERAGED);
+        }
+    }
+    (mean, last)
+}
+
+/// Errors over the number of active cells.
+#[must_use]
+pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
+    let of = skin.cells.len();
+    let series = |label: &str, error: fn(&Errors) -> f64| {
+        let points = errors.iter().map(|errors| (count(errors.active), error(errors))).collect();
+        Series::new(label, Shape::Line, points)
+    };
+    let single = Figure {
+        name: "sums".to_owned(),
+        title: format!("Mean error of the summed torque over active cells of {of}, Q7.8, loaded joints"),
+        x: Axis::new("active cells", "").log().between(0.9, 300.0),
+        y: Axis::new("mean absolute error", "Nm").log().between(1e-5, 1.0),
+        series: vec![
+            series("truncated", |errors| errors.truncated),
+            series("rounded", |errors| errors.rounded),
+            series("carried", |errors| errors.carried),
+            series("rounded, average of 32", |errors| errors.rounded_average),
+            series("carried, average of 32", |errors| errors.carried_average),
+        ],
+        ..Figure::default()
+    };
+    let mut findings = Vec::new();
+    if let Some(at) = errors.iter().find(|errors| errors.active == FOUND_AT) {
+        let summed = |what: &str, ours| {
+            let what = format!("sum of {FOUND_AT} active cells of {of}, {what}");
+            Finding::less_is_better(what, Quantity::new(paper::SUMMED_NM, "Nm"), Quantity::new(ours, "Nm"))
+        };
+        findings.push(summed("each cut off, mean error", at.truncated));
+        findings
+            .push(summed("rounded, mean error", at.rounded).must("at most 0.005 Nm", at.rounded <= 0.005));
+        findings.push(summed("carried, mean error of single epochs", at.carried));
+        findings.push(summed("rounded, mean error of the average over 32 epochs", at.rounded_average));
+        findings.push(summed("carried, mean error of the average over 32 epochs", at.carried_average));
+    }
+    Section {
+        name: "sums".to_owned(),
+        title: "Sums along the tree: cutting off, rounding, carrying".to_owned(),
+        text: vec![
+            "Random cells feel 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
+             microcontroller. A cell that cuts off what Q7.8 has no room for errs by half a step of 0.0039 Nm to the same \
+             side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
+             carries what rounding took away into its next value errs more in one epoch and not at all in the long run."
+                .to_owned(),
+            format!(
+                "The paper's {} Nm is what cutting off gives for about twenty active cells.",
+                number(paper::SUMMED_NM)
+            ),
+        ],
+        figures: vec![single],
+        findings,
+        tables: vec![Table {
+            title: "Mean absolute error in Nm".to_owned(),
+            head: [
+                "active cells",
+                "truncated",
+                "rounded",
+                "carried",
+                "rounded, average of 32",
+                "carried, average of 32",
+            ]
+            .map(str::to_owned)
+            .to_vec(),
+            rows: errors
+                .iter()
+                .map(|at| {
+                    let errors =
+                        [at.truncated, at.rounded, at.carried, at.rounded_average, at.carried_average];
+                    core::iter::once(at.active.to_string()).chain(errors.map(number)).collect()
+                })
+                .collect(),
+        }],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ticks;
+
+    #[test]
+    fn cut_off_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
+        let skin = ticks::skin(64, 1).unwrap();
+        let measure = || -> Vec<_> {
+            numbers(&skin).map(|active| errors(&skin, active, Extent { touches: 6, epochs: 4 })).collect()
+        };
+        let errors = measure();
+        assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
+        let (one, forty) = (errors[0], errors[5]);
+        // Half a step of 1/256 Nm for each cell that loads a joint; those near the base load fewer.
+        let drift = |at: &Errors| at.truncated / (count(at.active) / 512.0);
+        assert!((0.6..1.1).contains(&drift(&one)) && (0.6..1.0).contains(&drift(&forty)), "{errors:?}");
+        assert!((25.0..45.0).contains(&(forty.truncated / one.truncated)), "{errors:?}");
+        // A quarter of a step for one; grows with the root.
+        assert!(forty.rounded < 0.012 && forty.truncated > 4.0 * forty.rounded, "{errors:?}");
+        assert!(forty.carried_average < forty.rounded_average / 2.0, "{errors:?}");
+        let section = section(&skin, &errors);
+        assert_eq!(section.findings.len(), 5);
+        assert!(section.figures[0].series.iter().all(|series| series.points.len() == 6));
+        assert_eq!(measure(), errors, "the same again");
+    }
+}

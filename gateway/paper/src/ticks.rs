@@ -1,0 +1,238 @@
+//! A skin of any number of cells, and the control loop's ticks over it, without threads, sockets or waiting: what times
+//! are measured on.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use protocol::can::{Format, Frame};
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::message::{Joints, Message, SkinSensors};
+use protocol::packet::{Epoch, WORDS};
+use protocol::skin::{Cell, Skin};
+use protocol::time::{Micros, Span};
+
+use control::controller::{Controller, Input, Kinesthetic, Step};
+use control::cycle::turn::{Line, Shared, Timed, Turn};
+use control::cycle::{Cycle, Tick};
+use control::robot::SimulatedArm;
+use model::generate::{GenerateError, Wanted, generate};
+use model::scenario::{Mode, ModeChange, Scenario, contact_words};
+use model::table::{Snapshot, Table};
+
+/// Most cells of the paper's Fig. 9.
+pub const MOST_CELLS: usize = 3_000;
+/// Buses that so many cells need.
+pub const BUSES: usize = 12;
+/// Where the arm stands while times are measured, in rad.
+pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
+/// What an active cell feels, in N.
+const TOUCH_N: f64 = 1.5;
+/// Ticks in an epoch, at 500 Hz and 62.5 Hz.
+const TICKS: u64 = 8;
+/// Records and broadcasts that wait between two epochs: far more than there are.
+const QUEUE: usize = 64;
+
+/// A UR5 with a skin of so many cells on so many buses.
+///
+/// # Errors
+/// When they do not fit on the buses.
+pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
+    let text = generate(&Wanted { cells, buses, ..Wanted::default() })?;
+    Ok(Skin::parse("generated skin", &text)?)
+}
+
+/// The first cells of each bus, the same number on all (to one): the skin's parts that do not grow stay as they are.
+#[must_use]
+pub fn spread(skin: &Skin, cells: usize) -> Skin {
+    let buses = skin.buses.len().max(1);
+    let share = |bus: usize| cells / buses + usize::from(bus < cells % buses);
+    let of_bus = |bus: usize| skin.cells_of(bus).take(share(bus)).cloned().collect::<Vec<_>>();
+    Skin { cells: (0..buses).flat_map(of_bus).collect(), ..skin.clone() }
+}
+
+/// What a touched cell feels.
+#[must_use]
+pub fn touch() -> SkinSensors {
+    SkinSensors { contact: contact_words(TOUCH_N), ..SkinSensors::default() }
+}
+
+/// What each cell of a skin feels when the first `active` of them in the order of `spread` are touched.
+fn felt(cells: usize, active: usize) -> Vec<SkinSensors> {
+    (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
+}
+
+/// What the receiver of a bus leaves for the loop when the first `active` cells of `cells` have answered an epoch: by
+/// the real table, of real frames.
+fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
+    let mut table = Table::new(skin, bus);
+    let cells: Vec<&Cell> = skin.cells_of(bus).collect();
+    let epoch = Epoch(0);
+    let mut hear = |own, message: Message| {
+        for frame in message.encode().frames(Format::Fd) {
+            table.handle_frame(Micros(100), own, &frame, &mut |_| None);
+        }
+    };
+    hear(true, Message::Joints { epoch, joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 } });
+    for cell in cells.iter().take(active) {
+        // Some torque: what it is costs the same.
+        hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
+    }
+    Snapshot { sums: table.snapshot().sums, felt: felt(cells.len(), active) }
+}
+
+/// Holds the arm, and computes all that the kinesthetic controller computes: a robot that moved to its limits would make
+/// ticks of few cells other than those of many.
+struct Held(Kinesthetic);
+
+impl Controller for Held {
+    fn step(&mut self, input: &Input) -> Step {
+        match self.0.step(input) {
+            Step::Move(velocity) => Step::Move(std::hint::black_box(velocity).map(|_| 0.0)),
+            Step::Bad(why) => Step::Bad(why),
+        }
+    }
+}
+
+/// A control loop over buses whose receivers have left something.
+#[derive(Debug)]
+pub struct Ticks {
+    turn: Turn,
+    buses: Vec<Inlet>,
+    records: rtrb::Consumer<Timed>,
+    mode: Mode,
+    number: u64,
+}
+
+/// What a receiver has of the loop.
+#[derive(Debug)]
+struct Inlet {
+    snapshot: Snapshot,
+    to_loop: triple_buffer::Input<Snapshot>,
+    positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+}
+
+/// What the ticks of an epoch took, on average, in ns.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Took {
+    /// A whole tick, without the central computation.
+    pub tick: f64,
+    /// The central computation in it; 0 without one.
+    pub central: f64,
+}
+
+impl Ticks {
+    /// A loop over a skin of which the first `active` cells, evenly over the buses, are touched.
+    ///
+    /// # Panics
+    /// When the skin has a controller of somebody else's: a generated one has not.
+    #[must_use]
+    pub fn new(skin: &Skin, active: usize, mode: Mode) -> Self {
+        let buses = skin.buses.len();
+        let share = |bus: usize| active / buses + usize::from(bus < active % buses);
+        let (records_in, records) = rtrb::RingBuffer::new(QUEUE);
+        let mut lines = Vec::with_capacity(buses);
+        let mut inlets = Vec::with_capacity(buses);
+        for bus in 0..buses {
+            let snapshot = snapshot(skin, bus, share(bus));
+            let (to_loop, from_receiver) = triple_buffer::triple_buffer(&snapshot);
+            let (positions_in, positions) = rtrb::RingBuffer::new(QUEUE);
+            lines.push(Line {
+                format: Format::Fd,
+                snapshot: from_receiver,
+                positions: positions_in,
+                works: Arc::new(AtomicBool::new(true)),
+                commands: Arc::default(),
+                returned: Arc::default(),
+            });
+            inlets.push(Inlet { snapshot, to_loop, positions });
+        }
+        let modes = vec![ModeChange { at: Micros(0), mode }];
+        let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
+        let controller = Held(Kinesthetic::new(skin).expect("a generated skin moves by itself"));
+        let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, POSE)));
+        let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), records_in);
+        Self { turn, buses: inlets, records, mode, number: 0 }
+    }
+
+    /// The ticks of one epoch, each on a snapshot that has just come.
+    pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> Took {
+        for _ in 0..TICKS {
+            for Inlet { snapshot, to_loop, positions } in &mut self.buses {
+                // The epoch of the broadcast before, as a bus that works brings it back.
+                let sent = self.number.checked_sub(1).map(|number| number / TICKS);
+                snapshot.sums.read_back = sent.map(|sent| Epoch(sent.to_le_bytes()[0]));
+                to_loop.input_buffer_mut().take(snapshot, self.mode == Mode::Compare);
+                to_loop.publish();
+                while positions.pop().is_ok() {}
+            }
+            let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
+            let take = |_, frames: &[Frame]| std::hint::black_box(!frames.is_empty());
+            self.turn.turn(tick, 0, 0, now, take);
+            self.number += 1;
+        }
+        let mut took = Took::default();
+        while let Ok(Timed { took_ns, central, .. }) = self.records.pop() {
+            let central = central.map_or(0, |(nanos, _)| nanos);
+            took.tick += nanos(took_ns.saturating_sub(central)) / 8.0;
+            took.central += nanos(central) / 8.0;
+        }
+        took
+    }
+
+    /// What the last epoch's ticks knew: cells in the torque, active cells of the central computation (none without
+    /// one), and whether the robot was halted.
+    pub fn known(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
+        self.epoch(now);
+        let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
+        self.turn.turn(tick, 0, 0, now, |_, _| true);
+        self.number += 1;
+        let timed = self.records.pop().ok();
+        timed.map_or((0, None, true), |Timed { record, central, .. }| {
+            (record.contributing, central.map(|(_, felt)| felt.active), record.halted.is_some())
+        })
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
+pub(super) fn nanos(nanos: u64) -> f64 {
+    nanos as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_skin_is_spread_evenly_and_its_ticks_know_who_is_touched() {
+        let whole = skin(240, BUSES).unwrap();
+        for (cells, active) in [(0, 0), (30, 0), (30, 7), (240, 240)] {
+            let part = spread(&whole, cells);
+            assert_eq!(part.cells.len(), cells);
+            let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_of(bus).count()).collect();
+            assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
+            let wanted = u32::try_from(active).unwrap();
+            let mut compared = Ticks::new(&part, active, Mode::Compare);
+            // More than a hundred ticks: nobody is halted for want of what the buses carry.
+            for _ in 0..20 {
+                compared.epoch(|| 0);
+            }
+            assert_eq!(compared.known(|| 0), (wanted, Some(wanted), false));
+            let mut distributed = Ticks::new(&part, active, Mode::Distributed);
+            assert_eq!(distributed.known(|| 0), (wanted, None, false));
+        }
+    }
+
+    /// A clock that goes on by 1 ns each time it is looked at: begin, before and after the central computation, end.
+    #[test]
+    fn a_tick_is_told_without_its_central_computation() {
+        let part = spread(&skin(BUSES, BUSES).unwrap(), BUSES);
+        let clock = std::cell::Cell::new(0);
+        let now = || {
+            clock.set(clock.get() + 1);
+            clock.get()
+        };
+        let took = |mode| Ticks::new(&part, 0, mode).epoch(now);
+        assert_eq!(took(Mode::Compare), Took { tick: 2.0, central: 1.0 });
+        assert_eq!(took(Mode::Distributed), Took { tick: 1.0, central: 0.0 });
+    }
+}

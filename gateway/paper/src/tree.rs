@@ -1,0 +1,165 @@
+//! The cells' own arithmetic along a tree, without a bus: what arrives at the root, beside the central computation of the
+//! same touch.
+
+use std::collections::VecDeque;
+
+use cell_node::contact::{Force, Torque};
+use cell_node::kernel::{Kernel, Wrench};
+use cell_node::sum::{Begin, Sum};
+use protocol::fixed::{Acc, Q1_14};
+use protocol::id::CellId;
+use protocol::message::SkinSensors;
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Slots;
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+
+use model::central::Central;
+
+/// Fraction bits between a cell's exact torque and Q7.8.
+const SHORTENED: u32 = 30 - 8;
+/// From joints to joints, in µs.
+const PERIOD: u64 = 16_000;
+
+/// A cell, its depth, and its children with their ports.
+#[derive(Clone, Debug)]
+struct Branch {
+    cell: usize,
+    depth: u8,
+    children: Vec<(usize, usize)>,
+}
+
+/// A skin on one bus whose cells add up along the shortest ways to the nearest root.
+#[derive(Clone, Debug)]
+pub struct Tree {
+    skin: Skin,
+    central: Central,
+    sums: Vec<Sum>,
+    /// From the leaves to the roots.
+    order: Vec<Branch>,
+    kernels: Vec<Wrench>,
+    epoch: Epoch,
+}
+
+/// What came out of one epoch, in Nm.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Came {
+    /// Computed centrally in double precision.
+    pub central: [f64; WORDS],
+    /// Summed along the tree, Q7.8.
+    pub sum: [f64; WORDS],
+    /// Each active cell's torque cut off to Q7.8, then summed.
+    pub truncated: [f64; WORDS],
+    /// Joints that some active cell loads.
+    pub loaded: usize,
+    /// Cells in the sum.
+    pub count: usize,
+}
+
+impl Tree {
+    /// A tree in which rounding is carried into a cell's next value, or not. Cells without a way to a root have no part.
+    #[must_use]
+    pub fn new(skin: &Skin, carry: bool) -> Self {
+        let place = |node: CellId| skin.cells.iter().position(|cell| cell.node == node);
+        let mut reached = vec![false; skin.cells.len()];
+        let mut next = VecDeque::new();
+        for ((at, cell), reached) in skin.cells.iter().enumerate().zip(&mut reached) {
+            if cell.root {
+                *reached = true;
+                next.push_back((at, 0_u8));
+            }
+        }
+        let mut order = Vec::new();
+        while let Some((cell, depth)) = next.pop_front() {
+            let mut children = Vec::new();
+            let neighbors = skin.cells.get(cell).map(|cell| cell.neighbors).unwrap_or_default();
+            for (port, child) in neighbors.iter().enumerate() {
+                let Some(child) = child.and_then(place) else { continue };
+                if reached.get_mut(child).is_some_and(|reached| !core::mem::replace(reached, true)) {
+                    children.push((port, child));
+                    next.push_back((child, depth.saturating_add(1)));
+                }
+            }
+            order.push(Branch { cell, depth, children });
+        }
+        order.reverse();
+        let deepest = order.first().map_or(0, |branch| branch.depth);
+        let mut sums = vec![Sum::default(); skin.cells.len()];
+        for sum in &mut sums {
+            sum.set_slots(Some(Slots { slot_us: 600, deepest, carry }));
+        }
+        let kernels = skin.cells.iter().map(|cell| Wrench::new(&skin.parameters(cell))).collect();
+        Self { central: Central::new(skin), skin: skin.clone(), sums, order, kernels, epoch: Epoch(0) }
+    }
+
+    /// Cells that have a way to a root.
+    #[must_use]
+    pub fn cells(&self) -> usize {
+        self.order.len()
+    }
+
+    /// One epoch in which cells, by their places in the skin, feel something while the joints stand at `q` (rad).
+    pub fn turn(&mut self, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> Came {
+        let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
+        let frames = self.central.frames(&words);
+        let mut came = Came::default();
+        let mut own = vec![None; self.sums.len()];
+        for (place, felt) in touch {
+            let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else {
+                continue;
+            };
+            let force = self.central.force(*place, felt);
+            add(&mut came.central, self.central.torque(*place, &frames, force));
+            let force = Force::fuse(felt.contact, felt.proximity, &self.skin.parameters(cell).contact);
+            let exact = Torque::new(&kernel.jacobian(&words), force).exact();
+            add(&mut came.truncated, exact.map(cut_off));
+            came.loaded = came.loaded.max(cell.joint.into());
+            if let Some(own) = own.get_mut(*place) {
+                *own = Some(exact);
+            }
+        }
+        self.epoch = self.epoch.next();
+        let mut said = vec![None; self.sums.len()];
+        for Branch { cell, depth, children } in &self.order {
+            let Some(sum) = self.sums.get_mut(*cell) else { continue };
+            let begin = Begin {
+                epoch: self.epoch,
+                at: Micros(0),
+                period: Span(PERIOD),
+                depth: Some(*depth),
+                speaks: true,
+                children: children.iter().map(|(port, _)| 1 << port).sum(),
+            };
+            sum.begin(&begin, own.get(*cell).and_then(Option::as_ref));
+            for (port, child) in children {
+                if let Some((epoch, words, anew)) = said.get(*child).copied().flatten() {
+                    if anew {
+                        sum.state(Micros(0), *port, epoch);
+                    }
+                    sum.take(Micros(0), *port, epoch, words);
+                }
+            }
+            let says = sum.say(Micros(PERIOD));
+            if let (0, Some((_, words, _))) = (depth, &says) {
+                add(&mut came.sum, words.torque.map(|word| word.to_f64()));
+                came.count += usize::from(words.count);
+            }
+            if let Some(said) = said.get_mut(*cell) {
+                *said = says;
+            }
+        }
+        came
+    }
+}
+
+fn add(sum: &mut [f64; WORDS], more: [f64; WORDS]) {
+    for (sum, more) in sum.iter_mut().zip(more) {
+        *sum += more;
+    }
+}
+
+/// What a cell would say that drops the bits that Q7.8 has no room for, in Nm.
+#[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
+fn cut_off(exact: Acc<30>) -> f64 {
+    (exact.steps() >> SHORTENED) as f64 / 256.0
+}

@@ -1,0 +1,201 @@
+//! `gateway commission`.
+
+mod show;
+mod work;
+
+pub(super) use self::show::some;
+
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use bench::run::progress::Progress as Line;
+use clap::Args;
+use model::commission::numbers::{Numbers, renumbered};
+use model::commission::{Outcome, Progress, Wish};
+use protocol::bus::{Choice, Kinds, OneKind};
+use protocol::document;
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+
+use self::work::{Bench, Done, open};
+use super::output::Force;
+use super::{input, output};
+
+/// How often it is looked how far the buses are.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// Write what a skin's description says into its cells, and read it back
+///
+/// Finds every cell by its serial number, writes the robot's table, pose, gains and thresholds into its flash,
+/// reads all of it back and compares. A cell takes its new parameters as a whole, so this may be interrupted at any
+/// moment, and be run again: cells that have the right configuration are left as they are. Cells that the
+/// description does not have are named and left alone. Exit code 0: all cells have the skin's configuration; 1: some
+/// have not, and the table says why; 2: wrong use or configuration.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway commission skin.toml
+  gateway commission skin.toml --dry-run
+  gateway commission skin.toml --verify --json | jq '.buses[0].failed'
+  gateway commission skin.toml --numbers as-wired.toml && gateway run as-wired.toml --no-spawn")]
+pub(crate) struct Commission {
+    /// The skin's description
+    skin: PathBuf,
+    /// Only this bus of the skin's
+    #[arg(long, value_name = "NAME")]
+    bus: Option<String>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
+    /// Write nothing: say which cells are there and which would be written
+    #[arg(long)]
+    dry_run: bool,
+    /// Read back and compare also the cells that have the right hash already
+    #[arg(long)]
+    verify: bool,
+    /// Write a copy of the description with the numbers that the cells have on their buses
+    #[arg(long, value_name = "FILE")]
+    numbers: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+    /// Show no progress, only the table at the end
+    #[arg(long, short)]
+    quiet: bool,
+    /// One JSON object instead of the table
+    #[arg(long)]
+    json: bool,
+}
+
+impl Commission {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let text = document::text(&self.skin).map_err(Failure::usage)?;
+        let file = self.skin.display().to_string();
+        let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
+        let wanted = self.buses(&skin)?;
+        // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
+        let begun = self.numbers.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
+        let wish = Wish { dry_run: self.dry_run, verify: self.verify };
+        let stopped = input::stopped()?;
+        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
+            .and_then(|kinds| kinds.only(skin.buses.iter().map(|bus| bus.name.as_str())))
+            .map_err(Failure::usage)?;
+        // All are opened before anybody is told.
+        let benches = wanted.iter().map(|&bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
+        let benches = benches.map_err(Failure::usage)?;
+        let began = Instant::now();
+        let far = Mutex::new(vec![None; benches.len()]);
+        let mut line = Line::new(self.quiet);
+        let done: Vec<Done> = thread::scope(|scope| {
+            let work = |(place, bench): (usize, &Bench)| {
+                let (far, stopped, skin) = (&far, &stopped, &skin);
+                let bench = bench.clone();
+                scope.spawn(move || {
+                    bench.work(skin, wish, stopped, |progress| {
+                        if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
+                            *own = Some(progress);
+                        }
+                    })
+                })
+            };
+            let threads: Vec<_> = benches.iter().enumerate().map(work).collect();
+            while threads.iter().any(|thread| !thread.is_finished()) {
+                let now: Vec<Progress> =
+                    far.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
+                if !now.is_empty() {
+                    line.show(|| how_far(&now));
+                }
+                thread::sleep(LOOK);
+            }
+            threads.into_iter().filter_map(|thread| thread.join().ok()).collect()
+        });
+        line.clear();
+        let interrupted = stopped.load(Ordering::Relaxed);
+        nobody(&file, &done, interrupted)?;
+        let whole = show::Whole {
+            skin: skin.name.clone(),
+            file,
+            seconds: began.elapsed().as_secs_f64(),
+            dry_run: self.dry_run,
+            interrupted,
+            buses: done.iter().map(show::BusShown::of).collect(),
+        };
+        if !self.quiet && !self.json {
+            whole.notes(self.numbers.is_some()).iter().for_each(output::note);
+        }
+        whole.print(self.json)?;
+        if let Some((file, out)) = begun {
+            let numbers: Numbers = done
+                .iter()
+                .flat_map(|done| &done.report.cells)
+                .map(|cell| (cell.serial, cell.number))
+                .collect();
+            let copy = renumbered(&skin, &text, &numbers);
+            let copy =
+                copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", file.path().display())))?;
+            output::finish("--numbers", file, out, &copy)?;
+        }
+        whole.end()
+    }
+
+    /// The buses that are meant.
+    fn buses(&self, skin: &Skin) -> Result<Vec<usize>, Failure> {
+        let Some(name) = &self.bus else { return Ok((0..skin.buses.len()).collect()) };
+        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        let found = skin.bus_named(name).ok_or_else(|| {
+            Failure::usage(format!("bus {name} is not in {}, which has {}", self.skin.display(), names()))
+        });
+        Ok(vec![found?])
+    }
+}
+
+/// All buses in one line.
+fn how_far(all: &[Progress]) -> String {
+    let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
+    let [cells, found, done, failed] = [
+        |it: &Progress| it.cells,
+        |it: &Progress| it.found,
+        |it: &Progress| it.done,
+        |it: &Progress| it.failed,
+    ]
+    .map(sum);
+    // The one that is least far says what is being done.
+    let doing = all.iter().filter(|it| it.doing != "done").map(|it| it.doing).next().unwrap_or("done");
+    let failed = if failed == 0 { String::new() } else { format!(", {failed} failed") };
+    format!("{doing}: {found} of {cells} cells found, {done} done{failed}")
+}
+
+/// Where nothing was begun, one line says why.
+fn nobody(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
+    let begun = done.iter().any(|done| {
+        let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));
+        done.report.requests > 0 || done.report.cells.iter().any(|cell| is_well(cell.outcome))
+    });
+    if begun {
+        return Ok(());
+    }
+    if let Some(done) = done.iter().find(|done| done.failure.is_some()) {
+        return Err(Failure::run(done.failure.clone().unwrap_or_default()));
+    }
+    if interrupted {
+        return Err(Failure::run("interrupted; nothing was written yet"));
+    }
+    let found = done.iter().flat_map(|done| &done.report.cells).any(|cell| cell.number.is_some());
+    if found {
+        return Ok(());
+    }
+    let strangers: Vec<_> = done.iter().flat_map(|done| &done.report.strangers).collect();
+    let buses = done.iter().map(|done| done.name.as_str()).collect::<Vec<_>>().join(", ");
+    Err(Failure::run(if strangers.is_empty() {
+        format!("no cells are on {buses}: start them, or switch them on, and run this again")
+    } else {
+        let serials: Vec<_> = strangers.iter().map(|stranger| stranger.serial.to_string()).collect();
+        format!(
+            "none of the cells on {buses} is one of {file}: their serial numbers are {}; name the description \
+             that has them",
+            some(&serials)
+        )
+    }))
+}

@@ -1,0 +1,264 @@
+//! `gateway convert`.
+
+use std::ffi::OsStr;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, IsTerminal};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::{Args, ValueEnum};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::stop::{self, Stoppable};
+use protocol::usage::Failure;
+use trace::capture::convert::{ConvertError, Converted, Output, convert};
+use trace::capture::log::{self, Style};
+use trace::capture::{Format, ORIGIN, Reader};
+use trace::files::WholeFile;
+
+use super::input::captures;
+use super::output::{Force, apart, note, refused};
+
+/// Lines that cannot be read and are named; further ones are counted.
+const NAMED: u64 = 100;
+/// Bytes that are written at once.
+const PIECE: usize = 1 << 18;
+
+/// Convert a capture: a candump log to an MCAP recording, or back
+///
+/// What IN is, is told by its first bytes; OUT by the end of its name: .mcap is a recording, .log or .txt a candump
+/// log, - a log on standard output. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
+/// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
+/// place for is named. OUT appears when it is whole. Exit code 0: done, 1: it cannot be done, 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway convert run.mcap run.log
+  gateway convert run.mcap run-*.mcap all.log
+  gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
+  candump -L can0 | gateway convert - can0.mcap")]
+pub(crate) struct Convert {
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    #[arg(value_name = "IN", required = true)]
+    from: Vec<PathBuf>,
+    /// The new capture; - for candump text on standard output
+    #[arg(value_name = "OUT")]
+    to: PathBuf,
+    #[command(flatten)]
+    force: Force,
+    /// End at the first line that is no frame though it begins like one, or when IN has no end; write nothing then
+    #[arg(long)]
+    strict: bool,
+    /// Digits of a second in a log: 6 or 9; else as many as IN has
+    #[arg(long, value_enum, value_name = "N")]
+    digits: Option<Digits>,
+    /// Write T or R behind frames in a log, which a log that had them has anyway; Wireshark does not read that
+    #[arg(long, conflicts_with = "plain")]
+    direction: bool,
+    /// Write only what every tool reads: frames, without direction and raw DLC, 6 digits, no comments
+    #[arg(long)]
+    plain: bool,
+}
+
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+enum Digits {
+    #[value(name = "6")]
+    Six,
+    #[value(name = "9")]
+    Nine,
+}
+
+impl Convert {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let format = self.format()?;
+        let text = format == Format::Candump;
+        let options =
+            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
+        if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
+            return Err(Failure::usage(format!(
+                "{option} is for a candump log: a recording keeps everything"
+            )));
+        }
+        let to = self.to.display();
+        if !is_standard(&self.to) {
+            apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+            self.force.check("", &self.to)?;
+        }
+        let size = size(&self.from);
+        let live = size.is_none();
+        let bar = bar(size);
+        let progress = bar.clone();
+        let mut reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let stopped = stop::flag();
+        let name = reader.name().to_owned();
+        if !text && reader.format() == Format::Mcap {
+            return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
+        }
+        let digits = match self.digits {
+            None if self.plain => log::Digits::Six,
+            None => log::Digits::Own,
+            Some(Digits::Six) => log::Digits::Six,
+            Some(Digits::Nine) => log::Digits::Nine,
+        };
+        let directions = !self.plain && (self.direction || reader.is_of_a_log());
+        let style = Style { digits, plain: self.plain, directions };
+        let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
+        let (whole, out) = self.create(stopped)?;
+        let mut output = Output::new(out, format, style).map_err(failed)?;
+        let mut named = 0;
+        let done = convert(&mut reader, &mut output, |line, why| {
+            named += 1;
+            let place = if line.line > 0 { format!("{name}:{}", line.line) } else { name.clone() };
+            if self.strict {
+                return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
+            }
+            if named <= NAMED {
+                bar.suspend(|| note(format_args!("{place}: {why}")));
+            }
+            if named == NAMED {
+                bar.suspend(|| note(format_args!("{name}: further lines of that kind are counted")));
+            }
+            Ok(())
+        });
+        bar.finish_and_clear();
+        let done = match done {
+            Ok(done) => done,
+            Err(ConvertError::Write(error)) => return written(&self.to, error),
+            Err(error) => return Err(Failure::run(error)),
+        };
+        if done.frames == 0 {
+            return Err(Failure::run(nothing(&name, &reader)));
+        }
+        if stopped.load(Ordering::Relaxed) && !live {
+            let frames = done.frames;
+            return Err(Failure::run(format!("interrupted after {frames} frames: {to} is not written")));
+        }
+        if let Some(why) = &reader.extras().unfinished {
+            let said = format!("{name}: {why}");
+            if self.strict {
+                return Err(Failure::run(said));
+            }
+            note(said);
+        }
+        if let Err(error) = output.finish() {
+            return written(&self.to, error);
+        }
+        if let Some(whole) = whole {
+            whole.finish().map_err(failed)?;
+        }
+        for line in remarks(&reader, &done, &style) {
+            note(format_args!("{name}: {line}"));
+        }
+        note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
+        Ok(())
+    }
+
+    /// The output; standard output is written to as it is.
+    fn create(
+        &self,
+        stopped: &AtomicBool,
+    ) -> Result<(Option<WholeFile>, BufWriter<Stoppable<File>>), Failure> {
+        let begun = if is_standard(&self.to) {
+            io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
+        } else {
+            WholeFile::create_unless(&self.to, self.force.force, stopped)
+                .map(|(whole, file)| (Some(whole), file))
+        };
+        let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;
+        Ok((whole, BufWriter::with_capacity(PIECE, Stoppable::new(file))))
+    }
+
+    /// What OUT is to be, by its name.
+    fn format(&self) -> Result<Format, Failure> {
+        let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
+        match self.to.extension().and_then(OsStr::to_str) {
+            Some("mcap") => Ok(Format::Mcap),
+            Some("log" | "txt") => Ok(Format::Candump),
+            _ if is_standard(&self.to) || other => Ok(Format::Candump),
+            _ => Err(Failure::usage(format!(
+                "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, and - is standard output",
+                self.to.display()
+            ))),
+        }
+    }
+}
+
+fn is_standard(path: &Path) -> bool {
+    path.as_os_str() == "-"
+}
+
+/// How many bytes the input has, when that is known.
+fn size(from: &[PathBuf]) -> Option<u64> {
+    let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
+    from.iter().map(of).sum()
+}
+
+/// What becomes of an error of the output: who read it may have left, as `head` does.
+fn written(to: &Path, error: io::Error) -> Result<(), Failure> {
+    if is_standard(to) {
+        return protocol::usage::written(Err(error));
+    }
+    Err(Failure::run(format!("{}: {error}; nothing is left of it", to.display())))
+}
+
+/// Progress by bytes of the input, on a terminal.
+fn bar(size: Option<u64>) -> ProgressBar {
+    let Some(size) = size.filter(|_| io::stderr().is_terminal()) else { return ProgressBar::hidden() };
+    let bar = ProgressBar::with_draw_target(Some(size), ProgressDrawTarget::stderr());
+    let style = "{wide_bar} {bytes} of {total_bytes}, {binary_bytes_per_sec}, {eta} left";
+    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// Why there is nothing to convert.
+fn nothing(name: &str, reader: &Reader) -> String {
+    match (reader.format(), reader.lines()) {
+        (Format::Candump, 0) => format!("{name} is empty: there is nothing to convert"),
+        (Format::Candump, lines) => format!(
+            "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
+             `(1700000000.123456) vcan0 123#00`"
+        ),
+        (Format::Mcap, _) => match others(reader) {
+            others if others.is_empty() => format!("{name}: there is no frame in it"),
+            others => format!("{name}: there is no frame in it, only {others}"),
+        },
+    }
+}
+
+/// What is in a recording beside frames and notes.
+fn others(reader: &Reader) -> String {
+    let extras = reader.extras();
+    let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
+    let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
+    let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
+    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
+    let facts = facts.map(|(name, _)| format!("metadata {name}"));
+    topics.chain(attached).chain(facts).collect::<Vec<_>>().join(", ")
+}
+
+/// What somebody may want to know of a conversion, a line each.
+fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
+    let mut lines = Vec::new();
+    if let Some((times, first)) = done.backwards {
+        lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
+    }
+    let shortened = if style.plain || style.digits != log::Digits::Own || style.directions {
+        "frames are written without something that a log cannot have or was not to have"
+    } else {
+        "frames are written without their direction, which not every tool reads; --direction writes it"
+    };
+    for (count, what) in [
+        (done.unreadable, "begin like a frame and are none: not read"),
+        (done.can_xl, "are CAN XL frames: not read"),
+        (done.dropped, "frames are missing: whoever took the capture lost them"),
+        (done.shortened, shortened),
+        (done.left_out, "notes are left out"),
+    ] {
+        if count > 0 {
+            lines.push(format!("{count} {what}"));
+        }
+    }
+    match others(reader) {
+        others if others.is_empty() => {}
+        others => lines.push(format!("a log has no place for {others}")),
+    }
+    lines
+}

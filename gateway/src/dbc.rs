@@ -1,0 +1,82 @@
+//! `gateway dbc`.
+
+use std::path::PathBuf;
+
+use analysis::dbc::dbc;
+use clap::Args;
+use protocol::can::Format;
+use protocol::skin::Skin;
+use protocol::usage::{Failure, print};
+
+use super::output::{Force, apart};
+
+/// Describe a bus in a DBC file, for cantools, SavvyCAN and others
+///
+/// Every identifier of the bus is a message: the commands, and what each cell of the skin sends and is sent. Every
+/// field is a signal with its scale, unit and range; byte 13 multiplexes pages and parameters. Identifiers repeat
+/// from bus to bus, so there is one file for each.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway dbc gateway/examples/ur5-253.toml -o skin.dbc
+  gateway dbc skin.toml --bus can1 > can1.dbc
+  candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
+pub(crate) struct Dbc {
+    /// The skin's description
+    #[arg(value_name = "SKIN")]
+    file: PathBuf,
+    /// Which bus, when the skin has several
+    #[arg(long, value_name = "NAME")]
+    bus: Option<String>,
+    /// On a classic bus: describe the 16 bytes of two frames joined, for a program that joins them first
+    #[arg(long)]
+    joined: bool,
+    /// The file to write, whole or not at all; else standard output
+    #[arg(long, short, value_name = "FILE")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+}
+
+impl Dbc {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let file = self.file.display();
+        apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        let bus = match (&self.bus, skin.buses.as_slice()) {
+            (Some(name), _) => skin.bus_named(name).ok_or_else(|| {
+                Failure::usage(format!("{file} has no bus {name:?}; its buses are {}", names()))
+            })?,
+            (None, [_]) => 0,
+            (None, buses) => {
+                let many = buses.len();
+                return Err(Failure::usage(format!(
+                    "{file} has {many} buses, and a DBC describes one: say --bus and one of {}",
+                    names()
+                )));
+            }
+        };
+        let description = skin.buses.get(bus).expect("just found");
+        match (description.format, self.joined) {
+            (Format::Classic, false) => {
+                return Err(Failure::usage(format!(
+                    "bus {} is classic: a packet is two frames of 8 bytes under one identifier, which a DBC cannot \
+                     tell apart; --joined describes the 16 bytes of both, for a program that joins them first",
+                    description.name
+                )));
+            }
+            (Format::Fd, true) => {
+                return Err(Failure::usage(format!(
+                    "--joined is for classic buses; on {} a packet is one FD frame",
+                    description.name
+                )));
+            }
+            (Format::Fd, false) | (Format::Classic, true) => {}
+        }
+        let text = dbc(&skin, bus);
+        match self.output {
+            Some(path) => self.force.write("-o", &path, &text),
+            None => print(&text),
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! What is shown of each frame.
+
+use std::fmt::Write as _;
+use std::io::{self, Write};
+use std::sync::Arc;
+
+use analysis::stats::{Report, Stats};
+use model::decode::pick::Pick;
+use model::decode::settle::Settler;
+use model::decode::{Decoded, json};
+use protocol::can::{Format, Frame};
+use protocol::candump::{Direction, Record, Timestamp};
+use protocol::message::Message;
+use protocol::time::Micros;
+
+/// Colours of a terminal.
+const DIM: &str = "\x1b[2m";
+const RED: &str = "\x1b[31m";
+const GREEN: &str = "\x1b[32m";
+const YELLOW: &str = "\x1b[33m";
+const MAGENTA: &str = "\x1b[35m";
+const CYAN: &str = "\x1b[36m";
+const PLAIN: &str = "\x1b[0m";
+
+/// How frames are shown.
+#[derive(Debug)]
+pub(super) enum How {
+    /// One line each, in colours or not.
+    Lines { colour: bool },
+    /// The same without the raw frame: the time since the first one, the bus, and what it says.
+    Brief { colour: bool },
+    /// One JSON object each.
+    Json,
+    /// Not each; all of them in numbers at the end.
+    Stats(Box<Stats>),
+}
+
+/// Whether there is more to be shown.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Flow {
+    More,
+    Enough,
+}
+
+/// A frame of which it is not known yet what it is.
+struct Waiting {
+    time: Timestamp,
+    bus: Arc<str>,
+    frame: Frame,
+    direction: Option<Direction>,
+}
+
+/// Decodes, picks and shows frames.
+pub(super) struct Show<W> {
+    out: W,
+    settler: Settler<Waiting>,
+    /// The bus of the last frame.
+    bus: Arc<str>,
+    pick: Pick,
+    /// Only what tells of a touch.
+    contact: bool,
+    how: How,
+    /// Frames that may still be shown.
+    left: u64,
+    /// When the first frame came.
+    first: Option<u64>,
+    raw: String,
+}
+
+impl<W: Write> Show<W> {
+    pub(super) fn new(out: W, format: Option<Format>, pick: Pick, contact: bool, how: How, max: u64) -> Self {
+        let (settler, bus) = (Settler::new(format), Arc::from(""));
+        Self { out, settler, bus, pick, contact, how, left: max, first: None, raw: String::new() }
+    }
+
+    /// Takes the next frame; it is shown if it is wanted, as soon as it is known what it is.
+    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<Flow> {
+        let Record { time, interface, frame, direction } = *record;
+        if *self.bus != *interface {
+            self.bus = Arc::from(interface);
+        }
+        let waiting = Waiting { time, bus: Arc::clone(&self.bus), frame, direction };
+        self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
+        self.settled()
+    }
+
+    /// It is that late, and no frame came.
+    pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<Flow> {
+        self.settler.handle_time(now);
+        self.settled()
+    }
+
+    /// No more frames follow.
+    pub(super) fn finish(&mut self) -> io::Result<Flow> {
+        self.settler.finish();
+        self.settled()
+    }
+
+    /// Whether frames wait that are not shown yet.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.settler.is_waiting()
+    }
+
+    /// Shows what is known by now.
+    fn settled(&mut self) -> io::Result<Flow> {
+        while self.left > 0
+            && let Some((Waiting { time, bus, frame, direction }, decoded)) = self.settler.pop()
+        {
+            self.show(&Record { time, interface: &bus, frame, direction }, decoded)?;
+        }
+        Ok(if self.left == 0 { Flow::Enough } else { Flow::More })
+    }
+
+    /// Shows a frame if it is wanted.
+    fn show(&mut self, record: &Record<'_>, decoded: Decoded) -> io::Result<()> {
+        let nanos = record.time.nanos;
+        let first = *self.first.get_or_insert(nanos);
+        if !self.pick.takes(first, nanos, &record.frame, &decoded) || self.contact && !decoded.is_contact() {
+            return Ok(());
+        }
+        match &mut self.how {
+            How::Stats(stats) => stats.take(record, &decoded),
+            How::Json => json::write(&mut self.out, record, &decoded)?,
+            How::Brief { colour } => {
+                // Where times run backwards a frame may be before the first one.
+                let (sign, since) = if nanos < first { ("-", first - nanos) } else { ("", nanos - first) };
+                let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
+                let (dim, of, plain) = if *colour { (DIM, of(&decoded), PLAIN) } else { ("", "", "") };
+                let bus = record.interface;
+                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {bus}{plain} {of}{decoded}{plain}")?;
+            }
+            How::Lines { colour } => {
+                self.raw.clear();
+                let way = match record.direction {
+                    None => "",
+                    Some(Direction::Sent) => " T",
+                    Some(Direction::Received) => " R",
+                };
+                // A string takes everything.
+                let _ = write!(self.raw, "{record}{way}");
+                let raw = &self.raw;
+                if *colour {
+                    let colour = of(&decoded);
+                    writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{decoded}{PLAIN}")?;
+                } else {
+                    writeln!(self.out, "{raw}\t{decoded}")?;
+                }
+            }
+        }
+        self.left -= 1;
+        Ok(())
+    }
+
+    /// Frames were lost before this point.
+    pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
+        if let How::Stats(stats) = &mut self.how {
+            stats.dropped(bus, frames);
+        }
+    }
+
+    pub(super) fn flush(&mut self) -> io::Result<()> {
+        self.out.flush()
+    }
+
+    /// The numbers, where these are shown.
+    pub(super) fn report(&self) -> Option<Report> {
+        match &self.how {
+            How::Stats(stats) => Some(stats.report()),
+            How::Lines { .. } | How::Brief { .. } | How::Json => None,
+        }
+    }
+}
+
+/// The colour of what a frame says.
+fn of(decoded: &Decoded) -> &'static str {
+    match decoded {
+        Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Half { .. } => DIM,
+        Decoded::Damaged { .. } | Decoded::Meaningless { .. } => RED,
+        Decoded::Message(_) if decoded.is_saturated() => YELLOW,
+        Decoded::Message(message) => match message {
+            Message::Halt | Message::Joints { .. } | Message::Sync | Message::Resume | Message::Report => {
+                CYAN
+            }
+            Message::Torque { .. } | Message::Sum { .. } => PLAIN,
+            Message::Stimulus { .. } | Message::Sensors { .. } => MAGENTA,
+            Message::Configure { .. } | Message::Configured { .. } => GREEN,
+            Message::Network { .. } => DIM,
+        },
+    }
+}

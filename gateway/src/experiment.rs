@@ -1,0 +1,288 @@
+//! `gateway experiment`.
+
+mod benches;
+mod folder;
+
+use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use analysis::report::figure::{Finding, Page, Section, Verdict};
+use analysis::report::{page, svg};
+use bench::record::facts;
+use bench::run::realtime;
+use clap::Args;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use model::quantiles::Quantiles;
+use paper::arm::Reply;
+use paper::moving::Run;
+use paper::{Effort, Experiment as Named, Lab, Session, files};
+use protocol::usage::{Failure, print, quoted};
+
+use super::input::stopped;
+use super::output::{Force, note};
+use super::print::Rows;
+use super::programs::Programs;
+use benches::Benches;
+use folder::Folder;
+
+/// Do the paper's experiments, and draw and judge what comes out
+///
+/// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
+/// its verdict, and the recordings of the benches, all at once when everything is done; what fails or is ended writes
+/// nothing. A folder in which there is something is taken with --force only. `gateway experiment list` tells what there is.
+///
+/// The moving arm's benches are 253 processes on an embedded bus of their own. All of it takes about two minutes.
+/// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway experiment list
+  gateway experiment fig9 fig10 -o laws
+  gateway experiment all -o experiments")]
+pub(crate) struct Experiment {
+    /// Experiments, or all, or list
+    #[arg(value_name = "NAME", required = true)]
+    names: Vec<Word>,
+    /// The folder for what comes out; made where there is none
+    #[arg(long, short, value_name = "DIR")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+    /// Measure little: a few cells, a few seconds, to see that everything works
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    programs: Programs,
+    /// Show no progress and no findings
+    #[arg(long, short)]
+    quiet: bool,
+}
+
+/// What may be named.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Word {
+    All,
+    List,
+    One(Named),
+}
+
+impl FromStr for Word {
+    type Err = String;
+
+    fn from_str(word: &str) -> Result<Self, String> {
+        match word {
+            "all" => Ok(Self::All),
+            "list" => Ok(Self::List),
+            _ => word.parse().map(Self::One).map_err(|error| format!("{error}; list tells what each does")),
+        }
+    }
+}
+
+impl Experiment {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        if self.names.contains(&Word::List) {
+            return list();
+        }
+        let Some(output) = &self.output else {
+            return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
+        };
+        let wanted = |named: &Named| {
+            self.names.iter().any(|word| matches!(word, Word::All) || *word == Word::One(*named))
+        };
+        let named: Vec<Named> = Named::ALL.into_iter().filter(wanted).collect();
+        let stop = stopped()?;
+        // Before anything is measured: nobody wants to hear after minutes that there is nowhere to write.
+        let folder = Folder::create(output, self.force)?;
+        let page = self.perform(&named, &folder, stop)?;
+        write(&page, &folder)?;
+        folder.finish()?;
+        if self.quiet { Ok(()) } else { tell(&page, &output.join("report.html")) }
+    }
+
+    fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
+        let effort = if self.quick { Effort::Quick } else { Effort::Full };
+        let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
+        let benches =
+            Benches { folder: folder.inside(), programs: self.programs.clone(), stop: Arc::clone(&stop) };
+        let mut lab = Here { benches, stop, idle: None };
+        let mut session = Session::new(effort);
+        let mut sections = Vec::with_capacity(named.len());
+        for named in named {
+            progress.begin(*named);
+            sections.push(session.perform(*named, &mut lab)?);
+            progress.end(named.seconds(effort));
+        }
+        lab.go_on()?;
+        progress.clear();
+        Ok(self.page(sections, lab.idle))
+    }
+
+    fn page(&self, sections: Vec<Section>, idle: Option<String>) -> Page {
+        let words: Vec<String> = std::env::args().collect();
+        let words = words.iter().enumerate().map(|(place, word)| {
+            // The folder that the program lies in is nobody's business.
+            let name = Path::new(word).file_name().filter(|_| place == 0);
+            quoted(&name.map_or_else(|| word.clone(), |name| name.to_string_lossy().into_owned()))
+                .into_owned()
+        });
+        let command = words.collect::<Vec<_>>().join(" ");
+        let about = facts::program(std::slice::from_ref(&command), 0);
+        let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
+        let mut facts = vec![("command".to_owned(), command)];
+        facts.push(("program".to_owned(), format!("{}, revision {}", fact("program"), fact("git_revision"))));
+        facts.push(("machine".to_owned(), machine()));
+        facts.extend(idle.map(|idle| ("idle lateness".to_owned(), idle)));
+        if self.quick {
+            facts.push((
+                "effort".to_owned(),
+                "quick: few cells, few measurements; no figures of these are results".to_owned(),
+            ));
+        }
+        Page {
+            title: "The paper's experiments".to_owned(),
+            intro: "Efficient Distributed Torque Computation for Large Scale Robot Skin, done again on a simulated skin: \
+                    each figure measured anew, each number beside the paper's."
+                .to_owned(),
+            facts,
+            sections,
+        }
+    }
+}
+
+/// This machine.
+struct Here {
+    benches: Benches,
+    stop: Arc<AtomicBool>,
+    /// How late the machine woke an idle thread before a bench.
+    idle: Option<String>,
+}
+
+impl Lab for Here {
+    type Error = Failure;
+
+    fn now(&self) -> u64 {
+        realtime::now()
+    }
+
+    fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
+        let run = self.benches.run(reply, effort);
+        // Its own end by the same signal is no failure of the bench.
+        self.go_on()?;
+        let run = run?;
+        let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
+        self.idle.get_or_insert_with(|| {
+            format!("median {:.0}, 99 % {:.0}, greatest {:.0} µs", late("p50"), late("p99"), late("max"))
+        });
+        Ok(run)
+    }
+
+    fn go_on(&mut self) -> Result<(), Failure> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(Failure::run("ended by a signal: nothing was written"));
+        }
+        Ok(())
+    }
+}
+
+/// The processor and the kernel, in a line.
+fn machine() -> String {
+    let about = facts::machine(&Quantiles::default());
+    let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
+    let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+    let name = name.map_or("unknown processor", |(_, name)| name.trim());
+    format!(
+        "{name}, {} in use, {} {} {}",
+        fact("processors"),
+        fact("sysname"),
+        fact("release"),
+        fact("machine")
+    )
+}
+
+fn list() -> Result<(), Failure> {
+    let line = |named: Named| format!("{:12} {}\n", named.name(), named.about());
+    print(&Named::ALL.into_iter().map(line).collect::<String>())
+}
+
+/// Writes the page, the figures and their data, and the findings.
+fn write(page: &Page, folder: &Folder) -> Result<(), Failure> {
+    folder.write("report.html", &page::html(page))?;
+    for figure in page.sections.iter().flat_map(|section| &section.figures) {
+        folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
+        folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
+    }
+    let results = serde_json::to_string_pretty(&files::results(page));
+    let results = results.map_err(|error| Failure::run(format!("results.json: {error}")))?;
+    folder.write("results.json", &(results + "\n"))
+}
+
+/// Prints every finding, and where the page is.
+fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
+    let head = ["", "here", "paper, bar"].map(str::to_owned);
+    let mut rows = Rows::new(head);
+    for section in &page.sections {
+        rows.section(&section.title, "", "");
+        for Finding { what, paper, ours, bar, verdict } in &section.findings {
+            let beside = [paper.as_ref().map(|paper| format!("paper {paper}")), bar.clone()];
+            let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
+            let verdict = match verdict {
+                Verdict::Told => String::new(),
+                Verdict::Better | Verdict::Same | Verdict::Worse => format!("  {verdict}"),
+            };
+            rows.row(what, ours, format!("{beside}{verdict}"));
+        }
+    }
+    let worse = page.sections.iter().flat_map(|section| &section.findings);
+    let worse = worse.filter(|finding| finding.verdict == Verdict::Worse).count();
+    let worse = if worse == 0 {
+        String::new()
+    } else {
+        format!("worse than the paper's or than their bar: {worse}\n")
+    };
+    print(&format!("{}\n{worse}{}\n", rows.table(), report.display()))
+}
+
+/// A bar on a terminal, a line for each experiment elsewhere.
+struct Progress {
+    bar: ProgressBar,
+    lines: bool,
+}
+
+impl Progress {
+    fn new(seconds: u64, quiet: bool) -> Self {
+        let lines = !io::stderr().is_terminal() && !quiet;
+        if quiet || lines {
+            return Self { bar: ProgressBar::hidden(), lines };
+        }
+        let bar = ProgressBar::with_draw_target(Some(seconds), ProgressDrawTarget::stderr());
+        let style = ProgressStyle::with_template("{spinner} {wide_bar} {msg}  {elapsed} of about {len} s");
+        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        bar.enable_steady_tick(Duration::from_millis(100));
+        Self { bar, lines }
+    }
+
+    fn begin(&self, named: Named) {
+        self.bar.set_message(named.name());
+        if self.lines {
+            note(format_args!("{named}: {}", named.about()));
+        }
+    }
+
+    fn end(&self, seconds: u64) {
+        self.bar.inc(seconds);
+    }
+
+    fn clear(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.clear();
+    }
+}

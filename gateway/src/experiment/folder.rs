@@ -1,0 +1,132 @@
+//! A folder whose files get their names together, when everything is done.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use protocol::usage::Failure;
+use trace::files::rename;
+
+use crate::output::Force;
+
+/// A folder for what experiments come to. What is written stands in a hidden folder in it until [`Folder::finish`]; if that
+/// never comes, nothing of it stays.
+#[derive(Debug)]
+pub(super) struct Folder {
+    path: PathBuf,
+    inside: PathBuf,
+    /// Whether it was made for this.
+    made: bool,
+    force: Force,
+}
+
+impl Folder {
+    /// Makes it where there is none, and makes sure that it can be written. One in which there is something is taken
+    /// with `force` only.
+    pub(super) fn create(path: &Path, force: Force) -> Result<Self, Failure> {
+        let wrong = |error: &dyn std::fmt::Display| {
+            Failure::run(format!("-o {}: {error}; name a folder that can be written", path.display()))
+        };
+        let made = !path.exists();
+        if !made && !path.is_dir() {
+            return Err(wrong(&"it is a file"));
+        }
+        fs::create_dir_all(path).map_err(|error| wrong(&error))?;
+        let taken = fs::read_dir(path).map_err(|error| wrong(&error))?.next().is_some();
+        if taken && !force.force {
+            let path = path.display();
+            return Err(Failure::usage(format!(
+                "-o {path}: there is something in it: name another folder, or overwrite files in it with --force"
+            )));
+        }
+        let inside = path.join(format!(".experiment.{}.part", std::process::id()));
+        let folder = Self { path: path.to_owned(), inside, made, force };
+        fs::create_dir(&folder.inside).map_err(|error| wrong(&error))?;
+        Ok(folder)
+    }
+
+    /// Where files are until they get their names.
+    pub(super) fn inside(&self) -> PathBuf {
+        self.inside.clone()
+    }
+
+    /// Writes a file.
+    pub(super) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+        let mut file = File::create_new(self.inside.join(name)).map_err(|error| self.failed(name, &error))?;
+        let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
+        written.map_err(|error| self.failed(name, &error))
+    }
+
+    /// Everything gets its name; files of the same names are replaced with `force` only.
+    pub(super) fn finish(self) -> Result<(), Failure> {
+        let listed = fs::read_dir(&self.inside).and_then(Iterator::collect::<io::Result<Vec<_>>>);
+        for entry in listed.map_err(|error| self.failed("", &error))? {
+            let name = entry.file_name();
+            rename(&entry.path(), &self.path.join(&name), self.force.force)
+                .map_err(|error| self.failed(&name.to_string_lossy(), &error))?;
+        }
+        Ok(())
+    }
+
+    fn failed(&self, name: &str, error: &io::Error) -> Failure {
+        Failure::run(format!("{}: {error}", self.path.join(name).display()))
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        // Nothing more can be done; a folder that has something in it stays.
+        let _ = fs::remove_dir_all(&self.inside);
+        if self.made {
+            let _ = fs::remove_dir(&self.path);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(path: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            fs::read_dir(path).unwrap().map(|it| it.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn what_is_not_finished_leaves_nothing_and_what_is_replaces_what_was_there() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("deep/er");
+        let [kept, forced] = [false, true].map(|force| Force { force });
+        let folder = Folder::create(&path, kept).unwrap();
+        folder.write("report.html", "half").unwrap();
+        drop(folder);
+        assert!(!path.exists());
+        for (force, text) in [(kept, "first"), (forced, "second")] {
+            let folder = Folder::create(&path, force).unwrap();
+            folder.write("report.html", text).unwrap();
+            folder.finish().unwrap();
+            assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), text);
+        }
+        let refused = Folder::create(&path, kept).unwrap_err();
+        assert!(format!("{refused:?}").contains("there is something in it"), "{refused:?}");
+        let folder = Folder::create(&path, forced).unwrap();
+        folder.write("report.html", "third").unwrap();
+        drop(folder);
+        assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), "second");
+        assert_eq!(names(&path), ["report.html"]);
+    }
+
+    #[test]
+    fn a_file_is_no_folder() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("file");
+        fs::write(&path, "mine").unwrap();
+        for path in [path.clone(), path.join("below")] {
+            let error = Folder::create(&path, Force { force: true }).unwrap_err();
+            assert!(format!("{error:?}").contains("name a folder"), "{error:?}");
+        }
+        assert_eq!(fs::read_to_string(&path).unwrap(), "mine");
+    }
+}

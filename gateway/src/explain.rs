@@ -1,0 +1,235 @@
+//! `gateway explain`.
+
+mod show;
+
+use std::path::PathBuf;
+
+use analysis::explain::{Asked, Explanation, Watch, explain};
+use clap::Args;
+use model::decode::{Decoded, Decoder};
+use protocol::id::CellId;
+use protocol::packet::Epoch;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use protocol::usage::{Failure, print};
+use serde::Serialize;
+use trace::capture::{Entry, NoteKind, Reader};
+
+use super::output;
+
+/// The skin in a recording.
+const ATTACHED: &str = "skin.toml";
+
+/// Say why the torque of one epoch is what it is
+///
+/// Reads a capture up to the joints of that epoch and shows what each cell felt then, the force that it makes of it,
+/// the Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent;
+/// and what all of them add up to, beside the central computation. What the capture does not tell is named.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
+  gateway explain run.mcap --epoch 77 --cell 12
+  gateway explain run.mcap run-*.mcap --epoch 77 --at 700
+  gateway explain run.mcap --epoch 77 --at 20 --joint 2 --json")]
+pub(crate) struct Explain {
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// The number of the joints, modulo 256
+    #[arg(long, value_name = "N")]
+    epoch: u8,
+    /// Only joints from so many seconds after the first frame on
+    #[arg(long, value_name = "S", value_parser = super::dump::nanos, default_value = "0")]
+    at: u64,
+    /// Which joints of this epoch, when there are several
+    #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    occurrence: u32,
+    /// One cell in every step: its number, or BUS:NUMBER
+    #[arg(long, value_name = "CELL", value_parser = cell)]
+    cell: Option<Named>,
+    /// One joint, cell by cell
+    #[arg(long, value_name = "J", value_parser = clap::value_parser!(u8).range(1..=6))]
+    joint: Option<u8>,
+    /// The skin's description; else the one in the recording
+    #[arg(long, value_name = "FILE")]
+    skin: Option<PathBuf>,
+    /// One JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// A cell as it is named: on a bus, or on whichever has it.
+#[derive(Clone, Debug)]
+struct Named {
+    bus: Option<String>,
+    node: CellId,
+}
+
+fn cell(text: &str) -> Result<Named, String> {
+    let (bus, number) = match text.rsplit_once(':') {
+        Some((bus, number)) => (Some(bus.to_owned()), number),
+        None => (None, text),
+    };
+    match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
+        Some(node) => Ok(Named { bus, node }),
+        None => Err(format!("{number:?} is no cell: a number, 1 to 254, is")),
+    }
+}
+
+/// What is printed as JSON.
+#[derive(Serialize)]
+struct Whole<'a> {
+    source: String,
+    epoch: u8,
+    #[serde(flatten)]
+    explanation: &'a Explanation,
+}
+
+impl Explain {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = match &self.skin {
+            Some(path) => Skin::read(path).map_err(Failure::usage)?,
+            None => attached(&self.files)?,
+        };
+        self.check(&skin)?;
+        let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
+        let name = reader.name().to_owned();
+        let asked = Asked { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
+        let (moments, first) = find(&mut reader, &skin, asked)?;
+        let moments = moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
+        let mut explanation = explain(&skin, &moments);
+        if let Some(wanted) = &self.cell {
+            let named = |bus: &str, node: u8| {
+                node == wanted.node.get() && wanted.bus.as_ref().is_none_or(|wanted| wanted == bus)
+            };
+            explanation.cells.retain(|cell| named(&cell.bus, cell.node));
+        }
+        if let Some(joint) = self.joint {
+            for cell in &mut explanation.cells {
+                cell.rows.retain(|row| row.joint == joint);
+            }
+            explanation.total.retain(|total| total.joint == joint);
+        }
+        if self.json {
+            let whole = Whole { source: name, epoch: self.epoch, explanation: &explanation };
+            let text = serde_json::to_string_pretty(&whole).map_err(Failure::run)?;
+            return print(&(text + "\n"));
+        }
+        let what = match (self.cell.is_some(), self.joint) {
+            (true, _) => show::What::Cells,
+            (false, Some(_)) => show::What::Joint,
+            (false, None) => show::What::All,
+        };
+        print(&show::text(&name, self.epoch, first, &explanation, what))
+    }
+
+    /// The cell and the joint must be the skin's.
+    fn check(&self, skin: &Skin) -> Result<(), Failure> {
+        let joints = skin.robot.joints.len();
+        if let Some(joint) = self.joint.filter(|joint| usize::from(*joint) > joints) {
+            return Err(Failure::usage(format!(
+                "--joint {joint}: {} has joints 1 to {joints}",
+                skin.robot.name
+            )));
+        }
+        let Some(Named { bus, node }) = &self.cell else { return Ok(()) };
+        let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
+        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        if let Some(bus) = bus.as_ref().filter(|bus| skin.bus_named(bus).is_none()) {
+            return Err(Failure::usage(format!("--cell {bus}:{node}: the skin's buses are {}", names())));
+        }
+        let there: Vec<_> = skin
+            .cells
+            .iter()
+            .filter(|cell| cell.node == *node)
+            .filter_map(|cell| skin.buses.get(cell.bus))
+            .filter(|bus| on(&bus.name))
+            .collect();
+        match there.as_slice() {
+            [_] => Ok(()),
+            [] => Err(Failure::usage(format!(
+                "--cell {node}: the skin has no such cell on {}",
+                bus.clone().unwrap_or_else(names)
+            ))),
+            buses => {
+                let choices: Vec<_> = buses.iter().map(|bus| format!("{}:{node}", bus.name)).collect();
+                Err(Failure::usage(format!(
+                    "--cell {node} is on several buses: say one of {}",
+                    choices.join(", ")
+                )))
+            }
+        }
+    }
+}
+
+type Found = Result<Vec<Option<analysis::explain::Moment>>, analysis::explain::NotFound>;
+
+/// Reads up to what is asked for; also the time of the first frame.
+fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<(Found, u64), Failure> {
+    let name = reader.name().to_owned();
+    let mut watch = Watch::new(skin, asked);
+    let mut decoder = Decoder::new(None);
+    for before in &reader.extras().in_force {
+        let at = Micros(before.nanos / 1_000);
+        if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
+            watch.begin(before.nanos, &before.bus, &message);
+        }
+    }
+    let (mut first, mut dropped, mut unreadable) = (None, 0, 0_u64);
+    while let Some(entry) = reader.next().map_err(Failure::run)? {
+        match entry {
+            Entry::Frame(record) => {
+                let nanos = record.time.nanos;
+                first.get_or_insert(nanos);
+                let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+                let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
+                if watch.take(nanos, record.interface, message) {
+                    break;
+                }
+            }
+            Entry::Note(note) => match note.kind {
+                NoteKind::Dropped(frames) => dropped = frames.saturating_add(dropped),
+                NoteKind::Unreadable(_) => unreadable += 1,
+                NoteKind::Text | NoteKind::CanXl => {}
+            },
+        }
+    }
+    if dropped > 0 {
+        output::note(format_args!(
+            "{name}: {dropped} frames are missing before this point; what was felt may be older"
+        ));
+    }
+    if unreadable > 0 {
+        output::note(format_args!("{name}: {unreadable} lines before this point could not be read"));
+    }
+    Ok((watch.moments(), first.unwrap_or_default()))
+}
+
+/// The skin that a recording has with it.
+fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
+    if files.iter().any(|file| file.as_os_str() == "-") {
+        return Err(Failure::usage("standard input is read once: say which skin with --skin"));
+    }
+    if let Some(pipe) =
+        files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
+    {
+        return Err(Failure::usage(format!(
+            "{} is no regular file and is read once: say which skin with --skin",
+            pipe.display()
+        )));
+    }
+    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    let name = reader.name().to_owned();
+    loop {
+        let more = reader.next().map_err(Failure::run)?.is_some();
+        let found = reader.extras().attachments.iter().find(|(name, _)| name == ATTACHED);
+        if let Some((_, bytes)) = found {
+            let text = std::str::from_utf8(bytes)
+                .map_err(|error| Failure::run(format!("{name}: its {ATTACHED} is no text: {error}")))?;
+            return Skin::parse(&format!("{name}, {ATTACHED}"), text).map_err(Failure::usage);
+        }
+        if !more || reader.format() == trace::capture::Format::Candump {
+            return Err(Failure::usage(format!("{name} has no skin in it: say which with --skin")));
+        }
+    }
+}

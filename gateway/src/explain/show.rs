@@ -1,0 +1,329 @@
+//! An explanation as tables.
+
+use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+
+/// Which part is wanted.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum What {
+    /// One line a cell; a single cell in every step.
+    All,
+    /// These cells in every step.
+    Cells,
+    /// One joint, cell by cell.
+    Joint,
+}
+
+/// All of it; `first` is the time of the capture's first frame.
+pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation, what: What) -> String {
+    let mut text = String::new();
+    for bus in &explanation.buses {
+        let at = seconds(bus.at_ns.saturating_sub(first));
+        let halted = if bus.halted { ", halted" } else { "" };
+        text += &format!(
+            "{name}: joints of epoch {epoch} on {}, {at} s after the first frame{halted}\n",
+            bus.bus
+        );
+        let mut table = table();
+        let joints = (1..=bus.position_words.len()).map(|joint| format!("joint {joint}"));
+        table.set_header(std::iter::once(String::new()).chain(joints));
+        table
+            .add_row(std::iter::once("word".to_owned()).chain(bus.position_words.iter().map(i16::to_string)));
+        table.add_row(
+            std::iter::once("rad".to_owned()).chain(bus.position_rad.iter().map(|rad| format!("{rad:.4}"))),
+        );
+        text += &right(table, false);
+    }
+    let cells = &explanation.cells;
+    match (what, cells.as_slice()) {
+        (What::All | What::Cells, []) => text += "\nno cell was in contact, and none answered\n",
+        (What::Joint, _) => text += &joint(cells),
+        (What::Cells, _) | (What::All, [_]) => {
+            for cell in cells {
+                text += &every_step(cell, first);
+            }
+        }
+        (What::All, _) => text += &one_line_each(cells),
+    }
+    if what != What::Cells && !cells.is_empty() {
+        text += &totals(&explanation.total);
+    }
+    if !explanation.missing.is_empty() {
+        text += "\nnot known:\n";
+        for line in &explanation.missing {
+            text += &format!("  {line}\n");
+        }
+    }
+    text
+}
+
+fn table() -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    table
+}
+
+/// The table with its columns to the right, but the first and, where that is of words, the last; close together, so
+/// that it fits on 80 columns.
+fn right(mut table: Table, words_at_the_end: bool) -> String {
+    let count = table.column_count();
+    let last = count.saturating_sub(usize::from(words_at_the_end));
+    for (index, column) in table.column_iter_mut().enumerate() {
+        let numbers = index > 0 && index < last;
+        let at_the_end = index + 1 == count;
+        column.set_padding((1, u16::from(!numbers || at_the_end)));
+        if numbers {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    format!("{table}\n")
+}
+
+#[expect(clippy::cast_precision_loss, reason = "to be read")]
+fn seconds(nanos: u64) -> String {
+    format!("{:.6}", nanos as f64 / 1e9)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "to be read")]
+fn millis(nanos: u64) -> String {
+    format!("{:.3} ms", nanos as f64 / 1e6)
+}
+
+fn one_line_each(cells: &[CellExplained]) -> String {
+    let mut table = table();
+    // Joints beyond those that move any of them have nothing but zeros, if all is well.
+    let odd = |row: &&Row| row.word.is_some_and(|word| word != 0);
+    let odd = cells.iter().flat_map(|cell| cell.rows.iter().filter(odd)).map(|row| row.joint);
+    let joints = cells.iter().map(|cell| cell.joint).chain(odd).max().map_or(0, usize::from);
+    let names = Names::of(cells);
+    let head = [names.head(), "F_z N".to_owned()].into_iter();
+    let head = head.chain((1..=joints).map(|joint| format!("Nm {joint}")));
+    table.set_header(head.chain(["off".to_owned(), "which is".to_owned()]));
+    for cell in cells {
+        let force =
+            cell.force.as_ref().map_or_else(|| "?".to_owned(), |force| format!("{:.3}", force.force_n));
+        let head = [names.of_cell(cell), force];
+        let words = cell.rows.iter().take(joints);
+        let words = words.map(|row| row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.4}")));
+        table.add_row(head.into_iter().chain(words).chain([steps_off(&cell.rows), worst(&cell.rows)]));
+    }
+    format!(
+        "\nwhat cells said in Nm, and by how many steps of 2^-12 at most; --cell shows how\n{}",
+        right(table, true)
+    )
+}
+
+/// How cells are called: by their numbers, and by their bus where there are several.
+struct Names(Option<String>);
+
+impl Names {
+    fn of(cells: &[CellExplained]) -> Self {
+        let bus = cells.first().map(|cell| &cell.bus);
+        Self(bus.filter(|bus| cells.iter().all(|cell| cell.bus == **bus)).cloned())
+    }
+
+    fn head(&self) -> String {
+        self.0.clone().unwrap_or_else(|| "cell".to_owned())
+    }
+
+    fn of_cell(&self, cell: &CellExplained) -> String {
+        if self.0.is_some() { cell.node.to_string() } else { name(cell) }
+    }
+}
+
+fn name(cell: &CellExplained) -> String {
+    format!("{} {}", cell.bus, cell.node)
+}
+
+/// The differences of a cell's words from the nearest steps.
+fn steps_off(rows: &[Row]) -> String {
+    let mut off: Vec<_> = rows.iter().filter_map(|row| row.difference_steps).collect();
+    if off.is_empty() {
+        return "?".to_owned();
+    }
+    off.sort_unstable_by_key(|steps| steps.abs());
+    off.last().map(|steps| sign(*steps)).unwrap_or_default()
+}
+
+fn sign(steps: i32) -> String {
+    if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
+}
+
+/// The verdict that asks most of the reader.
+fn worst(rows: &[Row]) -> String {
+    let rank = |row: &&Row| match row.verdict {
+        Verdict::Unexplained => 4,
+        Verdict::Open => 3,
+        Verdict::Saturated => 2,
+        Verdict::Rounded { .. } => 1,
+        Verdict::Nearest => 0,
+    };
+    rows.iter().max_by_key(rank).map(|row| short(&row.verdict).to_owned()).unwrap_or_default()
+}
+
+const fn short(verdict: &Verdict) -> &'static str {
+    match verdict {
+        Verdict::Nearest => "nearest",
+        Verdict::Rounded { .. } => "16 bits",
+        Verdict::Saturated => "saturated",
+        Verdict::Unexplained => "NOT EXPLAINED",
+        Verdict::Open => "open",
+    }
+}
+
+/// The same with the J that a word comes of.
+fn long(verdict: &Verdict) -> String {
+    match verdict {
+        Verdict::Rounded { jacobian_steps, .. } => format!("16 bits: J {jacobian_steps:+.2}"),
+        Verdict::Nearest | Verdict::Saturated | Verdict::Unexplained | Verdict::Open => {
+            short(verdict).to_owned()
+        }
+    }
+}
+
+/// What the words of the last column mean, those that stand there.
+fn legend(cells: &[CellExplained]) -> String {
+    let rows = || cells.iter().flat_map(|cell| &cell.rows);
+    let mut text = String::new();
+    if rows().any(|row| matches!(row.verdict, Verdict::Rounded { .. })) {
+        text += "  16 bits: a J so many steps of 2^-14 m from the exact one gives this very word\n";
+    }
+    if rows().any(|row| row.verdict == Verdict::Saturated) {
+        text += "  saturated: the product is beyond 8 Nm, and the word says so\n";
+    }
+    if rows().any(|row| row.verdict == Verdict::Unexplained) {
+        text += &format!(
+            "  NOT EXPLAINED: no J within {JACOBIAN_STEPS} steps of the exact one gives this word\n"
+        );
+    }
+    text
+}
+
+fn every_step(cell: &CellExplained, first: u64) -> String {
+    let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
+    match &cell.force {
+        Some(force) => text += &force_steps(force, first),
+        None => text += "  felt       not known\n",
+    }
+    match cell.answered_after_ns {
+        Some(nanos) => text += &format!("  answered   {} after the joints\n", millis(nanos)),
+        None => text += "  answered   nothing\n",
+    }
+    text + &rows(std::slice::from_ref(cell), false)
+}
+
+fn force_steps(force: &Force, first: u64) -> String {
+    let Force { contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, .. } =
+        *force;
+    let Force { alpha_c, alpha_p_n, fused_n, force_threshold_n, force_steps, force_n, .. } = *force;
+    let counts = |counts: bool| if counts { "counts" } else { "none" };
+    let against = |value: f64, threshold: f64| if value < threshold { "below" } else { "not below" };
+    let touch = against(touch_n, contact_threshold_n);
+    let near = against(proximity, proximity_threshold);
+    let fused = against(fused_n, force_threshold_n);
+    let origin = origin(&force.origin, first);
+    let [touch_counts, near_counts] =
+        [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
+    format!(
+        "  felt       {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
+         since      {origin}\n  \
+         F_c        {touch_n:.4} N, {touch} {contact_threshold_n:.4} N: {touch_counts}\n  \
+         F_p        {proximity:.4}, {near} {proximity_threshold:.4}: {near_counts}\n  \
+         F_z        {alpha_c:.4} F_c + {alpha_p_n:.4} F_p = {fused_n:.6} N, {fused} {force_threshold_n:.4} N\n  \
+         in words   {force_steps} steps of 2^-16 N = {force_n:.6} N\n"
+    )
+}
+
+fn origin(origin: &Origin, first: u64) -> String {
+    let at = |nanos: u64| match nanos.checked_sub(first) {
+        Some(after) => seconds(after),
+        // In an earlier part of the recording.
+        None => format!("-{}", seconds(first - nanos)),
+    };
+    match *origin {
+        Origin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
+        Origin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),
+        Origin::Said { at_ns } => format!("it said so itself at {} s", at(at_ns)),
+        Origin::Stimulus { at_ns, from_epoch: None, .. } => {
+            format!("stimulus of {} s, from the next joints on", at(at_ns))
+        }
+        Origin::Stimulus { at_ns, from_epoch: Some(epoch), late } => {
+            let late = if late { ", late" } else { "" };
+            format!("stimulus of {} s, from epoch {epoch} on{late}", at(at_ns))
+        }
+    }
+}
+
+fn joint(cells: &[CellExplained]) -> String {
+    if cells.is_empty() {
+        return "\nno cell was in contact, and none answered\n".to_owned();
+    }
+    format!("\n{}", rows(cells, true))
+}
+
+/// Joints of cells, each in a line.
+fn rows(cells: &[CellExplained], by_cell: bool) -> String {
+    let mut table = table();
+    let names = Names::of(cells);
+    let first = if by_cell { names.head() } else { "joint".to_owned() };
+    let head = [first.as_str(), "J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"];
+    let force = by_cell.then_some("F_z N");
+    table.set_header(head.into_iter().take(1).chain(force).chain(head.into_iter().skip(1)));
+    let number = |value: Option<f64>, decimals: usize| {
+        value.map_or_else(|| "?".to_owned(), |value| format!("{value:.decimals$}"))
+    };
+    for cell in cells {
+        for row in &cell.rows {
+            let first = if by_cell { names.of_cell(cell) } else { row.joint.to_string() };
+            let force = by_cell.then(|| number(cell.force.as_ref().map(|force| force.force_n), 2));
+            let word = |word: Option<i16>| word.map_or_else(|| "-".to_owned(), |word| word.to_string());
+            let rest = [
+                number(row.jacobian_m, 6),
+                number(row.product_nm, 6),
+                word(row.nearest_word),
+                word(row.word),
+                row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.6}")),
+                row.difference_steps.map_or_else(|| "?".to_owned(), sign),
+                long(&row.verdict),
+            ];
+            table.add_row(std::iter::once(first).chain(force).chain(rest));
+        }
+    }
+    right(table, true) + &legend(cells)
+}
+
+fn totals(total: &[Total]) -> String {
+    let mut table = table();
+    table.set_header(["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"]);
+    for Total {
+        joint,
+        word_steps,
+        words_nm,
+        products_nm,
+        central_nm,
+        unrounded_nm,
+        difference_nm,
+        saturated,
+        open,
+    } in total
+    {
+        let difference = match (open, saturated) {
+            (0, 0) => format!("{difference_nm:+.6}"),
+            (0, saturated) => format!("{saturated} saturated"),
+            (open, _) => format!("{open} not known"),
+        };
+        table.add_row([
+            joint.to_string(),
+            word_steps.to_string(),
+            format!("{words_nm:.6}"),
+            format!("{products_nm:.6}"),
+            format!("{central_nm:.6}"),
+            difference,
+            format!("{unrounded_nm:.6}"),
+        ]);
+    }
+    format!(
+        "\nthe whole skin: the words of the frames added up, beside the central computation\n{}",
+        right(table, false)
+    )
+}

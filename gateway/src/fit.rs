@@ -1,0 +1,139 @@
+//! `gateway fit`.
+
+mod text;
+
+use std::path::PathBuf;
+
+use analysis::fit::{self, BusFit, COMPUTATION_NS};
+use clap::{Args, ValueEnum};
+use protocol::can::Format;
+use protocol::skin::{Bus, Skin};
+use protocol::usage::{Failure, print};
+use protocol::wire_time::{BitRates, bit_rate};
+
+/// Say whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
+///
+/// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as free
+/// of errors. Heartbeats count; commands and what only a bench sends do not. What a run asked for says `gateway shadow`. Without rates: those of the description where it has
+/// them for every bus, else a table over common ones. docs/bus.md says how it is computed.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway fit gateway/examples/ur5-253.toml
+  gateway fit gateway/examples/ur5-253.toml --nominal 1M --data 5M
+  gateway skin generate --cells 253 --buses 3 > three.toml; gateway fit three.toml --nominal 500k --format classic")]
+pub(crate) struct Fit {
+    /// The skin's description
+    #[arg(value_name = "SKIN")]
+    file: PathBuf,
+    /// Bits in a second while identifiers are compared, as 1000000, 500k or 1M: of all buses
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    nominal: Option<u32>,
+    /// Bits in a second of the data of CAN FD frames
+    #[arg(long, value_name = "RATE", value_parser = bit_rate, requires = "nominal")]
+    data: Option<u32>,
+    /// A table over common bit rates, whatever the description says
+    #[arg(long, conflicts_with = "nominal")]
+    table: bool,
+    /// What packets travel in on all buses, whatever the description says
+    #[arg(long, value_enum)]
+    format: Option<Packets>,
+    /// The longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
+    #[arg(long, value_name = "US", value_parser = computation)]
+    computation: Option<u64>,
+    /// Everything as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a packet travels in.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+enum Packets {
+    /// One CAN FD frame
+    Fd,
+    /// Two classic frames
+    Classic,
+}
+
+impl Fit {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
+        let format = self.format.map(|it| match it {
+            Packets::Fd => Format::Fd,
+            Packets::Classic => Format::Classic,
+        });
+        let rates = if self.table { None } else { self.rates(&skin, format)? };
+        let Some(rates) = rates else {
+            let rows = fit::table(&skin, format, computation_ns);
+            return if self.json {
+                print_json(&fit::json(&skin, &[], None, &rows))
+            } else {
+                print(&text::table(&skin, &rows))
+            };
+        };
+        let buses = rates.into_iter().enumerate();
+        let buses = buses
+            .filter_map(|(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns));
+        let buses: Vec<BusFit> = buses.collect();
+        let whole = fit::fullest(buses.iter().cloned()).map(|it| fit::whole(&skin, &it));
+        if self.json {
+            print_json(&fit::json(&skin, &buses, whole.as_ref(), &[]))
+        } else {
+            print(&text::buses(&skin, &buses, whole.as_ref()))
+        }
+    }
+
+    /// Format and rates of every bus; `None` when neither the command line nor the description has them for all.
+    fn rates(&self, skin: &Skin, format: Option<Format>) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
+        let formats: Vec<_> = skin.buses.iter().map(|bus| format.unwrap_or(bus.format)).collect();
+        let Some(nominal) = self.nominal else {
+            let described = skin.buses.iter().zip(&formats).map(|(bus, &format)| described(bus, format));
+            return described.collect();
+        };
+        if self.data.is_some() && !formats.contains(&Format::Fd) {
+            return Err(Failure::usage(
+                "--data is for CAN FD, and here all buses are classic: leave it out, or say --format fd",
+            ));
+        }
+        let rates = |format| match (format, self.data) {
+            (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage),
+            (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage),
+            (Format::Fd, None) => {
+                BitRates::classic(nominal).map_err(Failure::usage)?;
+                Err(Failure::usage(format!(
+                    "CAN FD needs a data bit rate: say --data, {nominal} to {}, or --format classic",
+                    BitRates::GREATEST_DATA
+                )))
+            }
+        };
+        formats.into_iter().map(|format| Ok((format, rates(format)?))).collect::<Result<_, _>>().map(Some)
+    }
+}
+
+/// What a bus' description says; a data bit rate that it does not have is the nominal one.
+fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
+    let Some(nominal) = bus.bitrate else { return Ok(None) };
+    let data = match format {
+        Format::Fd => bus.data_bitrate.unwrap_or(nominal),
+        Format::Classic => nominal,
+    };
+    let rates = BitRates::new(nominal, data);
+    let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
+    Ok(Some((format, rates)))
+}
+
+/// µs, with up to three decimals, as ns.
+fn computation(text: &str) -> Result<u64, String> {
+    let allowed = "0 to 65000 µs";
+    let us: f64 = text.parse().map_err(|_| format!("not a number; allowed is {allowed}"))?;
+    if !(0.0..=65_000.0).contains(&us) {
+        return Err(format!("allowed is {allowed}"));
+    }
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 65 000 000")]
+    let ns = (us * 1e3).ceil() as u64;
+    Ok(ns)
+}
+
+fn print_json(value: &serde_json::Value) -> Result<(), Failure> {
+    print(&format!("{value:#}\n"))
+}

@@ -1,0 +1,206 @@
+//! What `gateway fit` prints for people.
+
+use analysis::fit::case::{Answers, Case};
+use analysis::fit::limits::{Limit, NODES, Need};
+use analysis::fit::verdict::{Answer, percent};
+use analysis::fit::{BusFit, Judged, Row, Whole, name};
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use protocol::parameters::Sensing;
+use protocol::skin::Skin;
+
+use super::super::print::Rows;
+
+/// A line for each of several bit rates.
+pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
+    let Some(first) = rows.first() else { return String::new() };
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
+    table.set_header([
+        "bit rates",
+        "packet\nµs",
+        "load\n%",
+        "last\nms",
+        "cells\na bus",
+        "buses\nneeded",
+        "roots:\nload %",
+        "roots:\nlast ms",
+    ]);
+    for row in rows {
+        let BusFit { judged, most, answers, .. } = &row.fullest;
+        let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
+        table.add_row([
+            name(judged.case.format, judged.case.rates),
+            micros(judged.case.packet_ns()),
+            tenths(judged.load.total()),
+            ms(judged),
+            most.in_time().to_string(),
+            row.need.in_short(),
+            roots.map_or_else(String::new, |it| tenths(it.load.total())),
+            roots.map_or_else(String::new, ms),
+        ]);
+    }
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let case = &first.fullest.judged.case;
+    let cells = skin.cells.len();
+    let bus = match skin.buses.len() {
+        1 => format!("{cells} cells on one bus"),
+        buses => format!("{cells} cells on {buses} buses, here the fullest with {}", case.answers.cells()),
+    };
+    format!(
+        "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
+         load    worst case: all cells answer; joints, {}, heartbeats{}\n\
+         last    from the joints' turn on the bus to the end of the last answer at most\n\
+         cells   that a bus has time for; transceivers drive about {}\n\
+         buses   for {cells} cells, and what asks for so many: time or nodes\n\
+         roots   sums with only the roots on this bus; sums of all cells save no frame\n",
+        skin.name,
+        millis(case.period_ns),
+        micros(case.computation_ns),
+        what(case),
+        sensors(case),
+        NODES - 1,
+    )
+}
+
+/// Buses at their bit rates: a section for each, and one for all cells of the skin.
+pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> String {
+    let Some(first) = buses.first() else { return String::new() };
+    let case = &first.judged.case;
+    let period = format!("joints every {} ms", millis(case.period_ns));
+    let computation = format!("a cell computes {} µs", micros(case.computation_ns));
+    let mut rows = Rows::new([skin.name.clone(), period, computation]).names_in_one_line();
+    for bus in buses {
+        section(&mut rows, bus);
+    }
+    // Of one bus its own section says the same.
+    if let Some(whole) = whole.filter(|_| buses.len() > 1) {
+        rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
+        rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
+        for (buses, judged) in &whole.spread {
+            let on = format!("{} of {} cells", count(*buses), judged.case.answers.cells());
+            rows.row(on, figures(judged), judged.verdict());
+        }
+    }
+    format!("{}\n", rows.table())
+}
+
+fn section(rows: &mut Rows, bus: &BusFit) {
+    let BusFit { name: bus_name, judged, most, need, answers, remedies } = bus;
+    let Judged { case, load, times, .. } = judged;
+    let cells = case.answers.cells();
+    let worst = Answer::worst_case(judged);
+    rows.section(format!("{bus_name} at {}", worst.rates), format!("{cells} cells, {}", what(case)), "");
+    rows.row(worst.case(), worst.value(), worst.cells);
+    let parts = [
+        (format!("joints and {}", what(case)), load.joints + load.answers),
+        ("sensors".to_owned(), load.sensors),
+        ("heartbeats".to_owned(), load.heartbeats),
+    ];
+    let parts =
+        parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", tenths(*share)));
+    rows.row("  load", percent(load.total()), parts.collect::<Vec<_>>().join(", "));
+    let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
+    let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
+    let due = format!("due after {} ms", millis(case.deadline_ns()));
+    rows.row("last answer", last(judged), [due].into_iter().chain(bounds).collect::<Vec<_>>().join(", "));
+    let heartbeat =
+        times.heartbeat_ns.map_or_else(|| "no bound".to_owned(), |ns| format!("{} ms", millis(ns)));
+    rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
+    let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
+    rows.row("cells that fit", most.in_time().min(most.nodes), others);
+    rows.row("buses needed", needed(need), each_need(need));
+    if !remedies.is_empty() {
+        rows.section("  what to change", "", "");
+        for remedy in remedies {
+            rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
+        }
+    }
+    rows.section("  instead of these answers", "", "");
+    for remedy in answers {
+        rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
+    }
+    if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
+        rows.row("  sums", "not possible", "a cell has no way to a root");
+    }
+}
+
+fn is_of_roots(case: &Case) -> bool {
+    matches!(case.answers, Answers::Sums { shared: false, .. })
+}
+
+const fn what(case: &Case) -> &'static str {
+    match case.answers {
+        Answers::Torques { .. } => "torques",
+        Answers::Sums { .. } => "sums",
+    }
+}
+
+const fn sensors(case: &Case) -> &'static str {
+    match case.sensing {
+        Sensing::Off => "",
+        Sensing::Continuous { .. } => ", sensors",
+        Sensing::Event => ", sensors while nothing changes",
+    }
+}
+
+/// Load and last answer.
+fn figures(judged: &Judged) -> String {
+    format!("{}, {}", percent(judged.load.total()), last(judged))
+}
+
+fn last(judged: &Judged) -> String {
+    let Judged { case, load, times, .. } = judged;
+    match times.last_ns() {
+        Some(last_ns) => format!("{} ms", millis(last_ns)),
+        None if load.total() > 1.0 => "no bound".to_owned(),
+        None => format!("above {} ms", millis(case.period_ns)),
+    }
+}
+
+/// The last answer in ms for a column of numbers.
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn ms(judged: &Judged) -> String {
+    judged.times.last_ns().map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
+}
+
+fn needed(need: &Need) -> String {
+    let why: Vec<_> = need.binding().into_iter().map(Limit::name).collect();
+    need.buses().map_or_else(
+        || format!("none: {}", why.join(", ")),
+        |buses| if buses == 1 { "1".to_owned() } else { format!("{buses}: {}", why.join(", ")) },
+    )
+}
+
+fn each_need(need: &Need) -> String {
+    let of = |name: &str, buses: Option<u32>| {
+        buses.map_or_else(|| format!("{name} no number"), |buses| format!("{name} {buses}"))
+    };
+    [of("bandwidth", need.bandwidth), of("deadline", need.deadline), of("nodes", need.nodes)].join(", ")
+}
+
+fn count(buses: u32) -> String {
+    if buses == 1 { "1 bus".to_owned() } else { format!("{buses} buses") }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn millis(ns: u64) -> String {
+    trimmed(ns as f64 / 1e6, 2)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
+fn micros(ns: u64) -> String {
+    format!("{:.1}", ns as f64 / 1e3)
+}
+
+/// A share in %, in a column or a list of them.
+fn tenths(share: f64) -> String {
+    format!("{:.1}", 100.0 * share)
+}
+
+/// So many decimals at most, and no zeros at the end.
+fn trimmed(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}

@@ -1,0 +1,369 @@
+//! `gateway frame`: packets by hand.
+
+use std::fmt::Write;
+
+use clap::{Args, Subcommand};
+use model::decode::{parameter, pick};
+use model::generate::Format;
+use model::scenario::contact_words;
+use protocol::bus::Choice;
+use protocol::can::{self, BIT_RATE_SWITCH, Frame as CanFrame};
+use protocol::fixed::{Q, Q1_14, Q5_10};
+use protocol::id::Node;
+use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, WORDS};
+use protocol::usage::{Failure, print};
+
+use super::ack;
+
+/// Print a frame for cansend, with the right CRC; or send it
+///
+/// Prints one line for a CAN FD bus, two for a classic one. With --bus it is sent instead, also on an
+/// embedded bus, to which cansend cannot attach.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples, which press cell 12 with 3 N from the next joints on:
+  cansend vcan0 $(gateway frame configure --node 12 --write mode 1)
+  cansend vcan0 $(gateway frame stimulus --node 12 --force 3.0)
+  gateway frame stimulus --node 12 --force 3.0 --bus vcan0")]
+pub(crate) struct Frame {
+    #[command(subcommand)]
+    what: What,
+    /// What the packet travels in
+    #[arg(long, value_enum, default_value = "fd", global = true)]
+    format: Format,
+    /// Send it on this bus instead of printing it
+    #[arg(long, value_name = "NAME", global = true)]
+    bus: Option<String>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto, global = true)]
+    bus_kind: Choice,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Stop answering until a resume
+    #[command(after_help = "Example:\n  gateway frame halt")]
+    Halt,
+    /// Leave the halted state
+    #[command(after_help = "Example:\n  gateway frame resume")]
+    Resume,
+    /// Answer with a heartbeat when all that the last joints asked is done
+    #[command(after_help = "Example:\n  gateway frame sync")]
+    Sync,
+    /// Answer with the pages of counters and sensors
+    #[command(after_help = "Example:\n  gateway frame report")]
+    Report,
+    Joints(Positions),
+    Stimulus(Stimulus),
+    Configure(Configure),
+}
+
+/// The joint positions of an epoch
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
+  gateway frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
+struct Positions {
+    /// The number of this broadcast, 0 to 255; cells drop the one that they have just had
+    #[arg(long, value_name = "E")]
+    epoch: u8,
+    #[command(flatten)]
+    positions: Angles,
+}
+
+#[derive(Args, Debug)]
+#[group(required = true, multiple = false)]
+struct Angles {
+    /// One position for each of the robot's joints, 1 to 6 of them, in rad; wrapped to a turn
+    #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
+    rad: Option<Vec<String>>,
+    /// The same as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
+    #[arg(long, value_name = "WORD", num_args = 1.., allow_negative_numbers = true)]
+    words: Option<Vec<String>>,
+}
+
+/// What a cell in test mode shall feel
+///
+/// Puts nothing into test mode: `gateway frame configure --node N --write mode 1` does. A stimulus takes
+/// effect when joints come, and holds until another one replaces it; without --force nothing touches.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway frame stimulus --node 12 --force 3.0
+  gateway frame stimulus --node everyone --epoch 7 --force 0.5 --proximity 0.9
+  gateway frame stimulus --node 12 --acceleration 0 0 1")]
+struct Stimulus {
+    /// Who feels it: a cell's number, or everyone
+    #[arg(long, value_name = "NODE")]
+    node: String,
+    /// The touch's force in N, shared by the three contact words
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    force: Option<String>,
+    /// 0, nothing near, to 1
+    #[arg(long, value_name = "P", allow_negative_numbers = true)]
+    proximity: Option<String>,
+    /// The two temperatures in degrees Celsius
+    #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
+    temperature: Option<Vec<String>>,
+    /// The acceleration in g, instead of what touches the skin
+    #[arg(
+        long,
+        num_args = 3,
+        value_names = ["X", "Y", "Z"],
+        allow_negative_numbers = true,
+        conflicts_with_all = ["force", "proximity", "temperature"]
+    )]
+    acceleration: Option<Vec<String>>,
+    /// From the joints of this epoch on; else from the next joints on, whatever their epoch
+    #[arg(long, value_name = "E")]
+    epoch: Option<u8>,
+}
+
+/// Read or write a parameter of a cell
+///
+/// A parameter that is written by name takes values in their units:
+///
+///   mount JOINT JOINTS
+///   pose X Y Z NORMAL_X NORMAL_Y NORMAL_Z   (m, in the frame of the joint)
+///   contact ALPHA_C ALPHA_P CONTACT_THRESHOLD PROXIMITY_THRESHOLD FORCE_THRESHOLD   (N)
+///   timing PERIOD   (us)
+///   mode 0|1   (1 obeys stimuli)
+///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries what rounding took away)
+///   sensing off | continuous PERIOD | event   (ms)
+///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
+///   cuts none | 0+2   (ports that hear nothing, in test mode only)
+///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
+///   commit HASH   (hexadecimal)
+///
+/// By number it takes words as they are.
+#[derive(Args, Debug)]
+#[command(
+    verbatim_doc_comment,
+    after_help = "Examples:
+  gateway frame configure --node 12 --read pose
+  gateway frame configure --node 12 --write mode 1
+  gateway frame configure --node everyone --write row2 -0.425 0 0 0
+  gateway frame configure --node 12 --write 99 1 -1 0x7FFF"
+)]
+struct Configure {
+    /// Who is asked: a cell's number, or everyone
+    #[arg(long, value_name = "NODE")]
+    node: String,
+    #[command(flatten)]
+    request: Asked,
+    /// Comes back in the answer
+    #[arg(long, value_name = "T", default_value_t = 0)]
+    tag: u8,
+}
+
+#[derive(Args, Debug)]
+#[group(required = true, multiple = false)]
+struct Asked {
+    /// Ask for a parameter, by name or number
+    #[arg(long, value_name = "PARAMETER")]
+    read: Option<String>,
+    /// Write a parameter, by name or number
+    #[arg(long, num_args = 1.., value_names = ["PARAMETER", "VALUE"], allow_negative_numbers = true)]
+    write: Option<Vec<String>>,
+}
+
+impl Frame {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let message = self.what.message().map_err(Failure::usage)?;
+        let format = ack::wire(self.format);
+        match self.bus {
+            Some(name) => {
+                let bus = ack::open(&name, self.bus_kind, format).map_err(Failure::usage)?;
+                ack::send(&bus, &message, format)
+            }
+            None => print(&text(&message, format)),
+        }
+    }
+}
+
+/// The lines for cansend.
+fn text(message: &Message, format: can::Format) -> String {
+    let mut text = String::new();
+    for frame in message.encode().frames(format) {
+        // cansend needs only to be told of the bit-rate switch: `##1`, as the document has it.
+        let flags = frame.flags() & BIT_RATE_SWITCH;
+        let frame = CanFrame::with_data(frame.id(), format, flags, frame.data()).unwrap_or(frame);
+        writeln!(text, "{frame}").expect("a string takes whatever is written");
+    }
+    text
+}
+
+impl What {
+    fn message(&self) -> Result<Message, String> {
+        match self {
+            Self::Halt => Ok(Message::Halt),
+            Self::Resume => Ok(Message::Resume),
+            Self::Sync => Ok(Message::Sync),
+            Self::Report => Ok(Message::Report),
+            Self::Joints(joints) => joints.message(),
+            Self::Stimulus(stimulus) => stimulus.message(),
+            Self::Configure(configure) => configure.message(),
+        }
+    }
+}
+
+impl Positions {
+    fn message(&self) -> Result<Message, String> {
+        let Angles { rad, words } = &self.positions;
+        let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
+            (Some(rad), _) => ("--rad", rad, parameter::angle),
+            (None, words) => ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::raw),
+        };
+        if texts.len() > WORDS {
+            return Err(format!("{name} has {} positions: a robot has at most {WORDS} joints", texts.len()));
+        }
+        let mut positions = [Q1_14::ZERO; WORDS];
+        for (position, text) in positions.iter_mut().zip(texts) {
+            *position = Q1_14::from_bits(value(name, text, read)?);
+        }
+        let in_use = u8::try_from(texts.len()).map_err(|error| error.to_string())?;
+        Ok(Message::Joints { epoch: Epoch(self.epoch), joints: Joints { positions, in_use } })
+    }
+}
+
+impl Stimulus {
+    fn message(&self) -> Result<Message, String> {
+        let page = match &self.acceleration {
+            Some(texts) => SensorPage::Acceleration(several("--acceleration", texts)?),
+            None => SensorPage::Skin(SkinSensors {
+                contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
+                proximity: self.proximity.as_deref().map_or(Ok(Q1_14::ZERO), proximity)?,
+                temperature: several("--temperature", self.temperature.as_deref().unwrap_or_default())?,
+            }),
+        };
+        let from = self.epoch.map_or(From::Next, |epoch| From::Epoch(Epoch(epoch)));
+        Ok(Message::Stimulus { to: addressee(&self.node)?, from, page })
+    }
+}
+
+impl Configure {
+    fn message(&self) -> Result<Message, String> {
+        let wrong = |error: parameter::ParameterTextError| error.to_string();
+        let request = match (&self.request.read, self.request.write.as_deref()) {
+            (Some(name), _) => Request::Read { number: parameter::number(name).map_err(wrong)? },
+            (None, Some([name, values @ ..])) => {
+                let (number, words) = parameter::write(name, values).map_err(wrong)?;
+                Request::Write { number, words }
+            }
+            (None, None | Some([])) => return Err("--read or --write is needed".to_owned()),
+        };
+        Ok(Message::Configure { to: addressee(&self.node)?, tag: self.tag, request })
+    }
+}
+
+/// A value of an option; the error names the option, the value, and what is allowed.
+fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
+    read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
+}
+
+/// So many numbers, or zeros when none were given.
+fn several<const F: u32, const N: usize>(option: &str, texts: &[String]) -> Result<[Q<F>; N], String> {
+    let mut all = [Q::ZERO; N];
+    for (one, text) in all.iter_mut().zip(texts) {
+        *one = Q::from_bits(value(option, text, parameter::nearest::<F>)?);
+    }
+    Ok(all)
+}
+
+/// The three words of a force that they can say.
+fn contact(text: &str) -> Result<[Q5_10; 3], String> {
+    let force = value("--force", text, parameter::real)?;
+    let words = contact_words(force);
+    let sum: f64 = words.into_iter().map(Q::to_f64).sum();
+    if (sum - force).abs() > 1.0 / 1_024.0 {
+        let [least, greatest] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
+        return Err(format!("--force {text}: three contact words say {least} to {greatest:.3} N"));
+    }
+    Ok(words)
+}
+
+fn proximity(text: &str) -> Result<Q1_14, String> {
+    let allowed = |proximity: f64| match proximity {
+        0.0..=1.0 => Ok(Q1_14::nearest(proximity)),
+        _ => Err("proximity is 0 to 1".to_owned()),
+    };
+    value("--proximity", text, |text| parameter::real(text).and_then(allowed))
+}
+
+fn addressee(text: &str) -> Result<Node, String> {
+    match pick::node(text) {
+        Ok(node @ (Node::Cell(_) | Node::Everyone)) => Ok(node),
+        Ok(Node::Gateway) | Err(_) => {
+            Err(format!("--node {text}: a cell's number, 1 to 254, or everyone is possible"))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        frame: Frame,
+    }
+
+    fn message(line: &str) -> Result<Message, String> {
+        let words = std::iter::once("frame").chain(line.split(' '));
+        Line::try_parse_from(words).unwrap_or_else(|error| panic!("{error}")).frame.what.message()
+    }
+
+    fn says(line: &str) -> String {
+        message(line).unwrap_err()
+    }
+
+    #[test]
+    fn what_cannot_be_is_said_with_what_can() {
+        assert_eq!(says("joints --epoch 7 --rad 0 x"), "--rad x: it must be a number");
+        assert_eq!(
+            says("joints --epoch 7 --words 1 2 3 4 5 6 7"),
+            "--words has 7 positions: a robot has at most 6 joints"
+        );
+        assert_eq!(
+            says("stimulus --node 12 --force 96"),
+            "--force 96: three contact words say -96 to 95.997 N"
+        );
+        assert_eq!(says("stimulus --node 12 --force nan"), "--force nan: it must be a number");
+        assert_eq!(says("stimulus --node 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");
+        assert_eq!(
+            says("stimulus --node 12 --temperature 20 512"),
+            "--temperature 512: it must be in [-512, 512)"
+        );
+        let node = "a cell's number, 1 to 254, or everyone is possible";
+        for wrong in ["0", "255", "gateway", "-1", "x"] {
+            assert_eq!(says(&format!("stimulus --node={wrong}")), format!("--node {wrong}: {node}"));
+        }
+        assert_eq!(says("configure --node 12 --write mode 2"), "mode = 2: 0 measures, 1 obeys stimuli");
+    }
+
+    #[test]
+    fn a_force_is_shared_and_adds_up_to_its_nearest_word() {
+        for (force, steps) in
+            [("3.0", 3_072), ("-96", -98_304), ("95.997", 98_301), ("0.0005", 1), ("1", 1_024)]
+        {
+            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: From::Next, to: Node::Everyone }) =
+                message(&format!("stimulus --node everyone --force {force}"))
+            else {
+                panic!("{force}");
+            };
+            assert_eq!(
+                skin.contact.map(|word| i32::from(word.to_bits())).iter().sum::<i32>(),
+                steps,
+                "{force}"
+            );
+        }
+    }
+
+    #[test]
+    fn radians_are_wrapped_and_words_are_taken_as_they_are() {
+        let rad = message("joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 6.283185307179586").unwrap();
+        let words = message("joints --epoch 7 --words 0 0xCF1C 10430 -14603 0xc008 0").unwrap();
+        assert_eq!(rad, words);
+    }
+}

@@ -1,0 +1,94 @@
+//! Where commands write beside standard output: standard error, and files that are whole or not there.
+
+use std::fmt::Display;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use protocol::stop::Stoppable;
+use protocol::usage::Failure;
+use trace::files::{WholeFile, check};
+
+/// Whether files that exist may be overwritten.
+#[derive(Args, Clone, Copy, Debug)]
+pub(crate) struct Force {
+    /// Overwrite files that exist
+    #[arg(long)]
+    pub(crate) force: bool,
+}
+
+impl Force {
+    /// Begins a file that an option names, so that what makes that impossible is known before there is anything to
+    /// write.
+    pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
+        WholeFile::create(path, self.force).map_err(|error| refused(option, path, &error))
+    }
+
+    /// Sees that a file may be written, long before it is.
+    pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
+        check(path, self.force).map_err(|error| refused(option, path, &error))
+    }
+
+    /// Writes a whole file that an option names, or leaves what was there.
+    pub(crate) fn write(self, option: &str, path: &Path, text: &str) -> Result<(), Failure> {
+        let (whole, file) = self.create(option, path)?;
+        finish(option, whole, file, text)
+    }
+}
+
+/// Writes all of a file that was begun.
+pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
+    let name = named(option, whole.path());
+    let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
+    written.map_err(|error: io::Error| Failure::run(format!("{name}: {error}")))
+}
+
+/// A name that cannot be written to is wrong use.
+pub(crate) fn refused(option: &str, path: &Path, error: &io::Error) -> Failure {
+    Failure::usage(format!("{}: {error}", named(option, path)))
+}
+
+fn named(option: &str, path: &Path) -> String {
+    format!("{option} {}", path.display()).trim_start().to_owned()
+}
+
+/// Sees that each file that is written, by its option, is a file of its own, and none that the command reads: `--force`
+/// does not mean that one.
+pub(crate) fn apart<'a>(
+    written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
+    read: impl IntoIterator<Item = &'a Path>,
+) -> Result<(), Failure> {
+    // Two names may be one terminal.
+    let is_stream = |path: &Path| fs::metadata(path).is_ok_and(|about| !about.is_file() && !about.is_dir());
+    let read: Vec<_> = read.into_iter().map(place).collect();
+    let mut before = Vec::new();
+    for (option, path) in written {
+        let Some(path) = path.filter(|path| !is_stream(path)) else { continue };
+        let there = place(path);
+        if read.contains(&there) {
+            let name = named(option, path);
+            return Err(Failure::usage(format!(
+                "{name} is a file that this command reads: name another file"
+            )));
+        }
+        if let Some((other, _)) = before.iter().find(|(_, place)| *place == there) {
+            return Err(Failure::usage(format!("{option} and {other} name the same file: name two")));
+        }
+        before.push((option, there));
+    }
+    Ok(())
+}
+
+/// Where a name leads: two names of one file are the same, whether it is there or not.
+fn place(path: &Path) -> PathBuf {
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let inside = || Some(fs::canonicalize(folder).ok()?.join(path.file_name()?));
+    fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
+}
+
+/// Says something on standard error; if that is closed, nobody wants to know.
+pub(crate) fn note(text: impl Display) {
+    let _ = Stoppable::new(io::stderr()).write_all(format!("{text}\n").as_bytes());
+}

@@ -1,0 +1,55 @@
+//! `gateway recover`: makes a recording whole whose writer was killed.
+
+use std::fs::File;
+use std::path::PathBuf;
+
+use clap::Args;
+use protocol::usage::{Failure, print};
+use trace::recording::recover::RecoverError;
+use trace::recording::{names, repair};
+
+use super::output::{Force, apart};
+
+/// Make a recording whole that ends in the middle
+///
+/// Copies everything that is whole into a new file with its indexes, and says what was not. The recording stays as
+/// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
+/// or nothing was wrong; 1: it cannot be done; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Example:\n  gateway recover run.mcap.part -o run.mcap")]
+pub(crate) struct Recover {
+    /// The recording: an MCAP file, of whomever
+    file: PathBuf,
+    /// The new file; else FILE-recovered.mcap
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+}
+
+impl Recover {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let name = self.file.display();
+        let file = File::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        if names::is_held(&file) {
+            return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
+        }
+        let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
+        let out = output.display();
+        apart([("-o", Some(output.as_path()))], [self.file.as_path()])?;
+        self.force.check("-o", &output)?;
+        let failure = |error| {
+            if let RecoverError::Write(error) = error {
+                return Failure::run(format!("-o {out}: {error}"));
+            }
+            Failure::run(format!("{name}: {error}"))
+        };
+        let line = match repair::copy_unless_sound(&file, &output, self.force.force).map_err(failure)? {
+            (recovered, None) => {
+                format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
+            }
+            (recovered, Some(bytes)) => format!("{out}, {bytes} bytes: {recovered}"),
+        };
+        print(&format!("{line}\n"))
+    }
+}

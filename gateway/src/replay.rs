@@ -1,0 +1,279 @@
+//! `gateway replay`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use bench::replay::player::Pace;
+use bench::replay::reel::Only as What;
+use bench::replay::report::{Expect, Summary};
+use bench::replay::survey::Part;
+use bench::replay::{Options, Spawn, replay};
+use bench::run::RunError;
+use clap::{Args, ValueEnum};
+use model::decode::pick::{self, Pick, Wanted};
+use model::quantiles::Quantiles;
+use protocol::bus::{Choice, Kinds, OneKind};
+use protocol::id::Node;
+use protocol::usage::{Failure, print};
+
+use super::output::{self, Force, apart};
+use super::print::Rows;
+
+/// Bytes for frames that wait: all cells may answer a report at once.
+const RECEIVE_BUFFER: u32 = 8 << 20;
+
+/// Put a capture back on a bus, and compare what the cells answer with what they answered then
+///
+/// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
+/// bus answer; with --expect their answers have to be the recorded ones, bit for bit. docs/replay.md says what is
+/// compared and how. Exit code 0: all was sent, and all answers were right; 1: not so; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway replay run.log --only inputs --speed 0.5
+  gateway replay run.mcap --expect --spawn --lockstep
+  gateway replay run.mcap run-*.mcap --expect --spawn --lockstep
+  gateway replay foreign.log --map can0=vcan0 --max --loop 10")]
+pub(crate) struct Replay {
+    /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
+    /// Send the frames of one of the capture's buses on another bus
+    #[arg(long, value_name = "FROM=TO", value_parser = route)]
+    map: Vec<(String, String)>,
+    /// Only the frames of these buses of the capture
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    bus: Vec<String>,
+    /// Whose frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
+    /// else all are sent
+    #[arg(long, value_enum)]
+    only: Option<Only>,
+    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
+    /// joints, sync, resume, report alone, wire, and foreign
+    #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
+    kind: Vec<Wanted>,
+    /// Only packets from or to these: a cell's number, gateway, everyone
+    #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
+    node: Vec<Node>,
+    /// Begin so many seconds after the first frame; with inputs only, in the state that was in force there
+    #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
+    from: u64,
+    /// End before the frame so many seconds after the first one
+    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    to: Option<u64>,
+    /// Do it N times; 0 is until Ctrl-C
+    #[arg(long = "loop", value_name = "N", default_value_t = 1)]
+    passes: u32,
+    /// So many times as fast, 0.1 to 100
+    #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
+    speed: f64,
+    /// As fast as the bus takes it, whatever the times
+    #[arg(long, conflicts_with = "speed")]
+    max: bool,
+    /// Spin so many microseconds before a frame is due instead of sleeping; 0 is never
+    #[arg(long, value_name = "US", default_value_t = 100, value_parser = clap::value_parser!(u32).range(..=100_000))]
+    spin: u32,
+    /// Send the next joints only when every cell has answered: the same on any machine, however slow
+    #[arg(long)]
+    lockstep: bool,
+    /// Compare the answers with the recorded ones; with --max in lockstep
+    #[arg(long)]
+    expect: bool,
+    /// Start the cells, as processes, and end them afterwards
+    #[arg(long)]
+    spawn: bool,
+    /// The skin of the cells that are started; else the recording's own
+    #[arg(long, value_name = "FILE", requires = "spawn")]
+    skin: Option<PathBuf>,
+    /// Put up to N cells into one process
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254), requires = "spawn")]
+    cells_per_process: u8,
+    /// The program of the cells, when it is not beside this one
+    #[arg(long, value_name = "PATH", requires = "spawn")]
+    cell_node: Option<PathBuf>,
+    /// The program that serves embedded buses, when it is not beside this one
+    #[arg(long, value_name = "PATH", requires = "spawn")]
+    vcan_setup: Option<PathBuf>,
+    /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
+    #[arg(long)]
+    test_mode: bool,
+    /// How many milliseconds a full bus is waited for, before frames are refused
+    #[arg(long, value_name = "MS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=60_000))]
+    patience: u32,
+    /// End before anything is sent when a line of a log cannot be read
+    #[arg(long)]
+    strict: bool,
+    /// Write the figures of the end as JSON; docs/replay.md explains its keys
+    #[arg(long, value_name = "FILE")]
+    summary: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+    /// Print the figures as JSON instead of the table
+    #[arg(long)]
+    json: bool,
+    /// Show no progress, only the table at the end
+    #[arg(long, short)]
+    quiet: bool,
+}
+
+/// Whose frames are sent.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+enum Only {
+    /// Commands, configuration, stimuli
+    Inputs,
+    /// What cells said
+    Replies,
+    /// Everything
+    All,
+}
+
+fn route(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((from, to)) if !from.is_empty() && !to.is_empty() => Ok((from.to_owned(), to.to_owned())),
+        _ => Err("a bus of the capture and the bus it goes to, such as vcan0=vcan1".to_owned()),
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
+fn nanos(text: &str) -> Result<u64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
+        _ => Err("a number of seconds from 0 to 1e9".to_owned()),
+    }
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(speed),
+        _ => Err("a number from 0.1 to 100".to_owned()),
+    }
+}
+
+impl Replay {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let options = self.options()?;
+        let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
+        apart([("--summary", self.summary.as_deref())], read)?;
+        // Before the replay: nobody wants to hear after an hour that there is nowhere to write.
+        let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
+        let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
+        let summary = replay(&options).map_err(failure)?;
+        let json = serde_json::to_string_pretty(&summary).map_err(Failure::run)?;
+        if let Some((whole, file)) = file {
+            output::finish("--summary", whole, file, &format!("{json}\n"))?;
+        }
+        print(&if self.json { format!("{json}\n") } else { table(&summary) })?;
+        summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))
+    }
+
+    fn options(&self) -> Result<Options, Failure> {
+        let answered = [("--expect", self.expect), ("--lockstep", self.lockstep), ("--spawn", self.spawn)];
+        let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
+        let only = match (self.only, needs) {
+            (Some(Only::Replies | Only::All), Some(name)) => {
+                return Err(Failure::usage(format!(
+                    "{name} lets cells answer, and --only sends recorded answers in their place: leave out one of the \
+                     two"
+                )));
+            }
+            (Some(Only::Inputs), _) | (None, Some(_)) => What::Inputs,
+            (Some(Only::Replies), None) => What::Replies,
+            (Some(Only::All) | None, None) => What::All,
+        };
+        Ok(Options {
+            files: self.files.clone(),
+            kinds: Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)?,
+            only,
+            pick: Pick { kinds: self.kind.clone(), nodes: self.node.clone(), ..Pick::default() },
+            buses: self.bus.clone(),
+            map: self.map.clone(),
+            part: Part { from: self.from, to: self.to },
+            passes: (self.passes > 0).then_some(self.passes),
+            pace: if self.max { Pace::Max } else { Pace::Timed(self.speed) },
+            spin: Duration::from_micros(self.spin.into()),
+            lockstep: self.lockstep || (self.expect && self.max),
+            expect: self.expect,
+            spawn: self.spawn.then(|| Spawn {
+                skin: self.skin.clone(),
+                cells_per_process: self.cells_per_process.into(),
+                cell_node: self.cell_node.clone(),
+            }),
+            vcan_setup: self.vcan_setup.clone(),
+            test_mode: self.test_mode,
+            patience: Duration::from_millis(self.patience.into()),
+            receive_buffer: RECEIVE_BUFFER as usize,
+            strict: self.strict,
+            quiet: self.quiet,
+        })
+    }
+}
+
+/// The whole replay, for people.
+fn table(summary: &Summary) -> String {
+    let ended = if summary.interrupted { "interrupted" } else { "done" };
+    let head = [summary.file.clone(), format!("{:.1} s, {ended}", summary.duration_s), String::new()];
+    let mut rows = Rows::new(head);
+    rows.section("frames", "", "");
+    rows.row("sent", summary.sent, "");
+    rows.row("refused", summary.refused, "a bus stayed full");
+    rows.row("lost", summary.lost, "a bus was down");
+    for (reason, count) in &summary.skipped {
+        rows.row("not sent", count, reason);
+    }
+    if summary.sent_at_once > 0 {
+        rows.row("sent at once", summary.sent_at_once, "older than what was sent before");
+    }
+    if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
+        rows.section("lateness", "50 % / 90 % / 99 % / greatest, µs", "");
+        rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
+    }
+    if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {
+        for bus in &summary.buses {
+            let from = if bus.capture == bus.name { String::new() } else { format!("from {}", bus.capture) };
+            rows.section(format!("{} ({})", bus.name, bus.kind), format!("{} sent", bus.frames.sent), from);
+        }
+    }
+    if let Some(lockstep) = &summary.lockstep {
+        let silent = lockstep.silent_cells.join(", ");
+        let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
+        rows.section("lockstep", silent, format!("{} joints asked again", lockstep.asked_again));
+    }
+    if let Some(expect) = &summary.expect {
+        expectation(&mut rows, expect);
+    }
+    let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
+    let first = first.map(|first| format!("{}\n", first.text)).unwrap_or_default();
+    format!("{}\n{first}", rows.table())
+}
+
+fn expectation(rows: &mut Rows, expect: &Expect) {
+    let tally = &expect.tally;
+    rows.section("replies", "against the recording", "");
+    rows.row("equal", tally.equal, "bit for bit");
+    rows.row("different", tally.different, "");
+    let late = match expect.joints_skipped {
+        0 => String::new(),
+        count => format!("cells came too late for joints {count} times"),
+    };
+    rows.row("missing", tally.missing, late);
+    rows.row("extra", tally.extra, "");
+    if tally.not_asked > 0 {
+        rows.row("not asked for", tally.not_asked, "a bus did not take the joints");
+    }
+    for (reason, count) in tally.lacking.reasons() {
+        rows.row("not in the recording", count, reason);
+    }
+    if expect.recording_dropped > 0 {
+        rows.row("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
+    }
+    if expect.unchecked_cells > 0 {
+        rows.row("unknown configurations", expect.unchecked_cells, "not told before they were changed");
+    }
+}
+
+fn quantiles(of: &Quantiles) -> String {
+    format!("{:.0} / {:.0} / {:.0} / {:.0}", of.p50, of.p90, of.p99, of.max)
+}

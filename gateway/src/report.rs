@@ -1,0 +1,122 @@
+//! `gateway report`.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use analysis::report::run::{self, ReportError};
+use analysis::report::{figure::Page, page, svg};
+use clap::Args;
+use protocol::usage::{Failure, print};
+use protocol::wire_time::bit_rate;
+
+use super::output::{Force, apart, note};
+
+/// Report on a recorded run: one HTML page with figures, beside the paper's numbers
+///
+/// The page needs nothing else, no network and no script; it is readable on a phone, on a dark screen and on paper. A
+/// recording that was cut off is reported as far as it goes, and what is missing is said in it and on standard error.
+/// Exit code 0: the report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway report run.mcap -o run.html
+  gateway report run.mcap --svg figures --force
+  gateway report run.mcap run-*.mcap -o all.html")]
+pub(crate) struct Report {
+    /// The recording of a run: what `gateway run SKIN --record FILE` wrote; all parts of a split one in any order
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// The page; else the recording's name with .html
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Also each figure as an SVG file, in this folder, which is made if it is not there
+    #[arg(long, value_name = "DIR")]
+    svg: Option<PathBuf>,
+    /// Bits in a second of every bus, for its load: 500k, 1M; else the skin's, else 1M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    nominal: Option<u32>,
+    /// Bits in a second of FD frames' data: 2M, 5M; else the skin's, else 5M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    data: Option<u32>,
+    #[command(flatten)]
+    force: Force,
+}
+
+impl Report {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let first = self.files.iter().min_by_key(|file| (file.as_os_str().len(), file.as_os_str()));
+        let page = first.map(|first| first.with_extension("html")).unwrap_or_default();
+        let output = self.output.clone().unwrap_or(page);
+        self.is_free(&output, "-o")?;
+        let command: Vec<_> = std::env::args().collect();
+        let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
+        let report = run::report(&self.files, &options).map_err(refused)?;
+        let mut files = vec![("-o", output.clone(), page::html(&report.page))];
+        if let Some(folder) = &self.svg {
+            for (name, drawing) in drawings(&report.page) {
+                let path = folder.join(name);
+                if folder.is_dir() {
+                    self.is_free(&path, "--svg")?;
+                }
+                files.push(("--svg", path, drawing));
+            }
+        }
+        let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
+        if let Err(failure) = write(&files, self.force) {
+            if let Some(folder) = self.svg.filter(|_| made) {
+                // Only if nothing is in it.
+                let _ = fs::remove_dir(folder);
+            }
+            return Err(failure);
+        }
+        if let Some(missing) = &report.missing {
+            note(format_args!("gateway: {}: {missing}", report.name));
+        }
+        let figures: usize = report.page.sections.iter().map(|section| section.figures.len()).sum();
+        let beside =
+            self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
+        print(&format!("{}: {figures} figures{beside}\n", output.display()))
+    }
+
+    /// What is there is not overwritten unless that is asked for.
+    fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
+        apart([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
+        self.force.check(option, path)
+    }
+}
+
+/// What is no recording of a run is wrong use; what cannot be read is not.
+fn refused(error: ReportError) -> Failure {
+    if matches!(error, ReportError::Capture(_)) { Failure::run(error) } else { Failure::usage(error) }
+}
+
+/// Each figure's file name and drawing.
+fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
+    let figures = page.sections.iter().flat_map(|section| &section.figures);
+    figures.map(|figure| (format!("{}.svg", figure.name), svg::draw(figure)))
+}
+
+/// Makes a folder; whether it was not there.
+fn make(folder: &Path) -> Result<bool, Failure> {
+    let new = !folder.is_dir();
+    let made = fs::create_dir_all(folder).map(|()| new);
+    made.map_err(|error| {
+        Failure::usage(format!("--svg {}: {error}; name a folder that can be written", folder.display()))
+    })
+}
+
+/// Writes all of them, each beside the option that is for it, or none: each gets its name when all are whole.
+fn write(files: &[(&str, PathBuf, String)], force: Force) -> Result<(), Failure> {
+    let failed = |option: &str, path: &Path, error: io::Error| {
+        Failure::run(format!("{option} {}: {error}", path.display()))
+    };
+    let mut whole = Vec::with_capacity(files.len());
+    for (option, path, text) in files {
+        let (begun, mut file) = force.create(option, path)?;
+        file.write_all(text.as_bytes()).map_err(|error| failed(option, path, error))?;
+        whole.push((option, path, begun));
+    }
+    whole
+        .into_iter()
+        .try_for_each(|(option, path, whole)| whole.finish().map_err(|error| failed(option, path, error)))
+}

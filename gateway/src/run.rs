@@ -1,0 +1,339 @@
+//! `gateway run` and `gateway demo`.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::fd::AsRawFd;
+use std::panic::{self, AssertUnwindSafe};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use analysis::dbc;
+use bench::record::{self, Candump};
+use bench::run::{self, Options};
+use bench::summary::{Outcome, Summary};
+use clap::Args;
+use model::scenario::Scenario;
+use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
+use protocol::document;
+use protocol::skin::Skin;
+use protocol::time::Span;
+use protocol::usage::{Failure, quoted};
+use rustix::fs::{MemfdFlags, memfd_create};
+use trace::recording::series::{Attached, Split};
+
+use super::buses::Buses;
+use super::output::{self, Force, apart, note};
+use super::print;
+use super::programs::Programs;
+
+/// The skin and the scenario of the demonstration.
+const SKIN: &str = include_str!("../examples/ur5-253.toml");
+const SCENARIO: &str = include_str!("../examples/demo.toml");
+
+/// Where the demonstration's frames are recorded.
+const DEMO_LOG: &str = "skinbus-demo.log";
+
+/// How long a run without a scenario takes, unless it is told.
+const IDLE: Span = Span::from_millis(10_000);
+
+/// What both commands can be told.
+#[derive(Args, Debug)]
+struct Common {
+    /// End after so many seconds; else after the scenario's duration
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
+    duration: Option<f64>,
+    /// Write the figures of the end as JSON, also when the run fails; docs/summary.md explains its keys
+    #[arg(long, value_name = "FILE")]
+    summary: Option<PathBuf>,
+    #[command(flatten)]
+    programs: Programs,
+    /// Show no progress, only the table at the end
+    #[arg(long, short)]
+    quiet: bool,
+    #[command(flatten)]
+    recording: Recording,
+}
+
+/// What is recorded beside frames as text.
+#[derive(Args, Debug)]
+struct Recording {
+    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/recording.md has the topics
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
+    /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
+    #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
+    record_split: Vec<Limit>,
+    #[command(flatten)]
+    force: Force,
+}
+
+/// When another file of a recording is begun.
+#[derive(Clone, Copy, Debug)]
+enum Limit {
+    Bytes(u64),
+    Age(Duration),
+}
+
+fn limit(text: &str) -> Result<Limit, String> {
+    let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
+    let letters = text.find(|letter: char| !letter.is_ascii_digit()).ok_or(allowed)?;
+    let (number, unit) = text.split_at_checked(letters).ok_or(allowed)?;
+    let number: u64 = number.parse().map_err(|_| allowed)?;
+    let times = |factor: u64| number.checked_mul(factor).ok_or(allowed);
+    let limit = match unit {
+        "MB" => Limit::Bytes(times(1_000_000)?),
+        "MiB" => Limit::Bytes(times(1 << 20)?),
+        "GB" => Limit::Bytes(times(1_000_000_000)?),
+        "GiB" => Limit::Bytes(times(1 << 30)?),
+        "s" => Limit::Age(Duration::from_secs(number)),
+        "min" => Limit::Age(Duration::from_secs(times(60)?)),
+        "h" => Limit::Age(Duration::from_secs(times(3_600)?)),
+        _ => return Err(allowed.to_owned()),
+    };
+    if number == 0 { Err(allowed.to_owned()) } else { Ok(limit) }
+}
+
+impl Recording {
+    /// What is recorded where; the files go with it as they are.
+    fn options(
+        &self,
+        candump: Option<Candump>,
+        skin: &Skin,
+        skin_file: impl FnOnce() -> Result<Vec<u8>, Failure>,
+        scenario_file: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
+    ) -> Result<record::Options, Failure> {
+        let mut split = Split::default();
+        for &limit in &self.record_split {
+            match limit {
+                Limit::Bytes(bytes) => split.bytes = bytes,
+                Limit::Age(age) => split.age = age,
+            }
+        }
+        let mcap = self.record.clone().map(|path| {
+            let toml =
+                |name: &str, bytes| Attached { name: name.to_owned(), media_type: "application/toml", bytes };
+            let mut attachments = vec![toml("skin.toml", skin_file()?)];
+            attachments.extend(scenario_file()?.map(|bytes| toml("scenario.toml", bytes)));
+            attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
+                name: if skin.buses.len() == 1 {
+                    "skin.dbc".to_owned()
+                } else {
+                    format!("skin-{}.dbc", bus.name)
+                },
+                media_type: "text/plain",
+                bytes: dbc::dbc(skin, index).into_bytes(),
+            }));
+            let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+            Ok::<_, Failure>(record::Mcap { path, split, attachments, command_line })
+        });
+        Ok(record::Options { candump, mcap: mcap.transpose()?, force: self.force.force })
+    }
+}
+
+/// Show everything at once: 253 cells on an arm, touched here and there
+///
+/// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
+/// directory, so any number of demonstrations and runs go on side by side. It says which command shows the frames on
+/// its bus, and where it records them as candump text. Exit codes are those of `gateway run`.
+#[derive(Args, Debug)]
+#[command(after_help = "Example:\n  gateway demo --duration 5")]
+pub(crate) struct Demo {
+    #[command(flatten)]
+    common: Common,
+    /// Where the frames are recorded; else skinbus-demo.log, or skinbus-demo-1.log, ... where that exists
+    #[arg(long, value_name = "FILE")]
+    candump: Option<PathBuf>,
+    /// embedded, socketcan, or auto for SocketCAN where the kernel has it
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Only(BusKind::Embedded))]
+    bus_kind: Choice,
+}
+
+/// Run a bench: cells, buses, the control loop
+///
+/// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
+/// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
+/// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
+/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2:
+/// wrong use or configuration; 3: the robot was halted at its end.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
+  gateway run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
+pub(crate) struct Run {
+    /// The skin's description
+    skin: PathBuf,
+    /// What happens: touches, motion, faults; else nothing touches the skin
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
+    #[command(flatten)]
+    common: Common,
+    /// Write all frames as candump text: a log that can be followed while it grows
+    #[arg(long, value_name = "FILE")]
+    candump: Option<PathBuf>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
+    /// Start no cells: they are on the bus already, or are real
+    #[arg(long)]
+    no_spawn: bool,
+    /// Ask for so many bytes for frames that wait unread in the gateway's socket of each bus, about 1 KiB a
+    /// frame; the kernel grants the double, or less to those who may not have it
+    #[arg(long, value_name = "BYTES", default_value_t = GATEWAY_RECEIVE_BUFFER, value_parser = clap::value_parser!(u32).range(..=1 << 30))]
+    receive_buffer: u32,
+    /// Let cells keep their parameters in files of this directory
+    #[arg(long, value_name = "DIR")]
+    flash: Option<PathBuf>,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if seconds > 0.0 && seconds <= 1e7 => Ok(seconds),
+        _ => Err("a number of seconds above 0, up to 1e7".to_owned()),
+    }
+}
+
+/// A file in memory that goes with this program, and how its cells name it.
+fn in_memory(text: &str) -> Result<(File, PathBuf), Failure> {
+    let make = || -> std::io::Result<File> {
+        let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
+        file.write_all(text.as_bytes())?;
+        Ok(file)
+    };
+    let file = make().map_err(|error| Failure::run(format!("a file in memory: {error}")))?;
+    let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
+    Ok((file, path))
+}
+
+impl Demo {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let (_file, skin_file) = in_memory(SKIN)?;
+        let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
+        let scenario =
+            Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
+        let mut options = self.common.options(skin_file, skin, scenario);
+        options.kinds = Kinds::all(self.bus_kind);
+        let kind = self.bus_kind.resolve();
+        let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
+        let own = given.is_none() && kind == BusKind::Embedded;
+        let buses = own.then(|| Buses::create("demo")).transpose()?;
+        options.directory = buses.as_ref().map(|buses| buses.0.clone()).or(given);
+        if !options.quiet {
+            let place = options.directory.as_ref().map(|path| {
+                let path = path.to_string_lossy();
+                format!("SKINBUS_DIR={} ", quoted(&path))
+            });
+            let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
+            note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
+        }
+        let Common { recording, summary, .. } = self.common;
+        let numbered = self.candump.is_none();
+        let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
+        let candump = Some(Candump { path, numbered });
+        let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
+        options.record = recording.options(candump, &options.skin, texts.0, texts.1)?;
+        bench(&options, summary.as_deref(), recording.force, &[])
+    }
+}
+
+impl Run {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let name = |path: &Path| path.display().to_string();
+        let skin_text = document::text(&self.skin).map_err(Failure::usage)?;
+        let skin = Skin::parse(&name(&self.skin), &skin_text).map_err(Failure::usage)?;
+        let scenario_text =
+            self.scenario.as_deref().map(document::text).transpose().map_err(Failure::usage)?;
+        let scenario = match (&self.scenario, &scenario_text) {
+            (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
+            _ => Scenario::idle(IDLE),
+        };
+        let read: Vec<_> = [Some(self.skin.clone()), self.scenario.clone()].into_iter().flatten().collect();
+        // What can be read once only is read by the cells from memory.
+        let (_file, skin_file) = if self.skin.is_file() {
+            (None, self.skin)
+        } else {
+            let (file, path) = in_memory(&skin_text)?;
+            (Some(file), path)
+        };
+        let mut options = self.common.options(skin_file, skin, scenario);
+        let Common { recording, summary, .. } = self.common;
+        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
+            .and_then(|kinds| kinds.only(options.skin.buses.iter().map(|bus| bus.name.as_str())));
+        options.kinds = kinds.map_err(Failure::usage)?;
+        options.record = recording.options(
+            self.candump.map(|path| Candump { path, numbered: false }),
+            &options.skin,
+            || Ok(skin_text.into_bytes()),
+            || Ok(scenario_text.map(String::into_bytes)),
+        )?;
+        options.spawn = !self.no_spawn;
+        options.flash = self.flash;
+        options.receive_buffer = self.receive_buffer as usize;
+        bench(&options, summary.as_deref(), recording.force, &read)
+    }
+}
+
+impl Common {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
+    fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> Options {
+        if let Some(seconds) = self.duration {
+            scenario.duration = Span((seconds * 1e6) as u64);
+        }
+        Options {
+            skin_file,
+            skin,
+            scenario,
+            kinds: Kinds::default(),
+            directory: None,
+            spawn: true,
+            cells_per_process: self.programs.cells_per_process.into(),
+            flash: None,
+            cell_node: self.programs.cell_node.clone(),
+            vcan_setup: self.programs.vcan_setup.clone(),
+            receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
+            record: record::Options::default(),
+            quiet: self.quiet,
+        }
+    }
+}
+
+fn bench(
+    options: &Options,
+    summary_file: Option<&Path>,
+    force: Force,
+    read: &[PathBuf],
+) -> Result<(), Failure> {
+    let written = [
+        ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
+        ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
+        ("--summary", summary_file),
+    ];
+    apart(written, read.iter().map(PathBuf::as_path))?;
+    // Before the run: nobody wants to hear after an hour that there is nowhere to write.
+    let json = summary_file.map(|path| force.create("--summary", path)).transpose()?;
+    // What it says of its own end is not lost with the program.
+    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
+    let (ended, panicked) = match ended {
+        Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
+        Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),
+    };
+    let unwritten = json.and_then(|(whole, file)| {
+        let text = serde_json::to_string_pretty(&ended).map_err(Failure::run);
+        text.and_then(|text| output::finish("--summary", whole, file, &format!("{text}\n"))).err()
+    });
+    if let Some(panic) = panicked {
+        panic::resume_unwind(panic);
+    }
+    if ended.control.ticks > 0 {
+        print::summary(&ended)?;
+    }
+    // The last line is the failure's own; each of them is one line.
+    let mut lines = ended.complaints();
+    let code = if ended.outcome == Outcome::Halted && unwritten.is_none() { 3 } else { 1 };
+    lines.extend(unwritten.map(|failure| failure.to_string()));
+    let Some(last) = lines.pop() else { return Ok(()) };
+    for line in lines {
+        note(format_args!("gateway: {line}"));
+    }
+    Err(Failure::with_code(code, last))
+}

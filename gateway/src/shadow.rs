@@ -1,0 +1,377 @@
+//! `gateway shadow`.
+
+mod show;
+
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use analysis::fit::rates::Asked;
+use analysis::shadow::{Options, Shadow};
+use clap::Args;
+use protocol::bus::{self, Bus, BusError, Choice, Inbox};
+use protocol::can::EXTENDED_MASK;
+use protocol::skin::Skin;
+use protocol::stop::{self, Stoppable};
+use protocol::usage::{Failure, print, written};
+use protocol::wire_time::{BitRates, bit_rate};
+use trace::capture::{Entry, Format, NoteKind, Reader};
+
+use self::show::write_frames;
+use super::dump::nanos;
+use super::input::{LOOK, captures, stopped};
+use super::output;
+
+/// Bytes for frames that wait while others are worked on.
+const RECEIVE_BUFFER: usize = 8 << 20;
+
+/// Say what a real bus would have made of some traffic: its load, the delay of each frame, late answers, queues
+///
+/// vcan and the embedded bus have no bit rate: everything fits them. This takes the traffic of a capture (a candump
+/// log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, through a model of a bus with bit rates:
+/// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the moment at
+/// which it was to be sent. What only a bench sends is left out, start-up stands apart, and where the skin is known (attached
+/// to a recording, or --skin) its worst case stands beside the run. docs/bus.md says what the figures mean and what the model
+/// leaves out.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway shadow run.mcap
+  gateway shadow run.mcap run-*.mcap
+  gateway shadow run.log --nominal 500k --data 2M
+  gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
+  gateway shadow run.log --skin skin.toml
+  gateway shadow run.log --json | jq -c 'select(.end_s - .time > 0.016)'
+  gateway shadow vcan0 vcan1 --duration 10")]
+pub(crate) struct ShadowCommand {
+    /// A candump log or MCAP recording when there is a file of this name, all parts of a split recording in any order,
+    /// - for standard input, else buses
+    #[arg(value_name = "FILE|BUS", required = true)]
+    sources: Vec<PathBuf>,
+    /// The bit rate of identifiers, and of all of classic frames: bit/s, as 500k or 1M; else the skin's, else 1M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    nominal: Option<u32>,
+    /// The bit rate of the data of CAN FD frames that switch; else the skin's, else 5M
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    data: Option<u32>,
+    /// Other bit rates of one bus, as often as there are buses: can0=500k/2M, can1=1M
+    #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
+    rates: Vec<(String, BitRates)>,
+    /// The skin's description, for bit rates and the worst case; else the one attached to the recording
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Count what only a bench sends too: stimuli, sync and report with their answers, simulated wires
+    #[arg(long)]
+    bench_traffic: bool,
+    /// The share of bits that arrive damaged, 0 to 0.01: their frames cost an error frame and come again
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, allow_negative_numbers = true)]
+    ber: f64,
+    /// What damaged bits are drawn from: the same seed, the same bits
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// One JSON object a frame instead of tables, in the order of the file
+    ///
+    /// Keys: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it), nominal_bits and data_bits
+    /// (stuff bits and intermission included). What is left out has null bits and null times; what never went out has null times.
+    #[arg(long)]
+    json: bool,
+    /// End a live shadow after so many seconds
+    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    duration: Option<u64>,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    bus_kind: Choice,
+}
+
+fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
+    let (bus, rates) = text.split_once('=').unwrap_or_default();
+    if bus.is_empty() {
+        return Err("a bus and its bit rates are needed, as can0=1M/5M or can0=500k".to_owned());
+    }
+    let rates = rates.parse().map_err(|error| format!("{bus}: {error}"))?;
+    Ok((bus.to_owned(), rates))
+}
+
+/// What was taken in, beside the frames.
+#[derive(Default)]
+struct Taken {
+    /// What it was read from.
+    what: &'static str,
+    /// Frames that whoever took the capture lost.
+    missing: u64,
+    /// Lines that could not be read.
+    unreadable: u64,
+    /// Why there is no more, if not because that was all.
+    ended: Option<Failure>,
+}
+
+impl ShadowCommand {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
+        let mut out = BufWriter::new(Stoppable::new(io::stdout()));
+        let files = self.sources.iter().filter(|source| is_file(source)).count();
+        let name =
+            self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
+        let mut title = name.clone();
+        let (mut shadow, taken) = match self.sources.as_slice() {
+            sources if files == sources.len() => {
+                if self.duration.is_some() {
+                    return Err(Failure::usage(format!(
+                        "--duration is for live buses, and {name} is a file"
+                    )));
+                }
+                if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
+                    return Err(Failure::usage(format!(
+                        "{} is a directory: name a candump log, an MCAP recording or a bus",
+                        folder.display()
+                    )));
+                }
+                let reader = captures(sources, |file| Box::new(file))?;
+                reader.name().clone_into(&mut title);
+                let mut shadow = self.shadow(skin.or_else(|| attached(reader.name(), &reader)))?;
+                for before in &reader.extras().in_force {
+                    shadow.in_force(&before.bus, before.nanos, &before.frame);
+                }
+                let taken = captured(reader, &mut shadow, &mut out, stop::flag())?;
+                (shadow, taken)
+            }
+            _ if files > 0 => {
+                return Err(Failure::usage(format!(
+                    "{name}: one file, the parts of one recording, or buses without a file"
+                )));
+            }
+            sources => {
+                let stopped = stopped()?;
+                let mut shadow = self.shadow(skin)?;
+                let taken = self.live(sources, &mut shadow, &mut out, &stopped)?;
+                (shadow, taken)
+            }
+        };
+        shadow.finish();
+        written(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
+        drop(out);
+        let report = shadow.report();
+        for (bus, _) in &self.rates {
+            if report.buses.iter().all(|it| it.bus != *bus) {
+                output::note(format_args!("--rates {bus}=…: {name} has no frame of {bus}"));
+            }
+        }
+        if !self.json && report.frames > 0 {
+            print(&show::text(&title, taken.what, taken.missing, &report))?;
+        }
+        taken.ended.map_or(Ok(()), Err)
+    }
+
+    /// With the rates of the command line, else of the skin, else common ones.
+    fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
+        let asked = Asked { nominal: self.nominal, data: self.data };
+        let mut of_bus = self.rates.clone();
+        for bus in skin.iter().flat_map(|skin| &skin.buses) {
+            let rates = asked.of_bus(bus);
+            let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
+            of_bus.push((bus.name.clone(), rates));
+        }
+        let options = Options {
+            of_bus,
+            bit_errors: self.ber,
+            seed: self.seed,
+            each_frame: self.json,
+            bench_traffic: self.bench_traffic,
+            skin,
+            ..Options::new(asked.rates().map_err(Failure::usage)?)
+        };
+        Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
+    }
+
+    /// Listens to buses until somebody says stop.
+    fn live(
+        &self,
+        sources: &[PathBuf],
+        shadow: &mut Shadow,
+        out: &mut impl Write,
+        stopped: &AtomicBool,
+    ) -> Result<Taken, Failure> {
+        let mut ears = Vec::new();
+        for source in sources {
+            let name = source.display().to_string();
+            let bus = open(&name, self.bus_kind)
+                .map_err(|error| Failure::usage(format!("there is no file {name}, and as a bus: {error}")))?;
+            output::note(format_args!("{} is {}", bus.name(), bus.kind()));
+            ears.push(Ear { bus, inbox: Inbox::new(), down: false });
+        }
+        let end = self.duration.map(|nanos| Instant::now() + Duration::from_nanos(nanos));
+        let mut ended = None;
+        while ended.is_none()
+            && !stopped.load(Ordering::Relaxed)
+            && end.is_none_or(|end| Instant::now() < end)
+        {
+            wait(&ears)?;
+            for ear in &mut ears {
+                if let Err(failure) = ear.take(shadow) {
+                    ended = Some(failure);
+                }
+            }
+            if let Err(error) = write_frames(shadow, out).and_then(|()| out.flush()) {
+                written(Err(error))?;
+                break;
+            }
+        }
+        let mut missing = 0;
+        for Ear { bus, inbox, .. } in &ears {
+            let lost = u64::from(inbox.dropped());
+            shadow.missing(bus.name(), lost);
+            missing += lost;
+            if lost > 0 {
+                output::note(format_args!(
+                    "{}: {lost} frames are missing: they came faster than they were read",
+                    bus.name()
+                ));
+            }
+        }
+        Ok(Taken { what: "live", missing, unreadable: 0, ended })
+    }
+}
+
+/// A bus that is listened to.
+struct Ear {
+    bus: Bus,
+    inbox: Inbox,
+    down: bool,
+}
+
+impl Ear {
+    /// Takes what has come.
+    fn take(&mut self, shadow: &mut Shadow) -> Result<(), Failure> {
+        loop {
+            match self.bus.receive(&mut self.inbox) {
+                Ok(0) => return Ok(()),
+                Ok(_) => self.down = false,
+                Err(error) if error.may_pass() => {
+                    if !std::mem::replace(&mut self.down, true) {
+                        output::note(format_args!("gateway: {error}; waiting"));
+                    }
+                    std::thread::sleep(LOOK);
+                    return Ok(());
+                }
+                Err(error) => return Err(Failure::run(error)),
+            }
+            for received in self.inbox.frames() {
+                shadow.frame(self.bus.name(), received.at_nanos, &received.frame);
+            }
+        }
+    }
+}
+
+/// Waits until a frame comes, or it is time to look at other things.
+fn wait(ears: &[Ear]) -> Result<(), Failure> {
+    use rustix::event::{PollFd, PollFlags, Timespec, poll};
+    let mut fds: Vec<_> = ears.iter().map(|ear| PollFd::new(&ear.bus, PollFlags::IN)).collect();
+    match poll(&mut fds, Timespec::try_from(LOOK).ok().as_ref()) {
+        Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
+        Err(errno) => Err(Failure::run(io::Error::from(errno))),
+    }
+}
+
+fn is_file(source: &Path) -> bool {
+    source.as_os_str() == "-" || source.exists()
+}
+
+/// Opens a bus to hear all of it; a classic interface too.
+fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
+    let options = |fd| bus::Options {
+        fd,
+        error_mask: EXTENDED_MASK,
+        receive_buffer: RECEIVE_BUFFER,
+        ..bus::Options::default()
+    };
+    match Bus::open(name, kind, &options(true)) {
+        Err(BusError::ClassicOnly { .. }) => Bus::open(name, kind, &options(false)),
+        opened => opened,
+    }
+}
+
+/// The skin that is attached to a recording.
+fn attached(name: &str, reader: &Reader) -> Option<Skin> {
+    let skin = reader.extras().skin()?;
+    skin.inspect_err(|error| output::note(format_args!("{name}: the attached {error}; name one with --skin")))
+        .ok()
+}
+
+/// Takes in a capture, and says what is missing of it.
+fn captured(
+    mut reader: Reader,
+    shadow: &mut Shadow,
+    out: &mut impl Write,
+    stopped: &Arc<AtomicBool>,
+) -> Result<Taken, Failure> {
+    let name = reader.name().to_owned();
+    let what = match reader.format() {
+        Format::Candump => "candump log",
+        Format::Mcap => "MCAP",
+    };
+    let mut taken = Taken { what, ..Taken::default() };
+    let (mut frames, mut xl) = (0_u64, 0_u64);
+    loop {
+        let note = match reader.next() {
+            Ok(Some(Entry::Frame(record))) => {
+                frames += 1;
+                shadow.frame(record.interface, record.time.nanos, &record.frame);
+                if let Err(error) = write_frames(shadow, out) {
+                    written(Err(error))?;
+                    return Ok(taken);
+                }
+                continue;
+            }
+            Ok(Some(Entry::Note(note))) => note,
+            Ok(None) => break,
+            Err(error) => {
+                taken.ended = Some(Failure::run(error));
+                break;
+            }
+        };
+        match note.kind {
+            NoteKind::Text => {}
+            NoteKind::CanXl => xl += 1,
+            NoteKind::Dropped(lost) => {
+                taken.missing = taken.missing.saturating_add(lost);
+                if !note.interface.is_empty() {
+                    shadow.missing(note.interface, lost);
+                }
+            }
+            NoteKind::Unreadable(why) => {
+                if taken.unreadable == 0 {
+                    output::note(format_args!("{name}:{}: {why}", note.line));
+                }
+                taken.unreadable += 1;
+            }
+        }
+    }
+    let lines = reader.lines();
+    if taken.unreadable > 0 {
+        output::note(format_args!("{name}: {} of {lines} lines could not be read", taken.unreadable));
+    }
+    if taken.missing > 0 {
+        output::note(format_args!(
+            "{name}: {} frames are missing: whoever took the capture lost them",
+            taken.missing
+        ));
+    }
+    if xl > 0 {
+        output::note(format_args!("{name}: CAN XL frames are left out: {xl}"));
+    }
+    if let Some(what) = &reader.extras().unfinished {
+        output::note(format_args!("{name}: {what}"));
+    }
+    if stopped.load(Ordering::Relaxed) {
+        output::note(format_args!("{name}: stopped after {frames} frames"));
+    } else if frames == 0 && taken.ended.is_none() {
+        let like = "a candump log has lines like `(1700000000.123456) vcan0 123#00`";
+        taken.ended = Some(Failure::run(match (reader.format(), lines) {
+            (Format::Candump, 0) => format!("{name} is empty: there is no frame to look at"),
+            (Format::Candump, _) => format!("{name}: there is no frame in {lines} lines; {like}"),
+            (Format::Mcap, _) => format!("{name}: there is no CAN frame in this recording"),
+        }));
+    }
+    Ok(taken)
+}

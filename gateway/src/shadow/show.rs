@@ -1,0 +1,238 @@
+//! A shadow as JSON lines and as a table.
+
+use std::io::{self, Write};
+
+use analysis::fit::traffic::BenchFrames;
+use analysis::fit::verdict::percent;
+use analysis::shadow::{
+    Answering, BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow, StartUp,
+    Stretches,
+};
+
+use crate::print::Rows;
+
+/// Writes the frames of which it is known what became of them, one object a line.
+pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
+    let mut line = Vec::with_capacity(192);
+    while let Some(frame) = shadow.poll() {
+        line.clear();
+        write_frame(&mut line, frame.bus.map(|bus| shadow.bus(bus)), &frame)?;
+        out.write_all(&line)?;
+    }
+    Ok(())
+}
+
+fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &Shaded) -> io::Result<()> {
+    let Shaded { nanos, id, extended, bits, sent, .. } = *frame;
+    let seconds = |line: &mut Vec<u8>, key: &str, nanos: Option<u64>| {
+        line.extend_from_slice(key.as_bytes());
+        match nanos {
+            Some(nanos) => {
+                // With nine digits, which a double could not hold since 1970.
+                decimal(line, nanos / 1_000_000_000, 1);
+                line.push(b'.');
+                decimal(line, nanos % 1_000_000_000, 9);
+            }
+            None => line.extend_from_slice(b"null"),
+        }
+    };
+    let count = |line: &mut Vec<u8>, key: &str, count: Option<u32>| {
+        line.extend_from_slice(key.as_bytes());
+        match count {
+            Some(count) => decimal(line, count.into(), 1),
+            None => line.extend_from_slice(b"null"),
+        }
+    };
+    seconds(line, "{\"time\":", Some(nanos));
+    line.extend_from_slice(b",\"bus\":");
+    serde_json::to_writer(&mut *line, &bus)?;
+    write!(line, ",\"id\":\"{}\"", Identifier(id, extended))?;
+    count(line, ",\"nominal_bits\":", bits.map(|bits| bits.nominal));
+    count(line, ",\"data_bits\":", bits.map(|bits| bits.data));
+    seconds(line, ",\"start_s\":", sent.map(|(start, _)| start));
+    seconds(line, ",\"end_s\":", sent.map(|(_, end)| end));
+    line.extend_from_slice(b"}\n");
+    Ok(())
+}
+
+/// A number in decimal, in at least so many digits; many times as quick as by `fmt`.
+fn decimal(line: &mut Vec<u8>, mut number: u64, digits: usize) {
+    let mut text = [b'0'; 20];
+    let mut first = text.len();
+    for (index, digit) in text.iter_mut().enumerate().rev() {
+        if number == 0 {
+            break;
+        }
+        *digit = b'0' + (number % 10).to_le_bytes()[0];
+        number /= 10;
+        first = index;
+    }
+    let first = first.min(text.len() - digits.min(text.len()));
+    line.extend_from_slice(text.get(first..).unwrap_or_default());
+}
+
+/// All of it as a table.
+pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
+    let head = format!("{what}, {} frames", report.frames);
+    let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
+    let mut rows = Rows::new([name.to_owned(), head, beside]).names_in_one_line();
+    for bus in &report.buses {
+        one(&mut rows, bus, report.bit_error_rate);
+    }
+    if report.frames_of_other_buses > 0 {
+        rows.row("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    }
+    format!("{}\n", rows.table())
+}
+
+fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
+    let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
+    let missing = if bus.missing > 0 { format!("{} more are missing", bus.missing) } else { String::new() };
+    rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
+    fit(rows, bus);
+    if bus.this_run.is_some() {
+        operation(rows, bus);
+    }
+    if let Some(start_up) = &bus.start_up {
+        begin(rows, bus, start_up);
+    }
+    if bit_error_rate > 0.0 {
+        let each = format!("of each bit {bit_error_rate:e}");
+        rows.row("damaged, and sent again", format!("{} attempts", bus.damaged), each);
+    }
+    bench(rows, bus);
+    let of_all =
+        |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
+    if bus.error_frames > 0 {
+        rows.row("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
+    }
+    if bus.out_of_order > 0 {
+        rows.row("out of order, and sorted", bus.out_of_order, of_all(bus.out_of_order));
+    }
+    if bus.too_late_to_sort > 0 {
+        rows.row("  too far for that", bus.too_late_to_sort, "they count at a later time");
+    }
+    if bus.no_room > 0 {
+        rows.row("never sent", bus.no_room, "4 million frames waited already");
+    }
+}
+
+/// Whether it fits, at most and in this run.
+fn fit(rows: &mut Rows, bus: &BusShadow) {
+    match (&bus.worst_case, &bus.answering) {
+        (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
+        (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
+        (None, None) => {}
+    }
+    match &bus.this_run {
+        Some(run) => rows.row(run.case(), run.value(), run.cells),
+        None => rows.row("this run", "no joints in it", ""),
+    }
+    match bus.answering {
+        Some(Answering { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
+            rows.row("  cells that answered", format!("{mean:.1} on average"), format!("{epochs} joints"));
+        }
+        Some(Answering { epochs, epochs_halted, mean: Some(mean), .. }) => {
+            let beside = format!("{epochs} joints, and {epochs_halted} while halted are left out");
+            rows.row("  cells that answered", format!("{mean:.1} on average"), beside);
+        }
+        Some(Answering { epochs_halted: halted @ 1.., mean: None, .. }) => {
+            rows.row("  cells that answered", "halted all the time", format!("{halted} joints"));
+        }
+        _ => {}
+    }
+}
+
+fn operation(rows: &mut Rows, bus: &BusShadow) {
+    load(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
+    rows.row("  bus taken", share(bus.load.busy), "");
+    pauses(rows, bus, &bus.stretches);
+    rows.row("delay, µs", "half / 99 % / greatest", "until it is sent");
+    rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
+    for kind in &bus.kinds {
+        let (name, delay) = (kind.kind, &kind.delay_us);
+        rows.row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+    }
+    if let Some(replies) = &bus.replies {
+        answers(rows, replies);
+    }
+    rows.row("most that waited", format!("{} frames", bus.queue.value), at(bus, bus.queue));
+    if bus.queue_of_one.value > 0.0 {
+        let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
+        rows.row("  of one identifier", of, at(bus, bus.queue_of_one));
+    }
+}
+
+/// Start-up, which is judged by nobody: it takes as long as it takes.
+fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
+    let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
+    load(rows, bus, &start_up.load, ("start-up: average load", &beside));
+    pauses(rows, bus, &start_up.stretches);
+    rows.row("  delay, µs", delays(&start_up.delay_us), "half / 99 % / greatest");
+}
+
+fn bench(rows: &mut Rows, bus: &BusShadow) {
+    let BenchFrames { stimuli, syncs, reports, wires } = bus.bench;
+    if bus.bench.total() == 0 {
+        return;
+    }
+    let name = if bus.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
+    let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
+    let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
+    rows.row(name, format!("{} frames", bus.bench.total()), parts.collect::<Vec<_>>().join(", "));
+}
+
+fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
+    rows.row(name, share(load.mean), beside);
+    rows.row("  most in any 16 ms", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
+    rows.row("  most in any second", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
+}
+
+fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
+    let longest = stretches.longest_s;
+    let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
+    let count = format!("{} times, {:.3} s", stretches.count, stretches.total_s);
+    rows.row("  no pause for 16 ms", count, beside);
+}
+
+fn share(share: Option<f64>) -> String {
+    share.map_or_else(|| "?".to_owned(), percent)
+}
+
+fn answers(rows: &mut Rows, replies: &Replies) {
+    let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
+    rows.row("answers after joints, µs", delays(after_joints_us), "half / 99 % / greatest");
+    let mut beside = vec!["after the next joints".to_owned()];
+    if *late_when_ready > 0 {
+        beside.push(format!("{late_when_ready} were ready too late for any bus"));
+    }
+    if *late_before > 0 {
+        beside.push(format!("{late_before} more were late in the recording already"));
+    }
+    rows.row("  late", format!("{late} of {count}"), beside.join(", "));
+}
+
+fn delays(delays: &Delays) -> String {
+    let Delays { p50, p99, max, .. } = delays;
+    format!("{p50:.0} / {p99:.0} / {max:.0}")
+}
+
+fn at(bus: &BusShadow, most: Most) -> String {
+    format!("at {:.3} s", most.at_ns.saturating_sub(bus.first_ns) as f64 / 1e9)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_written_as_fmt_writes_them() {
+        for number in [0, 1, 9, 10, 999_999_999, 1_000_000_000, 1_700_000_000, u64::MAX] {
+            for digits in [1, 9] {
+                let mut line = Vec::new();
+                decimal(&mut line, number, digits);
+                assert_eq!(String::from_utf8(line).unwrap(), format!("{number:0digits$}"));
+            }
+        }
+    }
+}

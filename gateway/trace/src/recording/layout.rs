@@ -1,0 +1,116 @@
+//! The topics of a recording, by the skin: what each is called and what is in it.
+
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::Skin;
+
+use model::central::Central;
+
+/// The points of a patch are recorded at most so often.
+const POINTS_HZ: f64 = 30.0;
+
+/// Cells of one bus on one link.
+#[derive(Clone, Debug)]
+pub struct Patch {
+    /// Its topic.
+    pub topic: String,
+    /// The link.
+    pub link: String,
+    /// The bus, by its place in the skin.
+    pub bus: usize,
+    /// The cells: place among the bus' cells, and number there.
+    pub cells: Vec<(usize, u16)>,
+}
+
+/// What a skin's recording is made of.
+#[derive(Debug)]
+pub struct Layout {
+    /// The buses' names.
+    pub buses: Vec<String>,
+    /// The robot's name, as topics have it.
+    pub arm: String,
+    /// The joints' names.
+    pub joints: Vec<String>,
+    /// The patches.
+    pub patches: Vec<Patch>,
+    /// By bus: what its cells make of their sensors, and where they are.
+    pub central: Vec<Central>,
+    /// From one of a patch's clouds of points to the next, in epochs.
+    pub epochs_per_cloud: u64,
+}
+
+impl Layout {
+    /// A skin's.
+    #[must_use]
+    pub fn new(skin: &Skin) -> Self {
+        let joints = skin.robot.joints.len().min(MAX_JOINTS);
+        let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
+        let mut patches = Vec::new();
+        for joint in 1..=joints {
+            let on_bus = |bus: usize| {
+                let cells =
+                    skin.cells_of(bus).enumerate().filter(move |(_, cell)| usize::from(cell.joint) == joint);
+                cells.map(|(place, cell)| (place, u16::from(cell.node.get()))).collect::<Vec<_>>()
+            };
+            let parts: Vec<_> = (0..buses.len())
+                .map(|bus| (bus, on_bus(bus)))
+                .filter(|(_, cells)| !cells.is_empty())
+                .collect();
+            let several = parts.len() > 1;
+            let link = format!("link{joint}");
+            patches.extend(parts.into_iter().map(|(bus, cells)| {
+                let name = buses.get(bus).filter(|_| several).map(|bus| format!("_{}", word(bus)));
+                let topic = format!("/skin/{link}{}", name.unwrap_or_default());
+                Patch { topic, link: link.clone(), bus, cells }
+            }));
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "1 Hz to 10 kHz: checked"
+        )]
+        let epochs_per_cloud = (skin.timing.broadcast_hz() / POINTS_HZ).ceil().max(1.0) as u64;
+        Self {
+            central: (0..buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
+            buses,
+            arm: word(&skin.robot.name),
+            joints: (1..=joints).map(|joint| format!("joint{joint}")).collect(),
+            patches,
+            epochs_per_cloud,
+        }
+    }
+}
+
+/// A name as a topic may have it.
+fn word(name: &str) -> String {
+    let word = |letter: char| if letter.is_ascii_alphanumeric() { letter } else { '_' };
+    let word: String = name.chars().map(word).collect();
+    if word.is_empty() { "robot".to_owned() } else { word }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use model::testing;
+
+    #[test]
+    fn a_patch_is_the_cells_of_a_bus_on_a_link() {
+        let mut skin = testing::skin();
+        skin.robot.name = "UR 5/e".to_owned();
+        let layout = Layout::new(&skin);
+        assert_eq!((layout.arm.as_str(), layout.joints.len()), ("UR_5_e", skin.robot.joints.len()));
+        let cells: usize = layout.patches.iter().map(|patch| patch.cells.len()).sum();
+        assert_eq!(cells, skin.cells.len(), "each in one patch");
+        assert_eq!(layout.epochs_per_cloud, 3, "62.5 Hz are 20.8 clouds a second");
+        // A second bus with the same cells: now the bus tells patches of one link apart.
+        let mut other = skin.buses[0].clone();
+        other.name = "vcan-1".to_owned();
+        skin.buses.push(other);
+        let cells: Vec<_> =
+            skin.cells.iter().map(|cell| protocol::skin::Cell { bus: 1, ..cell.clone() }).collect();
+        skin.cells.extend(cells);
+        let topics: Vec<_> = Layout::new(&skin).patches.into_iter().map(|patch| patch.topic).collect();
+        let first = layout.patches[0].link.clone();
+        assert_eq!(topics[0], format!("/skin/{first}_{}", word(&skin.buses[0].name)));
+        assert_eq!(topics[1], format!("/skin/{first}_vcan_1"));
+    }
+}
