@@ -9,7 +9,7 @@ use analysis::report::figure::{
     Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
 };
 
-/// A run: its ticks, and the figures of its end ([`bench::summary::Summary`] as JSON).
+/// A run: its ticks, and the figures of its end (`bench::summary::Summary` as JSON).
 #[derive(Clone, Debug)]
 pub struct Run {
     /// Its ticks, in the order of time.
