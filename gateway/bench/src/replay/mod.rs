@@ -10,7 +10,7 @@
 //!                                                          └── ear (one a bus) <──────┘
 //! ```
 //!
-//! What decides is pure: [`survey`], [`state`], [`order`], [`reel`], [`player`] (its clock and buses are a
+//! What decides is pure: [`survey`], [`state`], [`trace::order`], [`reel`], [`player`] (its clock and buses are a
 //! [`player::Stage`]), [`judge`] and [`difference`]. The rest is threads, sockets and the clock.
 
 pub mod difference;
