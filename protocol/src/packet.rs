@@ -107,6 +107,22 @@ pub enum PacketError {
         /// What the packet says.
         got: u16,
     },
+    /// A classic frame that gives no packet with the one before it or the one after it.
+    #[error("no other half")]
+    Incomplete,
+}
+
+impl PacketError {
+    /// One word for it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Foreign => "foreign",
+            Self::Length { .. } => "length",
+            Self::Crc { .. } => "CRC",
+            Self::Incomplete => "incomplete",
+        }
+    }
 }
 
 impl Packet {

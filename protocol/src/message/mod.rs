@@ -23,7 +23,7 @@ pub use state::State;
 
 use thiserror::Error;
 
-use crate::fixed::{Q1_14, Q3_12, Q7_8};
+use crate::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use crate::id::{CellId, Command, Id, Kind, Node};
 use crate::packet::{Epoch, Packet, WORDS};
 
@@ -405,13 +405,30 @@ impl Message {
         if let Self::Sensors { page, .. } | Self::Stimulus { page, .. } = *self { Some(page) } else { None }
     }
 
-    /// Whether a word of it means *saturated*; `None` of what cannot.
+    /// Whether a word of it means *saturated*; `None` of what is neither a torque nor a sum.
     #[must_use]
     pub fn is_saturated(&self) -> Option<bool> {
-        let packet = self.encode();
-        let ends = [i16::MIN, i16::MAX];
-        matches!(packet.id.kind, Kind::Torque | Kind::Sum)
-            .then(|| packet.words.iter().any(|word| ends.contains(word)))
+        let is_end = |word: &i16| [i16::MIN, i16::MAX].contains(word);
+        self.torque_words().map(|words| words.iter().any(is_end))
+    }
+
+    /// Whether it tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
+    /// or a proximity, a heartbeat of an active cell.
+    #[must_use]
+    pub fn is_contact(&self) -> bool {
+        if let Self::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = self {
+            return heartbeat.state.has(State::ACTIVE);
+        }
+        if let Some(SensorPage::Skin(skin)) = self.sensor_page() {
+            return skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
+        }
+        self.torque_words().is_some_and(|words| words != [0; WORDS])
+    }
+
+    /// The words of a torque or a sum.
+    fn torque_words(&self) -> Option<[i16; WORDS]> {
+        let Packet { id, words, .. } = self.encode();
+        matches!(id.kind, Kind::Torque | Kind::Sum).then_some(words)
     }
 }
 

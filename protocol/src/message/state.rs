@@ -36,6 +36,11 @@ impl State {
         (Self::CLAIMING, "claiming"),
     ];
 
+    /// The names of the bits that are set.
+    pub fn names(self) -> impl Iterator<Item = &'static str> {
+        Self::NAMES.into_iter().filter(move |(bit, _)| self.has(*bit)).map(|(_, name)| name)
+    }
+
     /// Whether all of these bits are set.
     #[must_use]
     pub const fn has(self, bits: Self) -> bool {

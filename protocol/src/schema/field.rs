@@ -2,6 +2,10 @@
 
 use super::ALWAYS;
 use crate::fixed::Q1_14;
+use crate::packet::WORDS;
+
+/// The byte that counts the joints in use.
+const COUNT: usize = 2 * WORDS + 1;
 
 /// What a field's bits are.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -224,11 +228,50 @@ impl Field {
         f64::from(word) / f64::from(1_u32 << self.fraction())
     }
 
+    /// The sum of its word and the two after it.
+    #[must_use]
+    pub fn total(&self, bytes: &[u8]) -> f64 {
+        (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
+    }
+
+    /// The elements that mean something: of positions those of the joints in use, of all others each.
+    #[must_use]
+    pub fn elements_in(&self, bytes: &[u8]) -> usize {
+        match bytes.get(COUNT) {
+            Some(&in_use) if self.format == Format::Position => self.elements().min(usize::from(in_use)),
+            Some(_) | None => self.elements(),
+        }
+    }
+
+    /// The name of a value.
+    #[must_use]
+    pub fn name_of(&self, raw: i64) -> Option<&'static str> {
+        self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| *name)
+    }
+
+    /// The value of a name.
+    #[must_use]
+    pub fn value_of(&self, name: &str) -> Option<i16> {
+        self.names.iter().find(|(_, known)| *known == name).map(|(value, _)| *value)
+    }
+
+    /// Whether its ends mean *saturated*.
+    #[must_use]
+    pub const fn is_saturating(&self) -> bool {
+        matches!(self.format, Format::Saturating(_))
+    }
+
     /// Whether it is there, in these bytes of a packet whose layout begins with this field.
     #[must_use]
     pub fn is_there(&self, bytes: &[u8], first: &Self) -> bool {
+        self.follows(Some(first.raw(bytes, 0)))
+    }
+
+    /// Whether it is there when the first field of its layout is this.
+    #[must_use]
+    pub fn follows(&self, first: Option<i64>) -> bool {
         let [least, greatest] = self.when.map(i64::from);
-        self.when == ALWAYS || (least..=greatest).contains(&first.raw(bytes, 0))
+        self.when == ALWAYS || first.is_some_and(|first| (least..=greatest).contains(&first))
     }
 
     /// What a DBC calls one element of it.

@@ -12,12 +12,12 @@ mod packets;
 mod ports;
 
 pub use field::{Absent, Field, Format, Range};
-pub use packets::{PACKETS, REASONS};
+pub use packets::{PACKETS, REASONS, REFUSAL};
 pub use ports::{PORT_MESSAGES, port_message};
 
 use crate::id::{Command, Id, Kind};
 use crate::message::{FROM_THE_NEXT, Message, REFUSED, Request, WRITE};
-use crate::packet::Packet;
+use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
 /// Text for people in parts: each one is there when a number lies within its bounds, which are inclusive. In a part
@@ -102,19 +102,24 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     if matches!(message, Message::Configure { request: Request::Read { .. }, .. }) {
         return &EMPTY;
     }
-    let is_parameter = matches!(packet.id.kind, Kind::Configure | Kind::Configured) && number != REFUSED;
-    if is_parameter && !Parameter::from_number(number).is_some_and(|parameter| parameter.can_be(packet.words))
-    {
-        return &UNKNOWN;
+    if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && number != REFUSED {
+        return value(number, packet.words);
     }
     let layouts = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.layouts);
     layouts.iter().find(|layout| layout.number == number).unwrap_or(&EMPTY)
 }
 
-/// The layout of a parameter.
+/// The layout of a parameter's words; of words that it cannot have, and of a parameter that does not exist, words.
 #[must_use]
-pub fn parameter(number: u8) -> Option<&'static Layout> {
-    packets::PARAMETERS.iter().find(|layout| layout.number == number)
+pub fn value(number: u8, words: [i16; WORDS]) -> &'static Layout {
+    let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.can_be(words));
+    packets::PARAMETERS.iter().find(|layout| can_be && layout.number == number).unwrap_or(&UNKNOWN)
+}
+
+/// What a parameter is called, if it has a name.
+#[must_use]
+pub fn parameter_name(number: u8) -> Option<&'static str> {
+    packets::PARAMETERS.iter().find(|layout| layout.number == number).map(|layout| layout.name)
 }
 
 /// The parameter of this name.
@@ -125,15 +130,15 @@ pub fn parameter_named(name: &str) -> Option<&'static Layout> {
 
 /// What a refusal's reason means.
 #[must_use]
-pub fn reason(number: i16) -> &'static str {
-    let found = REASONS.iter().find(|(known, _)| *known == number);
+pub fn reason(number: i64) -> &'static str {
+    let found = REASONS.iter().find(|(known, _)| i64::from(*known) == number);
     found.map_or("for a reason that this version does not know", |(_, meaning)| meaning)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::packet::{BYTES, Epoch, WORDS};
+    use crate::packet::{BYTES, Epoch};
 
     /// Every layout with what belongs to it in bytes 12 and 13.
     fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {

@@ -183,7 +183,9 @@ const SENSORS: &[Layout] = &[
         fields: &[
             Field::word("force_n", 0, Format::Total(10), "the touch: the sum of the contact words").unit("N"),
             Field::word("contact_n", 0, Format::Fixed(10), "capacitive contact forces").unit("N").each(THREE),
-            Field::word("proximity", 3, Format::Fixed(14), "0, nothing near, to 1").within(0, 1),
+            Field::word("proximity", 3, Format::Fixed(14), "0, nothing near, to 1")
+                .within(0, 1)
+                .allowed("proximity is 0 to 1"),
             Field::word("temperature_c", 4, Format::Fixed(6), "temperatures").unit("°C").each(TWO),
         ],
         text: &[(
@@ -519,7 +521,8 @@ const COMMIT: Layout = Layout {
         .allowed("a hash has up to 4 hexadecimal digits")],
     text: &[(ALWAYS, "hash {hash}")],
 };
-const REFUSAL: Layout = Layout {
+/// The answer of a cell that refuses.
+pub const REFUSAL: Layout = Layout {
     number: REFUSED,
     name: "refusal",
     prefix: "",
