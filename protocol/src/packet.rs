@@ -86,7 +86,6 @@ pub struct Packet {
 
 /// Why a frame is not a packet.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[non_exhaustive]
 pub enum PacketError {
     /// A 29-bit identifier, a remote frame or an error frame.
     #[error("not a data frame with an 11-bit identifier")]

@@ -12,7 +12,7 @@ mod packets;
 mod ports;
 
 pub use field::{Absent, Field, Format, Range};
-pub use packets::{PACKETS, REASONS, REFUSAL};
+pub use packets::{PACKETS, PARAMETERS, REASONS, REFUSAL};
 pub use ports::{PORT_MESSAGES, port_message};
 
 use crate::id::{Command, Id, Kind};
@@ -113,19 +113,19 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
 #[must_use]
 pub fn value(number: u8, words: [i16; WORDS]) -> &'static Layout {
     let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.can_be(words));
-    packets::PARAMETERS.iter().find(|layout| can_be && layout.number == number).unwrap_or(&UNKNOWN)
+    PARAMETERS.iter().find(|layout| can_be && layout.number == number).unwrap_or(&UNKNOWN)
 }
 
 /// What a parameter is called, if it has a name.
 #[must_use]
 pub fn parameter_name(number: u8) -> Option<&'static str> {
-    packets::PARAMETERS.iter().find(|layout| layout.number == number).map(|layout| layout.name)
+    PARAMETERS.iter().find(|layout| layout.number == number).map(|layout| layout.name)
 }
 
 /// The parameter of this name.
 #[must_use]
 pub fn parameter_named(name: &str) -> Option<&'static Layout> {
-    packets::PARAMETERS.iter().find(|layout| layout.name == name)
+    PARAMETERS.iter().find(|layout| layout.name == name)
 }
 
 /// What a refusal's reason means.

@@ -557,7 +557,7 @@ const ANSWERS: &[Layout] = &[
     REFUSAL,
 ];
 /// The parameters, by number.
-pub(super) const PARAMETERS: &[Layout] = ANSWERS.split_at(ANSWERS.len() - 1).0;
+pub const PARAMETERS: &[Layout] = ANSWERS.split_at(ANSWERS.len() - 1).0;
 
 /// Why a parameter was refused, by the number that stands for it.
 pub const REASONS: &[(i16, &str)] = &[
