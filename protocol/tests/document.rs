@@ -154,7 +154,7 @@ fn format_of(field: &Field) -> String {
         }
         Format::Angle | Format::Position => "Q1.14".to_owned(),
         Format::Port => "unsigned, 8 bits".to_owned(),
-        Format::Ports(_) => "bits".to_owned(),
+        Format::Ports(..) => "bits".to_owned(),
         Format::State => "state".to_owned(),
         Format::Group(_) => "see below".to_owned(),
     }

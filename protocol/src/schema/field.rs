@@ -34,8 +34,8 @@ pub enum Format {
     Position,
     /// A port of a cell in 8 bits; the last one leads to the gateway's side.
     Port,
-    /// Bit p stands for port p, of so many ports.
-    Ports(u8),
+    /// So many bits, of which bit p stands for port p; the second number is that of the ports there are.
+    Ports(u8, u8),
     /// A state word, [`crate::message::State`].
     State,
     /// A parameter's number, in so many bits.
@@ -171,9 +171,12 @@ impl Field {
     /// The bits of one element, how many of them are a fraction, and whether they are two's complement.
     const fn shape(&self) -> (u8, u32, bool) {
         match self.format {
-            Format::Unsigned(bits) | Format::Parameter(bits) | Format::Page(bits) => (bits, 0, false),
+            Format::Unsigned(bits)
+            | Format::Ports(bits, _)
+            | Format::Parameter(bits)
+            | Format::Page(bits) => (bits, 0, false),
             Format::Flag(bits) => (bits, 0, bits == 16),
-            Format::Port | Format::Ports(_) => (8, 0, false),
+            Format::Port => (8, 0, false),
             Format::Hex | Format::State | Format::Group(_) => (16, 0, false),
             Format::Signed | Format::Choice | Format::Reason => (16, 0, true),
             Format::Angle | Format::Position => (16, 14, true),

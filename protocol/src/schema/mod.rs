@@ -102,7 +102,8 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     if matches!(message, Message::Configure { request: Request::Read { .. }, .. }) {
         return &EMPTY;
     }
-    if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && number != REFUSED {
+    let is_refusal = packet.id.kind == Kind::Configured && number == REFUSED;
+    if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && !is_refusal {
         return value(number, packet.words);
     }
     let layouts = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.layouts);

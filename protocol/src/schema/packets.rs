@@ -280,9 +280,9 @@ const NETWORK: &[Layout] = &[
                 Absent::Null,
             ),
             Field::bits("round", 24, 8, "the exploration from which the depth is"),
-            Field::new("children", 32, Format::Ports(4), "bit p: the cell at port p is a child")
+            Field::new("children", 32, Format::Ports(8, 4), "bit p: the cell at port p is a child")
                 .signal("child_at_{}"),
-            Field::new("works", 40, Format::Ports(5), "bit p: port p works in both directions")
+            Field::new("works", 40, Format::Ports(8, 5), "bit p: port p works in both directions")
                 .signal("port_{}_works"),
             Field::counter("sent", 3, "sums sent").signal("sums_sent"),
             Field::counter("taken", 4, "sums taken from children").signal("sums_taken"),
@@ -508,7 +508,7 @@ const CUTS: Layout = Layout {
     number: 9,
     name: "cuts",
     prefix: "",
-    fields: &[Field::new("deaf_ports", 0, Format::Ports(5), "bit p: port p hears nothing")
+    fields: &[Field::new("deaf_ports", 0, Format::Ports(5, 5), "bit p: port p hears nothing")
         .signal("cut_port_{}")
         .allowed("none is, or ports 0 to 3 and uplink with a plus between them: 0+2")],
     text: &[(ALWAYS, "deaf ports {deaf_ports}")],

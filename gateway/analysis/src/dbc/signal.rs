@@ -97,7 +97,7 @@ fn of(field: &Field, prefix: &str) -> Vec<Signal> {
                 [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
             State::NAMES.into_iter().map(bit).chain(parts).collect()
         }
-        Format::Ports(ports) => {
+        Format::Ports(_, ports) => {
             (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect()
         }
         Format::Group(parts) => {

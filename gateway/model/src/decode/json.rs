@@ -120,7 +120,7 @@ impl Serialize for Shown<'_> {
             Format::Flag(_) => serializer.serialize_bool(first == 1),
             Format::Hex => serializer.collect_str(&format_args!("{first:04X}")),
             Format::Parameter(_) => serializer.collect_str(&Name::of(first)),
-            Format::Ports(_) => serializer.collect_seq(Bits(first).ports()),
+            Format::Ports(..) => serializer.collect_seq(Bits(first).ports()),
             Format::Total(_) => serializer.serialize_f64(field.total(bytes)),
             Format::Group(parts) => {
                 let of = |element: usize| Group(parts, bytes.get(element * 2..).unwrap_or_default());

@@ -140,7 +140,7 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     };
     match field.format {
         Format::Choice => field.value_of(text).ok_or_else(allowed),
-        Format::Ports(_) => ports(text).ok_or_else(allowed),
+        Format::Ports(..) => ports(text).ok_or_else(allowed),
         Format::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
         Format::Unsigned(_) => {
             text.parse().ok().filter(|&number| number > 0).map(u16::cast_signed).ok_or_else(allowed)

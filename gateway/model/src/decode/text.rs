@@ -140,7 +140,7 @@ fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], part: &str) -> fmt::
         Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
         Format::Hex => write!(f, "{first:04X}"),
         Format::Port => write!(f, "{}", Port(first)),
-        Format::Ports(_) => write!(f, "{}", Bits(first)),
+        Format::Ports(..) => write!(f, "{}", Bits(first)),
         Format::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
         Format::Parameter(_) => write!(f, "{}", Name::of(first)),
         Format::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
