@@ -9,9 +9,10 @@ use model::scenario::contact_words;
 use protocol::bus::Choice;
 use protocol::can::{self, BIT_RATE_SWITCH, Frame as CanFrame};
 use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::id::Node;
+use protocol::id::{Kind, Node};
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
+use protocol::schema::PACKETS;
 use protocol::usage::{Failure, print};
 
 use super::ack;
@@ -228,11 +229,18 @@ impl Positions {
 impl Stimulus {
     fn message(&self) -> Result<Message, String> {
         let page = match &self.acceleration {
-            Some(texts) => SensorPage::Acceleration(several("--acceleration", texts)?),
+            Some(texts) => SensorPage::Acceleration(several("--acceleration", "acceleration_g", texts)?),
             None => SensorPage::Skin(SkinSensors {
                 contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
-                proximity: self.proximity.as_deref().map_or(Ok(Q1_14::ZERO), proximity)?,
-                temperature: several("--temperature", self.temperature.as_deref().unwrap_or_default())?,
+                proximity: self
+                    .proximity
+                    .as_deref()
+                    .map_or(Ok(Q1_14::ZERO), |text| felt("--proximity", "proximity", text))?,
+                temperature: several(
+                    "--temperature",
+                    "temperature_c",
+                    self.temperature.as_deref().unwrap_or_default(),
+                )?,
             }),
         };
         let from = self.epoch.map_or(From::Next, |epoch| From::Epoch(Epoch(epoch)));
@@ -260,11 +268,25 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
     read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
 }
 
+/// A value of a field of the sensors.
+fn felt<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
+    let layouts =
+        PACKETS.iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| schema.layouts);
+    let field = layouts.flat_map(|layout| layout.fields).find(|field| field.name == name);
+    let field = field.ok_or_else(|| format!("{option}: cells feel no {name}"))?;
+    let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
+    Ok(Q::from_bits(word))
+}
+
 /// So many numbers, or zeros when none were given.
-fn several<const F: u32, const N: usize>(option: &str, texts: &[String]) -> Result<[Q<F>; N], String> {
+fn several<const F: u32, const N: usize>(
+    option: &str,
+    name: &str,
+    texts: &[String],
+) -> Result<[Q<F>; N], String> {
     let mut all = [Q::ZERO; N];
     for (one, text) in all.iter_mut().zip(texts) {
-        *one = Q::from_bits(value(option, text, parameter::nearest::<F>)?);
+        *one = felt(option, name, text)?;
     }
     Ok(all)
 }
@@ -279,14 +301,6 @@ fn contact(text: &str) -> Result<[Q5_10; 3], String> {
         return Err(format!("--force {text}: three contact words say {least} to {greatest:.3} N"));
     }
     Ok(words)
-}
-
-fn proximity(text: &str) -> Result<Q1_14, String> {
-    let allowed = |proximity: f64| match proximity {
-        0.0..=1.0 => Ok(Q1_14::nearest(proximity)),
-        _ => Err("proximity is 0 to 1".to_owned()),
-    };
-    value("--proximity", text, |text| parameter::real(text).and_then(allowed))
 }
 
 fn addressee(text: &str) -> Result<Node, String> {

@@ -86,7 +86,6 @@ pub struct Packet {
 
 /// Why a frame is not a packet.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[non_exhaustive]
 pub enum PacketError {
     /// A 29-bit identifier, a remote frame or an error frame.
     #[error("not a data frame with an 11-bit identifier")]
@@ -107,6 +106,22 @@ pub enum PacketError {
         /// What the packet says.
         got: u16,
     },
+    /// A classic frame that gives no packet with the one before it or the one after it.
+    #[error("no other half")]
+    Incomplete,
+}
+
+impl PacketError {
+    /// One word for it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Foreign => "foreign",
+            Self::Length { .. } => "length",
+            Self::Crc { .. } => "CRC",
+            Self::Incomplete => "incomplete",
+        }
+    }
 }
 
 impl Packet {

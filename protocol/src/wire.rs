@@ -141,7 +141,9 @@ const UNNUMBERED: u8 = 1 << 5;
 const LABELLED: u8 = 1 << 6;
 
 impl PortMessage {
-    fn encode(self) -> [u8; 6] {
+    /// The bytes that say it, up to the CRC.
+    #[must_use]
+    pub fn encode(self) -> [u8; 6] {
         match self {
             Self::Hello(hello) => {
                 let flag = |set, flag| if set { flag } else { 0 };

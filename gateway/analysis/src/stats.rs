@@ -7,12 +7,12 @@
 //! The work for a frame is bounded, and so is the memory: it grows with the buses, of which [`BUSES`] are told
 //! apart, and not with the frames.
 
-use model::decode::{BUSES, Decoded, Fault};
+use model::decode::{BUSES, Decoded};
 use protocol::candump::Record;
 use protocol::fixed::Q;
 use protocol::id::CellId;
 use protocol::message::{Heartbeat, Message, NetworkPage, State, Tree};
-use protocol::packet::Epoch;
+use protocol::packet::{Epoch, PacketError};
 use serde::Serialize;
 
 use self::foreign::Foreigners;
@@ -356,9 +356,10 @@ impl Lane {
             Decoded::Meaningless { .. } => refused.meaning += 1,
             Decoded::Foreign(foreign) => self.foreign.take(nanos, &record.frame, *foreign),
             Decoded::Damaged { fault, .. } => match fault {
-                Fault::Length { .. } => refused.length += 1,
-                Fault::Crc { .. } => refused.crc += 1,
-                Fault::Incomplete => refused.incomplete += 1,
+                PacketError::Length { .. } => refused.length += 1,
+                PacketError::Crc { .. } => refused.crc += 1,
+                PacketError::Incomplete => refused.incomplete += 1,
+                PacketError::Foreign => {}
             },
         }
     }

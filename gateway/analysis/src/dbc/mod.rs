@@ -14,12 +14,14 @@
 //! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in two frames
 //! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.
 
-mod layout;
 mod signal;
 mod text;
 
+use core::iter;
+
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
+use protocol::schema::{PACKETS, PacketSchema};
 use protocol::skin::{Bus, Skin};
 
 use signal::Signal;
@@ -77,110 +79,46 @@ struct Message {
 
 /// All messages of a bus, by identifier.
 fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
-    let period = Rhythm::Every(period_ms(skin));
-    let mut all: Vec<_> = Command::ALL.into_iter().map(|command| commanded(command, period)).collect();
-    let nodes = || {
-        let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| cell.node).collect();
-        nodes.sort_unstable();
-        nodes
+    let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| Node::Cell(cell.node)).collect();
+    nodes.sort_unstable_by_key(|node| node.to_byte());
+    let of = |schema: &'static PacketSchema| {
+        let said = |node| message(schema, node, period_ms(skin));
+        let each = nodes.iter().map(|node| said(*node));
+        match schema.kind {
+            Kind::Command => vec![said(Node::Everyone)],
+            Kind::Network => {
+                let (from, to, rhythm) = (Party::Gateway, Party::Unnamed, Rhythm::Seldom);
+                let comment = "Another gateway: none has to send this, whoever hears it knows of it.";
+                let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
+                iter::once(other).chain(each).collect()
+            }
+            Kind::Configure | Kind::Stimulus => {
+                each.chain([Message { to: Party::Cells, ..said(Node::Everyone) }]).collect()
+            }
+            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => each.collect(),
+        }
     };
-    for kind in Kind::ALL.into_iter().filter(|kind| *kind != Kind::Command) {
-        if kind == Kind::Network {
-            all.push(Message {
-                from: Party::Gateway,
-                to: Party::Unnamed,
-                rhythm: Rhythm::Seldom,
-                comment: "Another gateway: none has to send this, whoever hears it knows of it.",
-                ..from_or_to(kind, Node::Gateway, period)
-            });
-        }
-        all.extend(nodes().into_iter().map(|cell| from_or_to(kind, Node::Cell(cell), period)));
-        if matches!(kind, Kind::Configure | Kind::Stimulus) {
-            all.push(Message { to: Party::Cells, ..from_or_to(kind, Node::Everyone, period) });
-        }
-    }
-    all
+    PACKETS.iter().flat_map(of).collect()
 }
 
-fn commanded(command: Command, period: Rhythm) -> Message {
-    let (signals, rhythm, comment) = match command {
-        Command::Halt => (layout::bare(), Rhythm::Seldom, "Stop answering joints until a resume."),
-        Command::Joints => (
-            layout::joints(),
-            period,
-            "The robot's joint positions; count is the joints in use, the others are 0. Cells in contact answer \
-             with their torque.",
-        ),
-        Command::Sync => (
-            layout::bare(),
-            Rhythm::Seldom,
-            "Every cell answers with a heartbeat when all that the last joints asked is done.",
-        ),
-        Command::Resume => (layout::bare(), Rhythm::Seldom, "Leave the halted state."),
-        Command::Report => {
-            (layout::bare(), Rhythm::Seldom, "Every cell answers with its pages of counters and sensors.")
+/// What a cell says of this kind, or what is said to it; a command.
+fn message(schema: &PacketSchema, node: Node, period_ms: u32) -> Message {
+    let PacketSchema { kind, command, meaning, .. } = *schema;
+    let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };
+    let (from, to) = if kind.is_from_cells() { (cell, Party::Gateway) } else { (Party::Gateway, cell) };
+    let rhythm = match kind {
+        Kind::Command if command == Some(Command::Joints) => Rhythm::Every(period_ms),
+        Kind::Torque => Rhythm::WhileActive(period_ms),
+        Kind::Network => Rhythm::Every(HEARTBEAT_MS),
+        Kind::Command | Kind::Sum | Kind::Sensors | Kind::Configure | Kind::Configured | Kind::Stimulus => {
+            Rhythm::Seldom
         }
     };
-    let (id, name) = (Id::command(command), command.name().to_owned());
-    Message { id, name, from: Party::Gateway, to: Party::Cells, rhythm, comment, signals }
-}
-
-/// What a cell says of this kind, or what is said to it.
-fn from_or_to(kind: Kind, node: Node, period: Rhythm) -> Message {
-    let cell = Party::Cell(node.to_byte());
-    let (up, down) = ((cell, Party::Gateway), (Party::Gateway, cell));
-    let active = match period {
-        Rhythm::Every(ms) | Rhythm::WhileActive(ms) => Rhythm::WhileActive(ms),
-        Rhythm::Seldom => Rhythm::Seldom,
+    let (id, name) = match command {
+        Some(command) => (Id::command(command), command.name().to_owned()),
+        None => (Id::new(kind, node), format!("{}_{node}", kind.name())),
     };
-    let ((from, to), rhythm, signals, comment) = match kind {
-        Kind::Command => (down, Rhythm::Seldom, layout::bare(), ""),
-        Kind::Sum => (
-            up,
-            Rhythm::Seldom,
-            layout::sum(),
-            "The cell's torques and those of the cells below it in the tree, answering the joints of this epoch, where \
-             a bus replies with sums. count is the cells in it that feel something, 0 the end of a contact; of two for \
-             one epoch the one with more cells counts.",
-        ),
-        Kind::Torque => (
-            up,
-            active,
-            layout::torque(),
-            "The cell's torques about joints 1 to 6, answering the joints of this epoch; sent while in contact, and \
-             once with zeros when the contact ends.",
-        ),
-        Kind::Sensors => (up, Rhythm::Seldom, layout::sensors(), "What the cell measures, by page."),
-        Kind::Network => (
-            up,
-            Rhythm::Every(HEARTBEAT_MS),
-            layout::network(),
-            "Page 0: heartbeat, four times a second and after each sync. Pages 1 to 4: counters modulo 65536, the \
-             place in the tree, the ports; on report, and page 3 when the parent changes. epoch is that of the last \
-             joints taken.",
-        ),
-        Kind::Configure => (
-            down,
-            Rhythm::Seldom,
-            layout::configure(),
-            "Reads a parameter, or writes its staged copy, which a commit with the right hash takes into use. The \
-             tag comes back in the answer.",
-        ),
-        Kind::Configured => (
-            up,
-            Rhythm::Seldom,
-            layout::configured(),
-            "The answer to configure: the value in force or written, or a refusal.",
-        ),
-        Kind::Stimulus => (
-            down,
-            Rhythm::Seldom,
-            layout::stimulus(),
-            "What a cell in test mode shall feel, from the joints of this epoch on or from the next ones.",
-        ),
-    };
-    let name = format!("{}_{node}", kind.name());
-    Message { id: Id::new(kind, node), name, from, to, rhythm, comment, signals }
+    Message { id, name, from, to, rhythm, comment: meaning, signals: signal::all(schema) }
 }
 
 /// The period of the joint broadcast in whole ms, as a DBC has it.

@@ -2,12 +2,12 @@
 
 use core::f64::consts::FRAC_PI_2;
 
-/// Where byte 12 begins.
-const EPOCH: u8 = 96;
-/// Where byte 13 begins.
-const COUNT: u8 = 104;
-/// Where the CRC begins.
-const CRC: u8 = 112;
+use protocol::message::State;
+use protocol::packet::{BYTES, WORDS};
+use protocol::schema::{Field, Format, Layout, PARAMETERS, PacketSchema, REASONS, Range};
+
+/// Where the words end.
+const END: usize = WORDS * 16;
 
 /// When a signal is there.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -26,7 +26,7 @@ pub(super) struct Signal {
     pub(super) name: String,
     pub(super) page: Page,
     /// The first bit, counted from the least significant one of byte 0.
-    pub(super) start: u8,
+    pub(super) start: usize,
     pub(super) bits: u8,
     pub(super) signed: bool,
     /// What one step is worth, in the unit.
@@ -35,100 +35,128 @@ pub(super) struct Signal {
     pub(super) range: [f64; 2],
     pub(super) unit: &'static str,
     /// Values that have a name.
-    pub(super) names: Vec<(i64, String)>,
+    pub(super) names: Vec<(i64, &'static str)>,
 }
 
-impl Signal {
-    /// Some bits as they are, unsigned.
-    pub(super) fn bits(name: impl Into<String>, start: u8, bits: u8) -> Self {
-        let greatest = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
-        Self {
-            name: name.into(),
-            page: Page::Every,
-            start,
-            bits,
-            signed: false,
-            factor: 1.0,
-            range: [0.0, greatest],
-            unit: "",
-            names: Vec::new(),
+/// The signals of a kind of packet: those of its pages, what bytes 12 and 13 say, and the CRC.
+pub(super) fn all(schema: &PacketSchema) -> Vec<Signal> {
+    let one_page = schema.layouts.len() == 1;
+    let of_layout = |layout: &'static Layout| {
+        let page = if one_page { Page::Every } else { Page::Only(layout.number) };
+        layout
+            .fields
+            .iter()
+            .flat_map(move |field| of(field, layout.prefix))
+            .map(move |it| Signal { page, ..it })
+    };
+    let mut signals: Vec<_> = schema.layouts.iter().flat_map(of_layout).collect();
+    for field in schema.end {
+        let is_number = matches!(field.format, Format::Page(_) | Format::Parameter(_));
+        let numbered = |signal| Signal { page: Page::Number, names: numbers(schema.layouts), ..signal };
+        let signals_of = of(field, "").into_iter();
+        signals.extend(signals_of.map(|signal| if is_number { numbered(signal) } else { signal }));
+    }
+    signals.push(bits("crc".to_owned(), BYTES * 8 - 16, 16));
+    signals.sort_by_key(|signal| if signal.start < END { 0 } else { signal.start });
+    signals
+}
+
+/// What the numbers of pages or parameters mean.
+fn numbers(layouts: &[Layout]) -> Vec<(i64, &'static str)> {
+    layouts.iter().map(|layout| (i64::from(layout.number), layout.name)).collect()
+}
+
+/// Some bits as they are, unsigned.
+fn bits(name: String, start: usize, bits: u8) -> Signal {
+    let greatest = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
+    Signal {
+        name,
+        page: Page::Every,
+        start,
+        bits,
+        signed: false,
+        factor: 1.0,
+        range: [0.0, greatest],
+        unit: "",
+        names: Vec::new(),
+    }
+}
+
+/// The signals of one field: one for each element, for each bit that has a meaning of its own.
+fn of(field: &Field, prefix: &str) -> Vec<Signal> {
+    let at = usize::from(field.at);
+    let named = |label: &str| field.signal_name(prefix, label);
+    match field.format {
+        Format::Total(_) => Vec::new(),
+        Format::State => {
+            let bit = |(bit, name): (State, &str)| {
+                let index = bit.0.trailing_zeros() as usize;
+                bits(format!("state_{}", name.replace('-', "_")), at + index, 1)
+            };
+            let parts =
+                [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
+            State::NAMES.into_iter().map(bit).chain(parts).collect()
+        }
+        Format::Ports(_, ports) => {
+            (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect()
+        }
+        Format::Group(parts) => {
+            let words = field.labels.iter().enumerate();
+            let part = |part: &Field, word: usize, label: &str| {
+                let signal = one(part, part.signal_name(prefix, label));
+                Signal { start: at + word * 16 + signal.start, ..signal }
+            };
+            words.flat_map(|(word, label)| parts.iter().map(move |it| part(it, word, label))).collect()
+        }
+        Format::Unsigned(_)
+        | Format::Signed
+        | Format::Choice
+        | Format::Flag(_)
+        | Format::Hex
+        | Format::Fixed(_)
+        | Format::Threshold(_)
+        | Format::Saturating(_)
+        | Format::Angle
+        | Format::Position
+        | Format::Port
+        | Format::Parameter(_)
+        | Format::Page(_)
+        | Format::Reason => {
+            let labels = if field.labels.is_empty() { &[""] } else { field.labels };
+            let element = |(word, label): (usize, &&str)| {
+                let signal = one(field, named(label));
+                Signal { start: at + word * 16, ..signal }
+            };
+            labels.iter().enumerate().map(element).collect()
         }
     }
+}
 
-    /// One of the six words as it is, unsigned.
-    pub(super) fn word(name: impl Into<String>, index: u8) -> Self {
-        Self::bits(name, index * 16, 16)
-    }
-
-    /// One of the six words with `F` fraction bits.
-    pub(super) fn fixed<const F: u32>(name: impl Into<String>, index: u8, unit: &'static str) -> Self {
-        Self { unit, ..Self::word(name, index).scaled(1.0 / f64::from(1_u32 << F)) }
-    }
-
-    /// One of the six words as an angle: Q1.14 of quarter turns, here in rad.
-    pub(super) fn angle(name: impl Into<String>, index: u8) -> Self {
-        Self { unit: "rad", ..Self::word(name, index).scaled(FRAC_PI_2 / f64::from(1_u32 << 14)) }
-    }
-
-    fn scaled(self, factor: f64) -> Self {
-        let range = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
-        Self { signed: true, factor, range, ..self }
-    }
-
-    /// Byte 12.
-    pub(super) fn epoch() -> Self {
-        Self::bits("epoch", EPOCH, 8)
-    }
-
-    /// Byte 12 of a question and its answer.
-    pub(super) fn tag() -> Self {
-        Self::bits("tag", EPOCH, 8)
-    }
-
-    /// Byte 13 where it counts.
-    pub(super) fn count(least: u8, greatest: u8) -> Self {
-        Self::bits("count", COUNT, 8).within(f64::from(least), f64::from(greatest))
-    }
-
-    /// The part of byte 13 that says which page this is; `bits` is 8, or 7 where the highest is a flag.
-    pub(super) fn page_number(name: &'static str, bits: u8) -> Self {
-        Self { page: Page::Number, ..Self::bits(name, COUNT, bits) }
-    }
-
-    /// The highest bit of byte 13.
-    pub(super) fn flag(name: &'static str) -> Self {
-        Self::bits(name, COUNT + 7, 1)
-    }
-
-    /// Bytes 14 and 15.
-    pub(super) fn crc() -> Self {
-        Self::bits("crc", CRC, 16)
-    }
-
-    pub(super) fn within(self, least: f64, greatest: f64) -> Self {
-        Self { range: [least, greatest], ..self }
-    }
-
-    /// The same without values below zero.
-    pub(super) fn not_negative(self) -> Self {
-        let [_, greatest] = self.range;
-        self.within(0.0, greatest)
-    }
-
-    pub(super) fn in_unit(self, unit: &'static str) -> Self {
-        Self { unit, ..self }
-    }
-
-    pub(super) fn on(self, page: u8) -> Self {
-        Self { page: Page::Only(page), ..self }
-    }
-
-    pub(super) fn naming<N: Into<String>>(self, names: impl IntoIterator<Item = (i64, N)>) -> Self {
-        Self { names: names.into_iter().map(|(value, name)| (value, name.into())).collect(), ..self }
-    }
-
-    /// The same word of a torque or a sum, whose ends mean *saturated*.
-    pub(super) fn saturating(self) -> Self {
-        self.naming([i16::MAX, i16::MIN].map(|end| (i64::from(end), "saturated")))
-    }
+/// The signal of a field that has one.
+fn one(field: &Field, name: String) -> Signal {
+    let unscaled = bits(name, usize::from(field.at), field.width());
+    let is_angle = matches!(field.format, Format::Angle | Format::Position);
+    let factor = if is_angle { FRAC_PI_2 } else { 1.0 } / f64::from(1_u32 << field.fraction());
+    let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
+    let [least, greatest] = if field.is_signed() { signed } else { unscaled.range };
+    let range = match field.range {
+        Range::All => [least, greatest],
+        Range::NotNegative | Range::NotNegativeAtCommit => [0.0, greatest],
+        Range::Within(least, greatest) => [least, greatest].map(f64::from),
+    };
+    let of = |names: &[(i16, &'static str)]| {
+        names.iter().map(|(value, name)| (i64::from(*value), *name)).collect()
+    };
+    let names = if let Format::Parameter(_) = field.format {
+        numbers(PARAMETERS)
+    } else if field.format == Format::Reason {
+        of(REASONS)
+    } else if field.is_saturating() {
+        of(&[i16::MAX, i16::MIN].map(|end| (end, "saturated")))
+    } else {
+        of(field.names)
+    };
+    // Readers differ in which bytes beyond ASCII they take.
+    let unit = if field.unit == "°C" { "degC" } else { field.unit };
+    Signal { signed: field.is_signed(), factor, range, unit, names, ..unscaled }
 }

@@ -7,7 +7,8 @@ use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
 use serde::Serialize;
 
 use super::{Count, seconds};
-use model::decode::{Fault, Foreign};
+use model::decode::Foreign;
+use protocol::packet::PacketError;
 
 /// Identifiers of a bus that are told apart; frames of others are counted together.
 const IDENTIFIERS: usize = 4096;
@@ -93,8 +94,9 @@ impl Foreigners {
             Foreign::Remote => FrameType::Remote,
             Foreign::Extended | Foreign::Data(_) => FrameType::Data,
         };
-        let wrong_crc = u64::from(matches!(why, Foreign::Data(Fault::Crc { .. })));
-        self.tried += u64::from(matches!(why, Foreign::Data(Fault::Crc { .. } | Fault::Incomplete)));
+        let wrong_crc = u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. })));
+        self.tried +=
+            u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. } | PacketError::Incomplete)));
         let key = (of, frame.raw_id());
         if self.identifiers.len() == IDENTIFIERS && !self.identifiers.contains_key(&key) {
             self.others += 1;

@@ -11,14 +11,14 @@ use protocol::can::Frame;
 use protocol::candump::Record;
 use protocol::id::Id;
 use protocol::message::{Joints, Message};
-use protocol::packet::{Epoch, data_id};
+use protocol::packet::{Epoch, PacketError, data_id};
 use protocol::time::Micros;
 
 use super::judge::Judge;
 use super::survey::{Survey, is_input, is_joints};
+use model::decode::Decoded;
 use model::decode::pick::Pick;
 use model::decode::settle::Settler;
-use model::decode::{Decoded, Fault};
 use trace::order::{Order, Ordered};
 
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
@@ -315,7 +315,9 @@ impl<'a> Reel<'a> {
                 judge.record(lane, &message, is_in_part);
                 Role::Plain
             }
-            Decoded::Half { id } | Decoded::Damaged { id, fault: Fault::Incomplete } if is_joints(id) => {
+            Decoded::Half { id } | Decoded::Damaged { id, fault: PacketError::Incomplete }
+                if is_joints(id) =>
+            {
                 Role::HalfOfJoints
             }
             Decoded::Half { .. }

@@ -6,9 +6,10 @@ use protocol::id::CellId;
 use protocol::message::VERSION;
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
+use protocol::schema::reason;
 use thiserror::Error;
 
-use crate::decode::parameter::{Name, Words, reason};
+use crate::decode::parameter::{Name, Words};
 
 /// What a cell is asked.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -92,7 +93,7 @@ pub enum Reason {
         tries: u8,
     },
     /// It will not.
-    #[error("refuses {ask}: {}", reason(*.code))]
+    #[error("refuses {ask}: {}", reason(i64::from(*.code)))]
     Refused {
         /// What it was asked.
         ask: Ask,

@@ -2,24 +2,20 @@
 
 use std::io::{self, Write};
 
-use protocol::can::Format;
+use protocol::can::Format as Bus;
 use protocol::candump::{Direction, Record};
-use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
 use protocol::id::{Id, Kind};
-use protocol::message::{
-    Answer, From, Heard, Heartbeat, Message, NetworkPage, PortState, Ports, Refused, Request, SensorPage,
-    State, Tree,
-};
-use protocol::packet::{BYTES, WORDS};
-use protocol::parameters::{Cuts, Events, Parameter, Reply, Sensing, Slots};
-use protocol::wire::{Hello, Label, Lane, PortMessage, Walk};
-use serde::Serialize;
+use protocol::message::{Message, State};
+use protocol::packet::{BYTES, PacketError};
+use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema};
+use protocol::wire::Lane;
+use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
-use super::parameter::{Name, reason};
-use super::{Decoded, Fault, Foreign, wires};
+use super::text::{Bits, Name};
+use super::{Decoded, Foreign, wires};
 
 /// A frame and what it says.
-#[derive(Serialize)]
+#[derive(serde::Serialize)]
 struct Line<'a> {
     time_ns: u64,
     bus: &'a str,
@@ -52,225 +48,109 @@ struct Line<'a> {
 }
 
 /// What the words say, by kind and page.
-#[derive(Serialize)]
-#[serde(untagged)]
-enum Values {
-    Joints {
-        position_rad: Vec<f64>,
-    },
-    Torque {
-        torque_nm: [f64; WORDS],
-    },
-    Sum {
-        torque_nm: [f64; WORDS],
-        cells: u8,
-    },
-    Felt(Felt),
-    Stimulus {
-        from_next: bool,
-        #[serde(flatten)]
-        felt: Felt,
-    },
-    Heartbeat {
-        page: &'static str,
-        serial: u32,
-        configuration: String,
-        sent: u16,
-        refused: u16,
-        #[serde(flatten)]
-        state: Flags,
-    },
-    Heard {
-        page: &'static str,
-        joints: u16,
-        joints_skipped: u16,
-        joints_repeated: u16,
-        stimuli: u16,
-        stimuli_late: u16,
-        torques: u16,
-    },
-    Refused {
-        page: &'static str,
-        length: u16,
-        crc: u16,
-        foreign: u16,
-        meaning: u16,
-        incomplete: u16,
-        stimuli: u16,
-    },
-    Tree {
-        page: &'static str,
-        parent: Option<u8>,
-        up: Option<u8>,
-        depth: Option<u8>,
-        round: u8,
-        children: Vec<u8>,
-        works: Vec<u8>,
-        sent: u16,
-        taken: u16,
-        dropped: u16,
-    },
-    Ports {
-        page: &'static str,
-        ports: [End; 4],
-        changes: u16,
-    },
-    Wire {
-        wire: u16,
-        back: bool,
-        #[serde(flatten)]
-        says: Says,
-    },
-    Read {
-        parameter: String,
-        write: bool,
-    },
-    Write {
-        parameter: String,
-        write: bool,
-        #[serde(flatten)]
-        value: Value,
-    },
-    Has {
-        parameter: String,
-        written: bool,
-        #[serde(flatten)]
-        value: Value,
-    },
-    Refusal {
-        parameter: String,
-        refusal: i16,
-        because: &'static str,
-    },
+struct Values {
+    lane: Option<Lane>,
+    end: &'static [Field],
+    layout: &'static Layout,
+    bytes: [u8; BYTES],
 }
 
-/// A page of sensors.
-#[derive(Serialize)]
-#[serde(untagged)]
-enum Felt {
-    Skin { page: &'static str, force_n: f64, contact_n: [f64; 3], proximity: f64, temperature_c: [f64; 2] },
-    Acceleration { page: &'static str, acceleration_g: [f64; 3] },
+impl Serialize for Values {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        let Self { lane, end, layout, bytes } = self;
+        if let Some(Lane { wire, back }) = lane {
+            map.serialize_entry("wire", wire)?;
+            map.serialize_entry("back", back)?;
+            map.serialize_entry("says", layout.name)?;
+        }
+        entries(&mut map, end, layout.name, bytes)?;
+        entries(&mut map, layout.fields, layout.name, bytes)?;
+        map.end()
+    }
 }
 
-/// What is at the other end of a wire.
-#[derive(Serialize)]
-struct End {
-    node: u8,
-    port: u8,
-    hears: bool,
-    works: bool,
-    other_version: bool,
+/// The fields of a group within a word.
+struct Group<'a>(&'a [Field], &'a [u8]);
+
+impl Serialize for Group<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        entries(&mut map, self.0, "", self.1)?;
+        map.end()
+    }
 }
 
-/// What is said over a wire; what a message does not have is not there.
-#[derive(Default, Serialize)]
-struct Says {
-    says: &'static str,
-    #[serde(flatten, skip_serializing_if = "Option::is_none")]
-    hello: Option<Greeting>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    round: Option<u8>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    depth: Option<u8>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    walk: Option<u8>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    first: Option<u8>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    last: Option<u8>,
+/// Each field that is there; the epoch and the tag stand beside the values.
+fn entries<M: SerializeMap>(map: &mut M, fields: &[Field], page: &str, bytes: &[u8]) -> Result<(), M::Error> {
+    let Some(first) = fields.first() else { return Ok(()) };
+    for field in fields.iter().filter(|field| !matches!(field.name, "" | "epoch" | "tag")) {
+        let raw = field.raw(bytes, 0);
+        if !field.is_there(bytes, first) {
+            if field.absent == Absent::Null {
+                map.serialize_entry(field.name, &())?;
+            }
+        } else if let Format::Page(_) = field.format {
+            map.serialize_entry(field.name, page)?;
+        } else if field.format == Format::State {
+            let state = State(u16::try_from(raw).map_err(M::Error::custom)?);
+            map.serialize_entry("state", &state.names().collect::<Vec<_>>())?;
+            map.serialize_entry("joint", &state.joint())?;
+            map.serialize_entry("version", &state.version())?;
+        } else {
+            map.serialize_entry(field.name, &Shown(field, bytes))?;
+            if field.format == Format::Reason {
+                map.serialize_entry("because", schema::reason(raw))?;
+            }
+        }
+    }
+    Ok(())
 }
 
-/// What only a hello has.
-#[derive(Serialize)]
-struct Greeting {
-    version: u8,
-    number: u8,
-    port: u8,
-    hears: bool,
-    up: bool,
-    unnumbered: bool,
-}
+/// The value of a field, or those of its elements.
+struct Shown<'a>(&'a Field, &'a [u8]);
 
-/// A state word.
-#[derive(Serialize)]
-struct Flags {
-    state: Vec<&'static str>,
-    joint: u16,
-    version: u16,
-}
-
-/// The words of a parameter.
-#[derive(Serialize)]
-#[serde(untagged)]
-enum Value {
-    Identity {
-        serial: u32,
-        identity_version: u16,
-        configuration: String,
-        #[serde(flatten)]
-        state: Flags,
-    },
-    Mount {
-        joint: i16,
-        joints: i16,
-    },
-    Pose {
-        position_m: [f64; 3],
-        normal: [f64; 3],
-    },
-    Contact {
-        alpha_c: f64,
-        alpha_p_n: f64,
-        contact_threshold_n: f64,
-        proximity_threshold: f64,
-        force_threshold_n: f64,
-    },
-    Timing {
-        period_us: u16,
-    },
-    Mode {
-        mode: i16,
-    },
-    Reply {
-        reply: &'static str,
-        #[serde(flatten)]
-        slots: Option<SlotsValue>,
-    },
-    Sensing {
-        sensing: &'static str,
-        #[serde(skip_serializing_if = "Option::is_none")]
-        period_ms: Option<u16>,
-    },
-    Events {
-        contact_n: f64,
-        proximity: f64,
-        temperature_c: f64,
-        acceleration_g: f64,
-        hysteresis: f64,
-    },
-    Cuts {
-        deaf_ports: Vec<u8>,
-    },
-    Row {
-        a_m: f64,
-        d_m: f64,
-        alpha_rad: f64,
-        theta_offset_rad: f64,
-    },
-    Commit {
-        hash: String,
-    },
-    Unknown {
-        words: [i16; WORDS],
-    },
-}
-
-/// When sums are said.
-#[derive(Serialize)]
-struct SlotsValue {
-    slot_us: u16,
-    deepest: u8,
-    carry: bool,
+impl Serialize for Shown<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self(field, bytes) = *self;
+        let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
+        let real = |element| field.real(field.raw(bytes, element));
+        match field.format {
+            Format::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
+            Format::Flag(_) => serializer.serialize_bool(first == 1),
+            Format::Hex => serializer.collect_str(&format_args!("{first:04X}")),
+            Format::Parameter(_) => serializer.collect_str(&Name::of(first)),
+            Format::Ports(..) => serializer.collect_seq(Bits(first).ports()),
+            Format::Total(_) => serializer.serialize_f64(field.total(bytes)),
+            Format::Group(parts) => {
+                let of = |element: usize| Group(parts, bytes.get(element * 2..).unwrap_or_default());
+                serializer.collect_seq(elements.map(of))
+            }
+            Format::Fixed(_)
+            | Format::Threshold(_)
+            | Format::Saturating(_)
+            | Format::Angle
+            | Format::Position => {
+                if field.labels.is_empty() {
+                    serializer.serialize_f64(real(0))
+                } else {
+                    serializer.collect_seq(elements.map(real))
+                }
+            }
+            Format::Unsigned(_)
+            | Format::Signed
+            | Format::Port
+            | Format::Page(_)
+            | Format::State
+            | Format::Reason => {
+                if field.labels.is_empty() {
+                    serializer.serialize_i64(first)
+                } else {
+                    serializer.collect_seq(elements.map(|element| field.raw(bytes, element)))
+                }
+            }
+        }
+    }
 }
 
 /// Writes one frame and the end of its line.
@@ -310,7 +190,9 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
         Decoded::Wire(lane, message) => {
             line.kind = Some("wire");
             line.crc = Some(word(last_word(record)));
-            line.say_over(lane, message);
+            let (bytes, layout) = wires::said(message);
+            line.epoch = wires::epoch(message);
+            line.values = Some(Values { lane: Some(lane), end: &[], layout, bytes });
         }
         Decoded::Half { id } => line.about(id),
         Decoded::Damaged { id, fault } => {
@@ -324,10 +206,9 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
             line.crc = Some(word(last_word(record)));
         }
         Decoded::Message(message) => {
-            line.about(message.encode().id);
+            line.about(message.id());
             line.crc = Some(word(last_word(record)));
-            line.saturated = matches!(message, Message::Torque { .. } | Message::Sum { .. })
-                .then(|| decoded.is_saturated());
+            line.saturated = message.is_saturated();
             line.say(&message);
         }
     }
@@ -338,8 +219,8 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
 /// The CRC of a packet: the last two bytes of its only frame, or of its second one.
 fn last_word(record: &Record<'_>) -> u16 {
     let end = match record.frame.format() {
-        Format::Fd => BYTES,
-        Format::Classic => BYTES / 2,
+        Bus::Fd => BYTES,
+        Bus::Classic => BYTES / 2,
     };
     match record.frame.data().get(end - 2..end) {
         Some(&[low, high]) => u16::from_le_bytes([low, high]),
@@ -359,253 +240,20 @@ impl Line<'_> {
     }
 
     /// The CRC that would have made a packet of it.
-    fn fails(&mut self, fault: Fault) {
-        if let Fault::Crc { expected, got } = fault {
+    fn fails(&mut self, fault: PacketError) {
+        if let PacketError::Crc { expected, got } = fault {
             (self.crc, self.crc_expected) = (Some(word(got)), Some(word(expected)));
         }
     }
 
-    fn say_over(&mut self, Lane { wire, back }: Lane, message: PortMessage) {
-        let mut says = Says { says: wires::name(message), ..Says::default() };
-        let label = match message {
-            PortMessage::Hello(Hello { version, number, port, hears, up, unnumbered, label }) => {
-                says.hello = Some(Greeting { version, number, port, hears, up, unnumbered });
-                label
-            }
-            PortMessage::Grant(label) => Some(label),
-            PortMessage::State(epoch) | PortMessage::Missed(epoch) => {
-                self.epoch = Some(epoch.0);
-                None
-            }
-            PortMessage::Seek(round) => {
-                says.round = Some(round);
-                None
-            }
-            PortMessage::Number(Walk { walk, first, last })
-            | PortMessage::Return(Walk { walk, first, last }) => {
-                (says.walk, says.first, says.last) = (Some(walk), Some(first), Some(last));
-                None
-            }
-            PortMessage::Join
-            | PortMessage::Refuse
-            | PortMessage::Leave
-            | PortMessage::Left
-            | PortMessage::Ask => None,
-        };
-        if let Some(Label { round, depth }) = label {
-            (says.round, says.depth) = (Some(round), Some(depth));
-        }
-        self.values = Some(Values::Wire { wire, back, says });
-    }
-
     fn say(&mut self, message: &Message) {
-        let values = match *message {
-            Message::Halt | Message::Sync | Message::Resume | Message::Report => return,
-            Message::Joints { epoch, joints } => {
-                self.epoch = Some(epoch.0);
-                let positions = joints.positions.iter().take(usize::from(joints.in_use));
-                Values::Joints { position_rad: positions.map(|word| word.to_radians()).collect() }
-            }
-            Message::Sum { from: _, epoch, torque, count } => {
-                self.epoch = Some(epoch.0);
-                Values::Sum { torque_nm: torque.map(Q::to_f64), cells: count }
-            }
-            Message::Torque { from: _, epoch, torque } => {
-                self.epoch = Some(epoch.0);
-                Values::Torque { torque_nm: torque.map(Q::to_f64) }
-            }
-            Message::Sensors { from: _, epoch, page } => {
-                self.epoch = Some(epoch.0);
-                Values::Felt(felt(page))
-            }
-            Message::Network { from: _, epoch, page } => {
-                self.epoch = Some(epoch.0);
-                network(page)
-            }
-            Message::Configure { to: _, tag, request } => {
-                self.tag = Some(tag);
-                match request {
-                    Request::Read { number } => {
-                        Values::Read { parameter: Name(number).to_string(), write: false }
-                    }
-                    Request::Write { number, words } => Values::Write {
-                        parameter: Name(number).to_string(),
-                        write: true,
-                        value: value(number, words),
-                    },
-                }
-            }
-            Message::Configured { from: _, tag, answer } => {
-                self.tag = Some(tag);
-                match answer {
-                    Answer::Value { number, written, words } => Values::Has {
-                        parameter: Name(number).to_string(),
-                        written,
-                        value: value(number, words),
-                    },
-                    Answer::Refused { number, reason: code } => Values::Refusal {
-                        parameter: Name(number).to_string(),
-                        refusal: code,
-                        because: reason(code),
-                    },
-                }
-            }
-            Message::Stimulus { to: _, from, page } => {
-                if let From::Epoch(epoch) = from {
-                    self.epoch = Some(epoch.0);
-                }
-                Values::Stimulus { from_next: from == From::Next, felt: felt(page) }
-            }
-        };
-        self.values = Some(values);
-    }
-}
-
-fn felt(page: SensorPage) -> Felt {
-    match page {
-        SensorPage::Skin(skin) => {
-            let contact_n = skin.contact.map(Q::to_f64);
-            Felt::Skin {
-                page: "skin",
-                force_n: contact_n.iter().sum(),
-                contact_n,
-                proximity: skin.proximity.to_f64(),
-                temperature_c: skin.temperature.map(Q::to_f64),
-            }
-        }
-        SensorPage::Acceleration(xyz) => {
-            Felt::Acceleration { page: "acceleration", acceleration_g: xyz.map(Q::to_f64) }
-        }
-    }
-}
-
-fn network(page: NetworkPage) -> Values {
-    match page {
-        NetworkPage::Heartbeat(Heartbeat { serial, configuration, sent, rejected, state }) => {
-            Values::Heartbeat {
-                page: "heartbeat",
-                serial,
-                configuration: word(configuration),
-                sent,
-                refused: rejected,
-                state: flags(state),
-            }
-        }
-        NetworkPage::Heard(Heard {
-            joints,
-            joints_late,
-            joints_repeated,
-            stimuli,
-            stimuli_late,
-            torques,
-        }) => {
-            let (joints_skipped, page) = (joints_late, "heard");
-            Values::Heard { page, joints, joints_skipped, joints_repeated, stimuli, stimuli_late, torques }
-        }
-        NetworkPage::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
-            Values::Refused { page: "refused", length, crc, foreign, meaning, incomplete, stimuli }
-        }
-        NetworkPage::Tree(Tree { parent, up, depth, round, children, works, sent, taken, dropped }) => {
-            let ports = |bits| wires::Bits(bits).ports().collect();
-            let (up, depth) = (parent.map(|_| up), parent.map(|_| depth));
-            let (children, works) = (ports(children), ports(works));
-            Values::Tree { page: "tree", parent, up, depth, round, children, works, sent, taken, dropped }
-        }
-        NetworkPage::Ports(Ports { ports, changes }) => {
-            let ports = ports.map(|PortState { number: node, port, hears, works, other_version }| End {
-                node,
-                port,
-                hears,
-                works,
-                other_version,
-            });
-            Values::Ports { page: "ports", ports, changes }
-        }
-    }
-}
-
-fn flags(state: State) -> Flags {
-    let set = State::NAMES.iter().filter(|(bit, _)| state.has(*bit)).map(|(_, name)| *name);
-    Flags { state: set.collect(), joint: state.joint(), version: state.version() }
-}
-
-fn value(number: u8, words: [i16; WORDS]) -> Value {
-    let [a, b, c, d, e, f] = words;
-    let meters = |word| Q1_14::from_bits(word).to_f64();
-    let radians = |word| Q1_14::from_bits(word).to_radians();
-    let newtons = |word| Q5_10::from_bits(word).to_f64();
-    match Parameter::from_number(number) {
-        Some(Parameter::Identity) => {
-            let [low, high, version, hash, state, _] = words.map(i16::cast_unsigned);
-            Value::Identity {
-                serial: u32::from(low) | u32::from(high) << 16,
-                identity_version: version,
-                configuration: word(hash),
-                state: flags(State(state)),
-            }
-        }
-        Some(Parameter::Mount) => Value::Mount { joint: a, joints: b },
-        Some(Parameter::Pose) => {
-            Value::Pose { position_m: [a, b, c].map(meters), normal: [d, e, f].map(meters) }
-        }
-        Some(Parameter::Contact) => Value::Contact {
-            alpha_c: Q3_12::from_bits(a).to_f64(),
-            alpha_p_n: newtons(b),
-            contact_threshold_n: newtons(c),
-            proximity_threshold: meters(d),
-            force_threshold_n: newtons(e),
-        },
-        Some(Parameter::Timing) => Value::Timing { period_us: a.cast_unsigned() },
-        Some(Parameter::Mode) => Value::Mode { mode: a },
-        Some(switch @ (Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts)) => {
-            switched(switch, words).unwrap_or(Value::Unknown { words })
-        }
-        Some(Parameter::Row(_)) => {
-            Value::Row { a_m: meters(a), d_m: meters(b), alpha_rad: radians(c), theta_offset_rad: radians(d) }
-        }
-        Some(Parameter::Commit) => Value::Commit { hash: word(a.cast_unsigned()) },
-        None => Value::Unknown { words },
-    }
-}
-
-/// The words of a switch, if they can be.
-fn switched(parameter: Parameter, words: [i16; WORDS]) -> Option<Value> {
-    match parameter {
-        Parameter::Reply => Some(match Reply::from_words(words)? {
-            Reply::Torque => Value::Reply { reply: "torque", slots: None },
-            Reply::Sum(Slots { slot_us, deepest, carry }) => {
-                Value::Reply { reply: "sum", slots: Some(SlotsValue { slot_us, deepest, carry }) }
-            }
-        }),
-        Parameter::Sensing => Some(match Sensing::from_words(words)? {
-            Sensing::Off => Value::Sensing { sensing: "off", period_ms: None },
-            Sensing::Continuous { period_ms } => {
-                Value::Sensing { sensing: "continuous", period_ms: Some(period_ms) }
-            }
-            Sensing::Event => Value::Sensing { sensing: "event", period_ms: None },
-        }),
-        Parameter::Events => {
-            let Events { contact, proximity, temperature, acceleration, hysteresis } =
-                Events::from_words(words)?;
-            Some(Value::Events {
-                contact_n: contact.to_f64(),
-                proximity: proximity.to_f64(),
-                temperature_c: temperature.to_f64(),
-                acceleration_g: acceleration.to_f64(),
-                hysteresis: hysteresis.to_f64(),
-            })
-        }
-        Parameter::Cuts => {
-            Some(Value::Cuts { deaf_ports: wires::Bits(Cuts::from_words(words).deaf).ports().collect() })
-        }
-        Parameter::Identity
-        | Parameter::Mount
-        | Parameter::Pose
-        | Parameter::Contact
-        | Parameter::Timing
-        | Parameter::Mode
-        | Parameter::Row(_)
-        | Parameter::Commit => None,
+        (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
+        let packet = message.encode();
+        let layout = schema::layout(message, &packet);
+        let schema = PacketSchema::of(packet.id).filter(|_| layout.number != schema::REFUSAL.number);
+        let end = schema.map_or(&[][..], |schema| schema.end);
+        let is_bare = end.is_empty() && layout.fields.is_empty();
+        self.values = (!is_bare).then(|| Values { lane: None, end, layout, bytes: packet.encode() });
     }
 }
 
@@ -756,7 +404,7 @@ mod tests {
         let record = Record { time, interface: "can0", frame, direction: None };
         let id = protocol::packet::data_id(&frame).unwrap();
         let mut line = Vec::new();
-        write(&mut line, &record, &Decoded::Damaged { id, fault: Fault::Crc { expected: 1, got: 2 } })
+        write(&mut line, &record, &Decoded::Damaged { id, fault: PacketError::Crc { expected: 1, got: 2 } })
             .unwrap();
         let damaged: Value = serde_json::from_slice(&line).unwrap();
         assert_eq!((&damaged["verdict"], &damaged["kind"]), (&json!("CRC"), &json!("torque")));

@@ -14,15 +14,13 @@ pub mod json;
 pub mod parameter;
 pub mod pick;
 pub mod settle;
-mod switch;
 mod text;
 mod wires;
 
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q;
 use protocol::id::Id;
-use protocol::message::{Message, MessageError, NetworkPage, SensorPage, State};
-use protocol::packet::{Half, Packet, PacketError, Paired, WORDS, data_id};
+use protocol::message::{Message, MessageError};
+use protocol::packet::{Half, Packet, PacketError, Paired, data_id};
 use protocol::time::Micros;
 use protocol::wire::{self, PortMessage};
 use thiserror::Error;
@@ -49,7 +47,7 @@ pub enum Decoded {
         /// Its identifier.
         id: Id,
         /// Why it is no packet.
-        fault: Fault,
+        fault: PacketError,
     },
     /// A packet that says nothing this version knows.
     Meaningless {
@@ -76,53 +74,7 @@ pub enum Foreign {
     Error,
     /// A data frame with an 11-bit identifier under which no packets come.
     #[error("no packet: {0}")]
-    Data(Fault),
-}
-
-/// Why a data frame with an 11-bit identifier is no packet.
-#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-pub enum Fault {
-    /// Another length or format than that of a packet.
-    #[error("{got} data bytes, not {expected}")]
-    Length {
-        /// Bytes that the format has.
-        expected: usize,
-        /// Bytes that came.
-        got: usize,
-    },
-    /// Wrong checksum.
-    #[error("CRC {got:04X}, not {expected:04X}")]
-    Crc {
-        /// What the bytes give.
-        expected: u16,
-        /// What the frame says.
-        got: u16,
-    },
-    /// A classic frame that gives no packet with the one before it or the one after it.
-    #[error("no other half")]
-    Incomplete,
-}
-
-impl Fault {
-    /// One word for it.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Length { .. } => "length",
-            Self::Crc { .. } => "CRC",
-            Self::Incomplete => "incomplete",
-        }
-    }
-}
-
-impl From<PacketError> for Fault {
-    fn from(error: PacketError) -> Self {
-        match error {
-            PacketError::Length { expected, got } => Self::Length { expected, got },
-            PacketError::Crc { expected, got } => Self::Crc { expected, got },
-            PacketError::Foreign | _ => Self::Incomplete,
-        }
-    }
+    Data(PacketError),
 }
 
 impl Foreign {
@@ -150,54 +102,22 @@ impl Decoded {
         }
     }
 
+    /// The message, if it is one.
+    #[must_use]
+    pub const fn message(&self) -> Option<&Message> {
+        if let Self::Message(message) = self { Some(message) } else { None }
+    }
+
     /// Whether a word of a torque or a sum means *saturated*.
     #[must_use]
     pub fn is_saturated(&self) -> bool {
-        match self {
-            Self::Message(Message::Torque { torque, .. }) => torque.iter().copied().any(Q::is_saturated),
-            Self::Message(Message::Sum { torque, .. }) => torque.iter().copied().any(Q::is_saturated),
-            Self::Message(_)
-            | Self::Foreign(_)
-            | Self::Wire(..)
-            | Self::Half { .. }
-            | Self::Damaged { .. }
-            | Self::Meaningless { .. } => false,
-        }
+        self.message().and_then(Message::is_saturated).unwrap_or(false)
     }
-}
 
-impl Decoded {
-    /// Whether this tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact
-    /// force or a proximity, a heartbeat of an active cell.
+    /// Whether this tells of a touch.
     #[must_use]
     pub fn is_contact(&self) -> bool {
-        let felt = |page: &SensorPage| match page {
-            SensorPage::Skin(skin) => skin.contact != [Q::ZERO; 3] || skin.proximity != Q::ZERO,
-            SensorPage::Acceleration(_) => false,
-        };
-        match self {
-            Self::Message(message) => match message {
-                Message::Torque { torque, .. } => *torque != [Q::ZERO; WORDS],
-                Message::Sum { torque, .. } => *torque != [Q::ZERO; WORDS],
-                Message::Sensors { page, .. } | Message::Stimulus { page, .. } => felt(page),
-                Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                    heartbeat.state.has(State::ACTIVE)
-                }
-                Message::Network { .. }
-                | Message::Halt
-                | Message::Joints { .. }
-                | Message::Sync
-                | Message::Resume
-                | Message::Report
-                | Message::Configure { .. }
-                | Message::Configured { .. } => false,
-            },
-            Self::Foreign(_)
-            | Self::Wire(..)
-            | Self::Half { .. }
-            | Self::Damaged { .. }
-            | Self::Meaningless { .. } => false,
-        }
+        self.message().is_some_and(Message::is_contact)
     }
 }
 
@@ -268,7 +188,7 @@ struct Slot {
 
 impl Slot {
     /// A frame that is no packet, nor half of one.
-    const fn refuse(&mut self, id: Id, fault: Fault) -> Decoded {
+    const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
         self.traffic.other();
         if self.traffic.carries_packets() {
             Decoded::Damaged { id, fault }
@@ -324,7 +244,7 @@ impl Decoder {
             Format::Classic => match slot.half.push(at, id, frame.data()) {
                 Ok(Paired::Waiting | Paired::Incomplete) => {
                     let older = slot.waiting.replace(number);
-                    let older = older.map(|older| (older, slot.refuse(id, Fault::Incomplete)));
+                    let older = older.map(|older| (older, slot.refuse(id, PacketError::Incomplete)));
                     return Taken { decoded: Decoded::Half { id }, waits: Some(on), older };
                 }
                 Ok(Paired::Whole(packet)) => {
@@ -341,7 +261,7 @@ impl Decoder {
                     Err(error) => Decoded::Meaningless { packet, error },
                 }
             }
-            Err(error) => slot.refuse(id, error.into()),
+            Err(error) => slot.refuse(id, error),
         };
         Taken { decoded, waits: None, older }
     }
@@ -351,10 +271,10 @@ impl Decoder {
         let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
         let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));
         let Some(slot) = slot.filter(|slot| slot.waiting == Some(number)) else {
-            return Decoded::Foreign(Foreign::Data(Fault::Incomplete));
+            return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
         };
         (slot.half, slot.waiting) = (Half::NONE, None);
-        slot.refuse(id, Fault::Incomplete)
+        slot.refuse(id, PacketError::Incomplete)
     }
 
     fn bus(&mut self, name: &str) -> &mut Bus {

@@ -1,36 +1,13 @@
 //! The parameters of a cell by name, and their words as values with units: to be read and to be written.
 
-use core::fmt::{self, Display, Formatter};
-
-use protocol::fixed::{OutOfRange, Q, Q1_14, Q3_12, Q5_10};
-use protocol::message::{Answer, State};
+use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
+use protocol::schema::{self, Field, Format, Layout, Range};
+use protocol::wire::{PORTS, UPLINK};
 use thiserror::Error;
 
-use super::switch;
-use super::text::{Bits, radians};
-
-/// Every parameter and its name.
-const NAMES: [(Parameter, &str); 17] = [
-    (Parameter::Identity, "identity"),
-    (Parameter::Mount, "mount"),
-    (Parameter::Pose, "pose"),
-    (Parameter::Contact, "contact"),
-    (Parameter::Timing, "timing"),
-    (Parameter::Mode, "mode"),
-    (Parameter::Reply, "reply"),
-    (Parameter::Sensing, "sensing"),
-    (Parameter::Events, "events"),
-    (Parameter::Cuts, "cuts"),
-    (Parameter::Row(0), "row1"),
-    (Parameter::Row(1), "row2"),
-    (Parameter::Row(2), "row3"),
-    (Parameter::Row(3), "row4"),
-    (Parameter::Row(4), "row5"),
-    (Parameter::Row(5), "row6"),
-    (Parameter::Commit, "commit"),
-];
+pub use super::text::{Name, Words};
 
 /// The greatest number that a parameter can have: the bit above it says that it is written.
 const GREATEST: u8 = 127;
@@ -78,7 +55,7 @@ pub enum ParameterTextError {
     #[error("{field} = {got}: {allowed}")]
     Value {
         /// What it is called.
-        field: &'static str,
+        field: String,
         /// What was given.
         got: String,
         /// What is allowed.
@@ -90,88 +67,12 @@ fn values(count: usize) -> String {
     if count == 1 { "one value".to_owned() } else { format!("{count} values") }
 }
 
-/// The parameter's name; of a number without one, the number.
-#[derive(Clone, Copy, Debug)]
-pub struct Name(pub u8);
-
-impl Display for Name {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match NAMES.iter().find(|(parameter, _)| parameter.number() == self.0) {
-            Some((_, name)) => f.write_str(name),
-            None => write!(f, "parameter {}", self.0),
-        }
-    }
-}
-
-/// The words of the parameter with this number, as values with units.
-#[derive(Clone, Copy, Debug)]
-pub struct Words(pub u8, pub [i16; WORDS]);
-
-impl Display for Words {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let Self(number, words) = *self;
-        let [a, b, c, d, e, g] = words;
-        let meters = |word| Q1_14::from_bits(word).to_f64();
-        let newtons = |word| Q5_10::from_bits(word).to_f64();
-        match Parameter::from_number(number) {
-            Some(Parameter::Identity) => {
-                let [low, high, version, hash, state, _] = words.map(i16::cast_unsigned);
-                let serial = u32::from(low) | u32::from(high) << 16;
-                write!(f, "serial {serial}, version {version}, hash {hash:04X}, {}", Bits(State(state)))
-            }
-            Some(Parameter::Mount) => write!(f, "joint {a} of {b}"),
-            Some(Parameter::Pose) => {
-                write!(f, "position {:.4} {:.4} {:.4} m, ", meters(a), meters(b), meters(c))?;
-                write!(f, "normal {:.4} {:.4} {:.4}", meters(d), meters(e), meters(g))
-            }
-            Some(Parameter::Contact) => {
-                let alpha_c = Q3_12::from_bits(a).to_f64();
-                write!(f, "alpha_c {alpha_c:.4}, alpha_p {:.3} N, ", newtons(b))?;
-                write!(f, "contact threshold {:.3} N, ", newtons(c))?;
-                write!(f, "proximity threshold {:.4}, ", Q1_14::from_bits(d).to_f64())?;
-                write!(f, "force threshold {:.3} N", newtons(e))
-            }
-            Some(Parameter::Timing) => write!(f, "period {} us", a.cast_unsigned()),
-            Some(Parameter::Mode) => {
-                write!(f, "{a}, {}", if a == 1 { "obey stimuli" } else { "measure" })
-            }
-            Some(switch @ (Parameter::Reply | Parameter::Sensing | Parameter::Events | Parameter::Cuts)) => {
-                switch::tell(f, switch, words)
-            }
-            Some(Parameter::Row(_)) => {
-                write!(f, "a {:.4} m, d {:.4} m, ", meters(a), meters(b))?;
-                write!(f, "alpha {:.4} rad, theta offset {:.4} rad", radians(c), radians(d))
-            }
-            Some(Parameter::Commit) => write!(f, "hash {a:04X}"),
-            None => write!(f, "words {a} {b} {c} {d} {e} {g}"),
-        }
-    }
-}
-
-/// What a refusal's reason means.
-#[must_use]
-pub const fn reason(reason: i16) -> &'static str {
-    match reason {
-        1 => "it cannot be written",
-        2 => "the robot's joints are not 1 to 6",
-        3 => "joint k is not 1 to the robot's joints",
-        4 => "the normal is not of length 1",
-        5 => "a gain or a threshold is below zero",
-        6 => "the period is 0",
-        Answer::WRONG_HASH => "the hash is not that of the staged copy",
-        Answer::FLASH_FAILED => "flash could not be written",
-        Answer::UNKNOWN => "there is no such parameter",
-        Answer::CANNOT_BE => "it cannot be that, or ports are cut outside test mode",
-        _ => "for a reason that this version does not know",
-    }
-}
-
 /// The number of the parameter with this name, or the number itself.
 ///
 /// # Errors
 /// When it is neither a name nor a number up to 127.
 pub fn number(text: &str) -> Result<u8, ParameterTextError> {
-    let named = NAMES.iter().find(|(_, name)| *name == text).map(|(parameter, _)| parameter.number());
+    let named = schema::parameter_named(text).map(|layout| layout.number);
     let number = || text.parse().ok().filter(|&number| number <= GREATEST);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
 }
@@ -183,73 +84,94 @@ pub fn number(text: &str) -> Result<u8, ParameterTextError> {
 pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), ParameterTextError> {
     let number = number(parameter)?;
     let mut words = [0; WORDS];
-    let Some(&(parameter, name)) = NAMES.iter().find(|(_, name)| *name == parameter) else {
+    let wrong = |field: String, text: &str, allowed| ParameterTextError::Value {
+        field,
+        got: text.to_owned(),
+        allowed,
+    };
+    let Some(layout) = schema::parameter_named(parameter) else {
         if values.len() > WORDS {
             return Err(ParameterTextError::Words { number, got: values.len() });
         }
         for (word, text) in words.iter_mut().zip(values) {
-            *word = raw(text).map_err(|allowed| value("word", text, allowed))?;
+            *word = raw(text).map_err(|allowed| wrong("word".to_owned(), text, allowed))?;
         }
         return Ok((number, words));
     };
-    let fields = fields(parameter, values.first().map(String::as_str));
-    if fields.is_empty() {
+    if Parameter::from_number(number) == Some(Parameter::Identity) {
         return Err(ParameterTextError::ReadOnly);
     }
+    let fields: Vec<_> = written(layout, values).collect();
     if values.len() != fields.len() {
-        let names: Vec<_> = fields.iter().map(|(field, _)| *field).collect();
-        let (wanted, got) = (fields.len(), values.len());
+        let names: Vec<_> = fields.iter().map(|(_, name)| name.as_str()).collect();
+        let (name, wanted, got) = (layout.name, fields.len(), values.len());
         return Err(ParameterTextError::Count { name, wanted, fields: names.join(" "), got });
     }
-    for (word, (&(field, read), text)) in words.iter_mut().zip(fields.iter().zip(values)) {
-        *word = read(text).map_err(|allowed| value(field, text, allowed))?;
+    for (word, ((field, name), text)) in words.iter_mut().zip(fields.into_iter().zip(values)) {
+        *word = read(field, text).map_err(|allowed| wrong(name, text, allowed))?;
     }
     Ok((number, words))
 }
 
-fn value(field: &'static str, text: &str, allowed: String) -> ParameterTextError {
-    ParameterTextError::Value { field, got: text.to_owned(), allowed }
+/// The values of a parameter and their names, in the order of its words, of which the first may say what follows.
+fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (&'static Field, String)> {
+    let first = layout.fields.first().zip(values.first()).and_then(|(field, text)| read(field, text).ok());
+    let follows = move |field: &&Field| field.follows(first.map(i64::from));
+    layout
+        .fields
+        .iter()
+        .filter(follows)
+        .flat_map(|field| field.written_names().map(move |name| (field, name)))
 }
 
-/// Makes a word of text; the error says what is allowed.
-type Read = fn(&str) -> Result<i16, String>;
-/// A value by its name.
-pub(super) type Field = (&'static str, Read);
-
-/// The values of a parameter in the order of its words, of which the first may say what follows; none of one that is
-/// read only.
-fn fields(parameter: Parameter, first: Option<&str>) -> &'static [Field] {
-    match parameter {
-        Parameter::Identity => &[],
-        Parameter::Mount => &[("joint", joint), ("joints", joint)],
-        Parameter::Pose => &[
-            ("x_m", nearest::<14>),
-            ("y_m", nearest::<14>),
-            ("z_m", nearest::<14>),
-            ("normal_x", nearest::<14>),
-            ("normal_y", nearest::<14>),
-            ("normal_z", nearest::<14>),
-        ],
-        Parameter::Contact => &[
-            ("alpha_c", nearest::<12>),
-            ("alpha_p_n", nearest::<10>),
-            ("contact_threshold_n", threshold::<10>),
-            ("proximity_threshold", threshold::<14>),
-            ("force_threshold_n", threshold::<10>),
-        ],
-        Parameter::Timing => &[("period_us", period)],
-        Parameter::Mode => &[("mode", mode)],
-        Parameter::Reply => switch::reply_fields(first),
-        Parameter::Sensing => switch::sensing_fields(first),
-        Parameter::Events => switch::EVENTS,
-        Parameter::Cuts => switch::CUTS,
-        Parameter::Row(_) => &[
-            ("a_m", nearest::<14>),
-            ("d_m", nearest::<14>),
-            ("alpha_rad", angle),
-            ("theta_offset_rad", angle),
-        ],
-        Parameter::Commit => &[("hash", hash)],
+/// The word of a value of a field.
+///
+/// # Errors
+/// What is allowed.
+pub fn read(field: &Field, text: &str) -> Result<i16, String> {
+    let allowed = || field.allowed.to_owned();
+    let known = |number: &i16| match field.range {
+        Range::Within(least, greatest) => {
+            (i32::from(least)..=i32::from(greatest)).contains(&i32::from(*number))
+        }
+        Range::All | Range::NotNegative | Range::NotNegativeAtCommit => {
+            field.name_of(i64::from(*number)).is_some()
+        }
+    };
+    match field.format {
+        Format::Choice => field.value_of(text).ok_or_else(allowed),
+        Format::Ports(..) => ports(text).ok_or_else(allowed),
+        Format::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
+        Format::Unsigned(_) => {
+            text.parse().ok().filter(|&number| number > 0).map(u16::cast_signed).ok_or_else(allowed)
+        }
+        Format::Signed | Format::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),
+        Format::Angle | Format::Position => angle(text),
+        Format::Threshold(fraction) => step(text, fraction, Q::<0>::try_at_least),
+        Format::Fixed(fraction) | Format::Saturating(fraction) | Format::Total(fraction) => {
+            let word = step(text, fraction, Q::<0>::try_nearest);
+            match field.range {
+                Range::All | Range::NotNegativeAtCommit => word,
+                Range::NotNegative => {
+                    let greatest = field.real(i64::from(i16::MAX));
+                    word.ok()
+                        .filter(|word| *word >= 0)
+                        .ok_or_else(|| format!("it must be in [0, {greatest}]"))
+                }
+                Range::Within(least, greatest) => {
+                    let bounds = [least, greatest].map(|bound| i64::from(bound) << fraction);
+                    word.ok()
+                        .filter(|word| (bounds[0]..=bounds[1]).contains(&i64::from(*word)))
+                        .ok_or_else(allowed)
+                }
+            }
+        }
+        Format::Port
+        | Format::State
+        | Format::Parameter(_)
+        | Format::Page(_)
+        | Format::Reason
+        | Format::Group(_) => raw(text),
     }
 }
 
@@ -273,14 +195,6 @@ pub fn real(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| "it must be a number".to_owned())
 }
 
-/// A number to the nearest step.
-///
-/// # Errors
-/// What is allowed.
-pub fn nearest<const F: u32>(text: &str) -> Result<i16, String> {
-    Q::<F>::try_nearest(real(text)?).map(Q::to_bits).map_err(range)
-}
-
 /// An angle in rad, wrapped to a turn.
 ///
 /// # Errors
@@ -289,35 +203,24 @@ pub fn angle(text: &str) -> Result<i16, String> {
     Q1_14::from_radians(real(text)?).map(Q::to_bits).ok_or_else(|| "it must be a number".to_owned())
 }
 
-fn threshold<const F: u32>(text: &str) -> Result<i16, String> {
-    Q::<F>::try_at_least(real(text)?).map(Q::to_bits).map_err(range)
+/// A number as steps of 2^-fraction; scaling by a power of two is exact.
+fn step(text: &str, fraction: u32, round: fn(f64) -> Result<Q<0>, OutOfRange>) -> Result<i16, String> {
+    let scale = f64::from(1_u32 << fraction);
+    let range =
+        |error: OutOfRange| format!("it must be in [{}, {})", error.least / scale, error.bound / scale);
+    round(real(text)? * scale).map(Q::to_bits).map_err(range)
 }
 
-fn range(error: OutOfRange) -> String {
-    format!("it must be in [{}, {})", error.least, error.bound)
-}
-
-fn joint(text: &str) -> Result<i16, String> {
-    let joint = text.parse().ok().filter(|joint| (1..=6).contains(joint));
-    joint.ok_or_else(|| "joints are 1 to 6".to_owned())
-}
-
-fn period(text: &str) -> Result<i16, String> {
-    let period = text.parse().ok().filter(|&period| period > 0).map(u16::cast_signed);
-    period.ok_or_else(|| "a period is 1 to 65535 us".to_owned())
-}
-
-fn mode(text: &str) -> Result<i16, String> {
-    match text {
-        "0" => Ok(0),
-        "1" => Ok(1),
-        _ => Err("0 measures, 1 obeys stimuli".to_owned()),
+/// Ports with a plus or a comma between them, `uplink` among them, or `none`.
+fn ports(text: &str) -> Option<i16> {
+    let bit = |port: &str| match port {
+        "uplink" => Some(1 << UPLINK),
+        number => number.parse().ok().filter(|port| *port < PORTS).map(|port: usize| 1 << port),
+    };
+    if text == "none" {
+        return Some(0);
     }
-}
-
-fn hash(text: &str) -> Result<i16, String> {
-    let hash = u16::from_str_radix(text, 16).ok().map(u16::cast_signed);
-    hash.ok_or_else(|| "a hash has up to 4 hexadecimal digits".to_owned())
+    text.split(['+', ',']).try_fold(0, |bits, port| Some(bits | bit(port)?))
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ fn knowing(format: Option<Format>) -> Decoder {
     let mut decoder = Decoder::new(format);
     let packet = Packet {
         id: Id { kind: protocol::id::Kind::Torque, node: 12 },
-        words: [0; WORDS],
+        words: [0; protocol::packet::WORDS],
         epoch: protocol::packet::Epoch(1),
         count: 1,
     };
@@ -419,7 +419,7 @@ fn memory_is_bounded_whatever_buses_a_log_names() {
 
 proptest! {
     #[test]
-    fn every_packet_is_one_line(id in 0_u16..0x800, words: [i16; 6], epoch: u8, count: u8) {
+    fn every_packet_is_one_line(id in 0_u16..0x800, words: [i16; protocol::packet::WORDS], epoch: u8, count: u8) {
         let epoch = protocol::packet::Epoch(epoch);
         let packet = Packet { id: Id::from_bits(id), words, epoch, count };
         for frame in packet.frames(Format::Fd) {

@@ -2,15 +2,13 @@
 
 use core::fmt::{self, Display, Formatter};
 
-use protocol::fixed::{Q, Q1_14};
 use protocol::id::{Command, Id, Kind, Node};
-use protocol::message::{
-    Answer, From, Heard, Heartbeat, Message, NetworkPage, Refused, Request, SensorPage, SkinSensors, State,
-};
+use protocol::message::{Message, State};
+use protocol::packet::WORDS;
+use protocol::schema::{self, Field, Format, Layout, PacketSchema, Text};
 
 use super::Decoded;
-use super::parameter::{self, Words};
-use super::wires::{Around, Place, Said};
+use super::wires::{self, Port, Said};
 
 impl Display for Decoded {
     /// A verdict, a space, and what the frame says.
@@ -49,144 +47,159 @@ struct Meaning<'a>(&'a Message);
 
 impl Display for Meaning<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", Subject(self.0.encode().id))?;
-        match *self.0 {
-            Message::Halt | Message::Sync | Message::Resume | Message::Report => Ok(()),
-            Message::Joints { epoch, joints } => {
-                write!(f, " epoch {epoch}:")?;
-                for position in joints.positions.iter().take(usize::from(joints.in_use)) {
-                    write!(f, " {:.4}", position.to_radians())?;
-                }
-                f.write_str(" rad")
-            }
-            Message::Sum { from: _, epoch, torque, count } => {
-                write!(f, " epoch {epoch}: {} Nm, cells {count}", Torque(&torque, 3))
-            }
-            Message::Torque { from: _, epoch, torque } => {
-                write!(f, " epoch {epoch}: {} Nm", Torque(&torque, 4))
-            }
-            Message::Sensors { from: _, epoch, page } => write!(f, " epoch {epoch}: {}", Felt(page)),
-            Message::Network { from: _, epoch, page } => write!(f, " epoch {epoch} {}", Page(page)),
-            Message::Configure { to: _, tag, request: Request::Read { number } } => {
-                write!(f, " tag {tag}: read {}", parameter::Name(number))
-            }
-            Message::Configure { to: _, tag, request: Request::Write { number, words } } => {
-                write!(f, " tag {tag}: write {}: {}", parameter::Name(number), Words(number, words))
-            }
-            Message::Configured { from: _, tag, answer } => write!(f, " tag {tag}: {}", Reply(answer)),
-            Message::Stimulus { to: _, from: From::Epoch(epoch), page } => {
-                write!(f, " from epoch {epoch} on: {}", Felt(page))
-            }
-            Message::Stimulus { to: _, from: From::Next, page } => {
-                write!(f, " from the next joints on: {}", Felt(page))
-            }
+        let packet = self.0.encode();
+        write!(f, "{}", Subject(packet.id))?;
+        let Some(schema) = PacketSchema::of(packet.id).filter(|schema| !schema.text.is_empty()) else {
+            return Ok(());
+        };
+        let (layout, bytes) = (schema::layout(self.0, &packet), packet.encode());
+        f.write_str(" ")?;
+        fill(f, schema.text, u16::from(packet.count), &|f, part| match (part, field(schema.end, part)) {
+            ("", _) => say(f, layout, &bytes),
+            ("page", _) => f.write_str(layout.name),
+            (_, Some(field)) => show(f, field, &bytes, part),
+            (_, None) => field(layout.fields, part).map_or(Ok(()), |field| show(f, field, &bytes, part)),
+        })
+    }
+}
+
+/// The words of the parameter with this number, as values with units.
+#[derive(Clone, Copy, Debug)]
+pub struct Words(pub u8, pub [i16; WORDS]);
+
+impl Display for Words {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let bytes: Vec<u8> = self.1.into_iter().flat_map(i16::to_le_bytes).collect();
+        say(f, schema::value(self.0, self.1), &bytes)
+    }
+}
+
+/// The parameter's name; of a number without one, the number.
+#[derive(Clone, Copy, Debug)]
+pub struct Name(pub u8);
+
+impl Name {
+    /// That of a number as a field has it.
+    pub(super) fn of(raw: i64) -> Self {
+        Self(raw.to_le_bytes()[0])
+    }
+}
+
+impl Display for Name {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match schema::parameter_name(self.0) {
+            Some(name) => f.write_str(name),
+            None => write!(f, "parameter {}", self.0),
         }
     }
 }
 
-/// Words of torque with so many decimals; the words that mean it say `saturated`.
-struct Torque<'a, const F: u32>(&'a [Q<F>], usize);
-
-impl<const F: u32> Display for Torque<'_, F> {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        for (index, word) in self.0.iter().enumerate() {
-            let space = if index == 0 { "" } else { " " };
-            if word.is_saturated() {
-                write!(f, "{space}{}saturated", if *word == Q::MAX { '+' } else { '-' })?;
-            } else {
-                write!(f, "{space}{:.*}", self.1, word.to_f64())?;
-            }
-        }
-        Ok(())
-    }
+/// What a layout's fields say in these bytes.
+pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
+    let number = layout.fields.first().map_or(0, |first| first.raw(bytes, 0));
+    fill(f, layout.text, u16::try_from(number).unwrap_or_default(), &|f, part| {
+        field(layout.fields, part).map_or(Ok(()), |field| show(f, field, bytes, part))
+    })
 }
 
-/// A page of sensors.
-struct Felt(SensorPage);
-
-impl Display for Felt {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self.0 {
-            SensorPage::Skin(SkinSensors { contact, proximity, temperature: [one, other] }) => {
-                let [a, b, c] = contact.map(Q::to_f64);
-                // Words of 10 fraction bits: the sum of three is exact.
-                write!(f, "force {:.3} N ({a:.3} {b:.3} {c:.3}), ", a + b + c)?;
-                write!(f, "proximity {:.4}, ", proximity.to_f64())?;
-                write!(f, "temperature {:.2} {:.2} °C", one.to_f64(), other.to_f64())
-            }
-            SensorPage::Acceleration(xyz) => {
-                let [x, y, z] = xyz.map(Q::to_f64);
-                write!(f, "acceleration {x:.4} {y:.4} {z:.4} g")
-            }
-        }
-    }
+/// The field that a part of a text names.
+fn field<'a>(fields: &'a [Field], part: &str) -> Option<&'a Field> {
+    let name = part.split([':', '?']).next()?;
+    fields.iter().find(|field| field.name == name)
 }
 
-/// A page of the network.
-struct Page(NetworkPage);
-
-impl Display for Page {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self.0 {
-            NetworkPage::Heartbeat(Heartbeat { serial, configuration, sent, rejected, state }) => {
-                write!(f, "heartbeat: serial {serial}, hash {configuration:04X}, sent {sent}, ")?;
-                write!(f, "refused {rejected}, {}", Bits(state))
-            }
-            NetworkPage::Heard(Heard {
-                joints,
-                joints_late,
-                joints_repeated,
-                stimuli,
-                stimuli_late,
-                torques,
-            }) => {
-                write!(f, "heard: joints {joints}, skipped {joints_late}, repeated {joints_repeated}, ")?;
-                write!(f, "stimuli {stimuli}, late {stimuli_late}, torques {torques}")
-            }
-            NetworkPage::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
-                write!(f, "refused: length {length}, CRC {crc}, foreign {foreign}, meaning {meaning}, ")?;
-                write!(f, "incomplete {incomplete}, stimuli {stimuli}")
-            }
-            NetworkPage::Tree(tree) => write!(f, "{}", Place(tree)),
-            NetworkPage::Ports(ports) => write!(f, "{}", Around(ports)),
+/// Writes the parts of a text that belong to a number; `show` writes what stands between braces.
+fn fill(
+    f: &mut Formatter<'_>,
+    text: Text,
+    number: u16,
+    show: &dyn Fn(&mut Formatter<'_>, &str) -> fmt::Result,
+) -> fmt::Result {
+    for (_, part) in text.iter().filter(|([least, greatest], _)| (*least..=*greatest).contains(&number)) {
+        let mut rest = *part;
+        while let Some((before, (inside, after))) =
+            rest.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
+        {
+            f.write_str(before)?;
+            show(f, inside)?;
+            rest = after;
         }
+        f.write_str(rest)?;
+    }
+    Ok(())
+}
+
+/// Writes a field as a part of a text asks for it.
+fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], part: &str) -> fmt::Result {
+    let first = field.raw(bytes, 0);
+    if let Some((no, yes)) = part.split_once('?').and_then(|(_, words)| words.split_once('|')) {
+        return f.write_str(if first == 1 { yes } else { no });
+    }
+    let decimals = part.split_once(':').and_then(|(_, decimals)| decimals.parse().ok()).unwrap_or(0);
+    match field.format {
+        Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
+        Format::Hex => write!(f, "{first:04X}"),
+        Format::Port => write!(f, "{}", Port(first)),
+        Format::Ports(..) => write!(f, "{}", Bits(first)),
+        Format::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
+        Format::Parameter(_) => write!(f, "{}", Name::of(first)),
+        Format::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
+        Format::Total(_) => write!(f, "{:.decimals$}", field.total(bytes)),
+        Format::Group(parts) => wires::around(f, parts, bytes, field.elements()),
+        Format::Fixed(_)
+        | Format::Threshold(_)
+        | Format::Saturating(_)
+        | Format::Angle
+        | Format::Position
+        | Format::Unsigned(_)
+        | Format::Signed
+        | Format::Flag(_)
+        | Format::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
+            f.write_str(if element == 0 { "" } else { " " })?;
+            let raw = field.raw(bytes, element);
+            match i16::try_from(raw) {
+                Ok(i16::MAX) if field.is_saturating() => f.write_str("+saturated"),
+                Ok(i16::MIN) if field.is_saturating() => f.write_str("-saturated"),
+                _ if field.fraction() > 0 => write!(f, "{:.decimals$}", field.real(raw)),
+                _ => write!(f, "{raw}"),
+            }
+        }),
     }
 }
 
 /// A state word: `configured+active, joint 2, version 1`.
-pub(super) struct Bits(pub(super) State);
+struct Flags(State);
+
+impl Display for Flags {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        joined(f, self.0.names())?;
+        write!(f, ", joint {}, version {}", self.0.joint(), self.0.version())
+    }
+}
+
+/// The ports whose bits are set: `0+2`, or `none`.
+pub(super) struct Bits(pub(super) i64);
+
+impl Bits {
+    /// Their numbers.
+    pub(super) fn ports(&self) -> impl Iterator<Item = u8> + use<> {
+        let bits = self.0;
+        (0..8).filter(move |port| bits >> port & 1 == 1)
+    }
+}
 
 impl Display for Bits {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let set = State::NAMES.iter().filter(|(bit, _)| self.0.has(*bit)).map(|(_, name)| *name);
-        let mut any = false;
-        for name in set {
-            write!(f, "{}{name}", if any { "+" } else { "" })?;
-            any = true;
-        }
-        write!(f, "{}, joint {}, version {}", if any { "" } else { "none" }, self.0.joint(), self.0.version())
+        joined(f, self.ports())
     }
 }
 
-/// A cell's answer to a `configure`.
-struct Reply(Answer);
-
-impl Display for Reply {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self.0 {
-            Answer::Value { number, written, words } => {
-                let wrote = if written { "wrote" } else { "has" };
-                write!(f, "{wrote} {}: {}", parameter::Name(number), Words(number, words))
-            }
-            Answer::Refused { number, reason } => {
-                let why = parameter::reason(reason);
-                write!(f, "refuses {}: {why} (reason {reason})", parameter::Name(number))
-            }
-        }
+/// Things with a plus between them, or `none`.
+fn joined(f: &mut Formatter<'_>, all: impl Iterator<Item = impl Display>) -> fmt::Result {
+    let mut any = false;
+    for one in all {
+        write!(f, "{}{one}", if any { "+" } else { "" })?;
+        any = true;
     }
-}
-
-/// An angle word in rad.
-pub(super) fn radians(word: i16) -> f64 {
-    Q1_14::from_bits(word).to_radians()
+    if any { Ok(()) } else { f.write_str("none") }
 }

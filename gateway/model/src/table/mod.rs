@@ -315,7 +315,8 @@ impl Table {
         let event = |error| match error {
             PacketError::Length { .. } => Event::Length,
             PacketError::Crc { .. } => Event::Crc,
-            PacketError::Foreign | _ => Event::Foreign,
+            PacketError::Incomplete => Event::Incomplete,
+            PacketError::Foreign => Event::Foreign,
         };
         if self.format == Format::Fd {
             return Packet::from_fd(frame).map(Some).map_err(event);

@@ -13,9 +13,17 @@
 //!
 //! In a torque or a sum the greatest and the least word mean *saturated*.
 
+mod network;
+mod sensors;
+mod state;
+
+pub use network::{Heard, Heartbeat, NetworkPage, PortState, Ports, Refused, Tree};
+pub use sensors::{SensorPage, SkinSensors};
+pub use state::State;
+
 use thiserror::Error;
 
-use crate::fixed::{Q1_14, Q3_12, Q5_10, Q7_8, Q9_6};
+use crate::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use crate::id::{CellId, Command, Id, Kind, Node};
 use crate::packet::{Epoch, Packet, WORDS};
 
@@ -23,13 +31,11 @@ use crate::packet::{Epoch, Packet, WORDS};
 pub const VERSION: u8 = 1;
 
 /// Set in a stimulus' count: it holds from the next joints on, whatever their epoch.
-const FROM_THE_NEXT: u8 = 0x80;
+pub(crate) const FROM_THE_NEXT: u8 = 0x80;
 /// Set in the count of `configure` and `configured`: the parameter is written.
-const WRITE: u8 = 0x80;
-/// In a tree page: no parent.
-const NOBODY: u8 = 255;
+pub(crate) const WRITE: u8 = 0x80;
 /// The parameter number that stands for a refusal.
-const REFUSED: u8 = 126;
+pub(crate) const REFUSED: u8 = 126;
 
 /// The joint positions of one epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -40,26 +46,6 @@ pub struct Joints {
     pub in_use: u8,
 }
 
-/// What a cell measures, or shall feel.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum SensorPage {
-    /// Page 0: what touches the skin.
-    Skin(SkinSensors),
-    /// Page 1: accelerometer x, y, z in g.
-    Acceleration([Q3_12; 3]),
-}
-
-/// Page 0 of the sensors.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct SkinSensors {
-    /// Three capacitive contact forces in N; their sum is the touch.
-    pub contact: [Q5_10; 3],
-    /// Proximity, 0 (nothing near) to 1.
-    pub proximity: Q1_14,
-    /// Two temperatures in degrees Celsius.
-    pub temperature: [Q9_6; 2],
-}
-
 /// When a stimulus begins to hold.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum From {
@@ -67,208 +53,6 @@ pub enum From {
     Epoch(Epoch),
     /// From the next joints on, whatever their epoch.
     Next,
-}
-
-/// What a cell says of itself and its part of the network.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum NetworkPage {
-    /// Page 0.
-    Heartbeat(Heartbeat),
-    /// Page 1: what became of the packets it heard.
-    Heard(Heard),
-    /// Page 2: what it refused, by reason.
-    Refused(Refused),
-    /// Page 3: its place in the tree, and what became of sums.
-    Tree(Tree),
-    /// Page 4: what its ports lead to.
-    Ports(Ports),
-}
-
-/// Page 0: sign of life, four times a second and after each sync. The epoch byte is that of the last
-/// joints taken.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Heartbeat {
-    /// The cell's serial number.
-    pub serial: u32,
-    /// Hash of its configuration, [`crate::parameters::Parameters::hash`].
-    pub configuration: u16,
-    /// Packets sent before this one, modulo 2^16.
-    pub sent: u16,
-    /// Frames refused, modulo 2^16; page 2 says why.
-    pub rejected: u16,
-    /// How it is.
-    pub state: State,
-}
-
-/// How a cell is: one bit each, the joint in bits 8 to 11, the protocol version in bits 12 to 15.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct State(pub u16);
-
-impl State {
-    /// It has a configuration and computes with it.
-    pub const CONFIGURED: Self = Self(1);
-    /// It feels a contact.
-    pub const ACTIVE: Self = Self(1 << 1);
-    /// It was halted and waits for a resume.
-    pub const HALTED: Self = Self(1 << 2);
-    /// Its flash was damaged; what was in it is not used.
-    pub const FLASH_DAMAGED: Self = Self(1 << 3);
-    /// It has heard another cell speak under its number.
-    pub const DUPLICATE: Self = Self(1 << 4);
-    /// It obeys stimuli instead of measuring.
-    pub const TEST_MODE: Self = Self(1 << 5);
-    /// A torque saturated since the last heartbeat.
-    pub const SATURATED: Self = Self(1 << 6);
-    /// It has just started and listens for another cell under its number.
-    pub const CLAIMING: Self = Self(1 << 7);
-
-    /// The bits and their names, as everything prints them.
-    pub const NAMES: [(Self, &'static str); 8] = [
-        (Self::CONFIGURED, "configured"),
-        (Self::ACTIVE, "active"),
-        (Self::HALTED, "halted"),
-        (Self::FLASH_DAMAGED, "flash-damaged"),
-        (Self::DUPLICATE, "duplicate"),
-        (Self::TEST_MODE, "test-mode"),
-        (Self::SATURATED, "saturated"),
-        (Self::CLAIMING, "claiming"),
-    ];
-
-    /// Whether all of these bits are set.
-    #[must_use]
-    pub const fn has(self, bits: Self) -> bool {
-        self.0 & bits.0 == bits.0
-    }
-
-    /// The same with these bits set or not.
-    #[must_use]
-    pub const fn with(self, bits: Self, set: bool) -> Self {
-        if set { Self(self.0 | bits.0) } else { Self(self.0 & !bits.0) }
-    }
-
-    /// The same with the joint and this protocol's version.
-    #[must_use]
-    pub const fn with_joint(self, joint: u8) -> Self {
-        Self((self.0 & 0xFF) | (((joint & 0xF) as u16) << 8) | ((VERSION as u16) << 12))
-    }
-
-    /// The joint that moves the cell; 0 while it is not configured.
-    #[must_use]
-    pub const fn joint(self) -> u16 {
-        (self.0 >> 8) & 0xF
-    }
-
-    /// The version of the protocol that the cell speaks.
-    #[must_use]
-    pub const fn version(self) -> u16 {
-        self.0 >> 12
-    }
-}
-
-/// Page 1: what became of what was heard, each modulo 2^16.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Heard {
-    /// Joints taken and answered if in contact.
-    pub joints: u16,
-    /// Joints skipped because they were older than one period.
-    pub joints_late: u16,
-    /// Joints of the epoch that was the last already.
-    pub joints_repeated: u16,
-    /// Stimuli taken.
-    pub stimuli: u16,
-    /// Stimuli that came after the epoch they were meant for (taken from the next one on).
-    pub stimuli_late: u16,
-    /// Torques sent.
-    pub torques: u16,
-}
-
-/// Page 2: frames refused, each modulo 2^16.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Refused {
-    /// Neither 16 bytes FD nor 8 bytes classic, as the bus has it.
-    pub length: u16,
-    /// Wrong CRC.
-    pub crc: u16,
-    /// Remote frame, error frame, 29-bit identifier.
-    pub foreign: u16,
-    /// A kind, page or command that does not exist, or words that cannot be.
-    pub meaning: u16,
-    /// First halves whose second half did not come.
-    pub incomplete: u16,
-    /// Stimuli for which there was no room, or that a measuring cell was sent.
-    pub stimuli: u16,
-}
-
-/// Page 3: a cell's place in the tree. The epoch byte is that of the last joints taken.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Tree {
-    /// Where its sums go: the number of a cell, 0 for the gateway's side; `None` without a way up.
-    pub parent: Option<u8>,
-    /// The port that leads there, 0 to 4; not looked at without a parent.
-    pub up: u8,
-    /// Wires to the root of its tree: 0 is a root; not looked at without a parent.
-    pub depth: u8,
-    /// The exploration from which the depth is.
-    pub round: u8,
-    /// Bit p: the cell at port p is its child.
-    pub children: u8,
-    /// Bit p: port p works in both directions.
-    pub works: u8,
-    /// Sums sent, resends among them, modulo 2^16.
-    pub sent: u16,
-    /// Sums taken from children, modulo 2^16.
-    pub taken: u16,
-    /// Sums of children that were not taken: too late, or not said to be for this cell; modulo 2^16.
-    pub dropped: u16,
-}
-
-/// Page 4: what a cell's ports lead to.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Ports {
-    /// Each port.
-    pub ports: [PortState; 4],
-    /// How often its parent changed, modulo 2^16.
-    pub changes: u16,
-}
-
-/// What one port leads to.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct PortState {
-    /// The number of the cell at the other end; 0 when nothing is heard from there, or it has no number.
-    pub number: u8,
-    /// The other end's port.
-    pub port: u8,
-    /// Something is heard from there.
-    pub hears: bool,
-    /// It hears this cell too.
-    pub works: bool,
-    /// It speaks another version of the protocol.
-    pub other_version: bool,
-}
-
-impl PortState {
-    const HEARS: u16 = 1 << 12;
-    const WORKS: u16 = 1 << 13;
-    const OTHER_VERSION: u16 = 1 << 14;
-
-    const fn decode(word: u16) -> Self {
-        let [number, high] = word.to_le_bytes();
-        Self {
-            number,
-            port: high & 7,
-            hears: word & Self::HEARS != 0,
-            works: word & Self::WORKS != 0,
-            other_version: word & Self::OTHER_VERSION != 0,
-        }
-    }
-
-    fn encode(self) -> u16 {
-        let flag = |set: bool, flag| if set { flag } else { 0 };
-        u16::from_le_bytes([self.number, self.port & 7])
-            | flag(self.hears, Self::HEARS)
-            | flag(self.works, Self::WORKS)
-            | flag(self.other_version, Self::OTHER_VERSION)
-    }
 }
 
 /// What a `configure` packet asks for.
@@ -576,117 +360,82 @@ impl Message {
     }
 }
 
+impl Message {
+    /// The identifier under which it is sent.
+    #[must_use]
+    pub fn id(&self) -> Id {
+        self.encode().id
+    }
+
+    /// The cell that sends it; `None` when the gateway's side does.
+    #[must_use]
+    pub fn sender(&self) -> Option<CellId> {
+        self.id().sender()
+    }
+
+    /// The epoch that it speaks of, if it does.
+    #[must_use]
+    pub const fn epoch(&self) -> Option<Epoch> {
+        match *self {
+            Self::Joints { epoch, .. }
+            | Self::Sum { epoch, .. }
+            | Self::Torque { epoch, .. }
+            | Self::Sensors { epoch, .. }
+            | Self::Network { epoch, .. }
+            | Self::Stimulus { from: From::Epoch(epoch), .. } => Some(epoch),
+            Self::Halt
+            | Self::Sync
+            | Self::Resume
+            | Self::Report
+            | Self::Configure { .. }
+            | Self::Configured { .. }
+            | Self::Stimulus { from: From::Next, .. } => None,
+        }
+    }
+
+    /// The tag of a request or of its answer.
+    #[must_use]
+    pub const fn tag(&self) -> Option<u8> {
+        if let Self::Configure { tag, .. } | Self::Configured { tag, .. } = *self { Some(tag) } else { None }
+    }
+
+    /// What a cell measures, or shall feel.
+    #[must_use]
+    pub const fn sensor_page(&self) -> Option<SensorPage> {
+        if let Self::Sensors { page, .. } | Self::Stimulus { page, .. } = *self { Some(page) } else { None }
+    }
+
+    /// Whether a word of it means *saturated*; `None` of what is neither a torque nor a sum.
+    #[must_use]
+    pub fn is_saturated(&self) -> Option<bool> {
+        let is_end = |word: &i16| [i16::MIN, i16::MAX].contains(word);
+        self.torque_words().map(|words| words.iter().any(is_end))
+    }
+
+    /// Whether it tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
+    /// or a proximity, a heartbeat of an active cell.
+    #[must_use]
+    pub fn is_contact(&self) -> bool {
+        if let Self::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = self {
+            return heartbeat.state.has(State::ACTIVE);
+        }
+        if let Some(SensorPage::Skin(skin)) = self.sensor_page() {
+            return skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
+        }
+        self.torque_words().is_some_and(|words| words != [0; WORDS])
+    }
+
+    /// The words of a torque or a sum.
+    fn torque_words(&self) -> Option<[i16; WORDS]> {
+        let Packet { id, words, .. } = self.encode();
+        matches!(id.kind, Kind::Torque | Kind::Sum).then_some(words)
+    }
+}
+
 fn addressee(kind: Kind, node: u8) -> Result<Node, MessageError> {
     match Node::from_byte(node) {
         Node::Gateway => Err(MessageError::Addressee { kind, node }),
         to @ (Node::Cell(_) | Node::Everyone) => Ok(to),
-    }
-}
-
-impl SensorPage {
-    fn decode(kind: Kind, page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
-        let [a, b, c, d, e, f] = words;
-        match page {
-            0 => Ok(Self::Skin(SkinSensors {
-                contact: [a, b, c].map(Q5_10::from_bits),
-                proximity: Q1_14::from_bits(d),
-                temperature: [e, f].map(Q9_6::from_bits),
-            })),
-            1 => Ok(Self::Acceleration([a, b, c].map(Q3_12::from_bits))),
-            _ => Err(MessageError::Page { kind, page }),
-        }
-    }
-
-    fn encode(self) -> (u8, [i16; WORDS]) {
-        match self {
-            Self::Skin(SkinSensors { contact, proximity, temperature }) => {
-                let ([a, b, c], [e, f]) = (contact.map(Q5_10::to_bits), temperature.map(Q9_6::to_bits));
-                (0, [a, b, c, proximity.to_bits(), e, f])
-            }
-            Self::Acceleration(xyz) => {
-                let [x, y, z] = xyz.map(Q3_12::to_bits);
-                (1, [x, y, z, 0, 0, 0])
-            }
-        }
-    }
-}
-
-impl NetworkPage {
-    fn decode(page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
-        let [a, b, c, d, e, f] = words.map(i16::cast_unsigned);
-        match page {
-            0 => Ok(Self::Heartbeat(Heartbeat {
-                serial: u32::from(a) | (u32::from(b) << 16),
-                configuration: c,
-                sent: d,
-                rejected: e,
-                state: State(f),
-            })),
-            1 => Ok(Self::Heard(Heard {
-                joints: a,
-                joints_late: b,
-                joints_repeated: c,
-                stimuli: d,
-                stimuli_late: e,
-                torques: f,
-            })),
-            2 => Ok(Self::Refused(Refused {
-                length: a,
-                crc: b,
-                foreign: c,
-                meaning: d,
-                incomplete: e,
-                stimuli: f,
-            })),
-            3 => {
-                let ([parent, up], [depth, round]) = (a.to_le_bytes(), b.to_le_bytes());
-                let [children, works] = c.to_le_bytes();
-                let parent = (parent != NOBODY).then_some(parent);
-                Ok(Self::Tree(Tree {
-                    parent,
-                    up,
-                    depth,
-                    round,
-                    children,
-                    works,
-                    sent: d,
-                    taken: e,
-                    dropped: f,
-                }))
-            }
-            4 => Ok(Self::Ports(Ports { ports: [a, b, c, d].map(PortState::decode), changes: e })),
-            _ => Err(MessageError::Page { kind: Kind::Network, page }),
-        }
-    }
-
-    fn encode(self) -> (u8, [i16; WORDS]) {
-        let (page, words) = match self {
-            Self::Heartbeat(Heartbeat { serial, configuration, sent, rejected, state }) => {
-                let [a, b, c, d] = serial.to_le_bytes();
-                let halves = [u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])];
-                (0, [halves[0], halves[1], configuration, sent, rejected, state.0])
-            }
-            Self::Heard(Heard { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }) => {
-                (1, [joints, joints_late, joints_repeated, stimuli, stimuli_late, torques])
-            }
-            Self::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
-                (2, [length, crc, foreign, meaning, incomplete, stimuli])
-            }
-            Self::Tree(tree) => {
-                let pair = |low, high| u16::from_le_bytes([low, high]);
-                let place = [
-                    pair(tree.parent.unwrap_or(NOBODY), tree.up),
-                    pair(tree.depth, tree.round),
-                    pair(tree.children, tree.works),
-                ];
-                (3, [place[0], place[1], place[2], tree.sent, tree.taken, tree.dropped])
-            }
-            Self::Ports(Ports { ports: [a, b, c, d], changes }) => {
-                let [a, b, c, d] = [a, b, c, d].map(PortState::encode);
-                (4, [a, b, c, d, changes, 0])
-            }
-        };
-        (page, words.map(u16::cast_signed))
     }
 }
 
@@ -723,13 +472,5 @@ mod tests {
         assert_eq!(says(0x301, 2), "sensors page 2 does not exist");
         assert_eq!(says(0x401, 9), "network page 9 does not exist");
         assert_eq!(says(0x500, 0), "configure to node 0, which is no cell");
-    }
-
-    #[test]
-    fn the_state_word_keeps_its_parts_apart() {
-        let state = State::CONFIGURED.with(State::ACTIVE, true).with_joint(5);
-        assert!(state.has(State::CONFIGURED) && state.has(State::ACTIVE) && !state.has(State::HALTED));
-        assert_eq!((state.joint(), state.version()), (5, 1));
-        assert_eq!(state.with(State::ACTIVE, false).0, 0x1501);
     }
 }

@@ -1,0 +1,54 @@
+//! What a cell measures, or shall feel.
+
+use super::MessageError;
+use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use crate::id::Kind;
+use crate::packet::WORDS;
+
+/// What a cell measures, or shall feel.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum SensorPage {
+    /// Page 0: what touches the skin.
+    Skin(SkinSensors),
+    /// Page 1: accelerometer x, y, z in g.
+    Acceleration([Q3_12; 3]),
+}
+
+/// Page 0 of the sensors.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct SkinSensors {
+    /// Three capacitive contact forces in N; their sum is the touch.
+    pub contact: [Q5_10; 3],
+    /// Proximity, 0 (nothing near) to 1.
+    pub proximity: Q1_14,
+    /// Two temperatures in degrees Celsius.
+    pub temperature: [Q9_6; 2],
+}
+
+impl SensorPage {
+    pub(super) fn decode(kind: Kind, page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
+        let [a, b, c, d, e, f] = words;
+        match page {
+            0 => Ok(Self::Skin(SkinSensors {
+                contact: [a, b, c].map(Q5_10::from_bits),
+                proximity: Q1_14::from_bits(d),
+                temperature: [e, f].map(Q9_6::from_bits),
+            })),
+            1 => Ok(Self::Acceleration([a, b, c].map(Q3_12::from_bits))),
+            _ => Err(MessageError::Page { kind, page }),
+        }
+    }
+
+    pub(super) fn encode(self) -> (u8, [i16; WORDS]) {
+        match self {
+            Self::Skin(SkinSensors { contact, proximity, temperature }) => {
+                let ([a, b, c], [e, f]) = (contact.map(Q5_10::to_bits), temperature.map(Q9_6::to_bits));
+                (0, [a, b, c, proximity.to_bits(), e, f])
+            }
+            Self::Acceleration(xyz) => {
+                let [x, y, z] = xyz.map(Q3_12::to_bits);
+                (1, [x, y, z, 0, 0, 0])
+            }
+        }
+    }
+}

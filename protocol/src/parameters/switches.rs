@@ -1,0 +1,175 @@
+//! What is switched at run time: the parameters 6 to 9, which are volatile.
+
+use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use crate::packet::WORDS;
+
+/// What a cell answers joints with, parameter 6. Volatile: a cell starts with [`Reply::Torque`].
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Reply {
+    /// Its own torque, Q3.12.
+    #[default]
+    Torque,
+    /// The sum of its own and its children's, Q7.8, in slots by depth.
+    Sum(Slots),
+}
+
+/// When sums are said.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Slots {
+    /// Width of a slot in µs.
+    pub slot_us: u16,
+    /// Depth of the deepest cell; a root's is 0. A cell at depth d speaks in slot `deepest - d`.
+    pub deepest: u8,
+    /// Whether what rounding took away is carried into a cell's next value.
+    pub carry: bool,
+}
+
+impl Reply {
+    /// The words of the parameter.
+    #[must_use]
+    pub const fn words(self) -> [i16; WORDS] {
+        match self {
+            Self::Torque => [0; WORDS],
+            Self::Sum(Slots { slot_us, deepest, carry }) => {
+                [1, slot_us.cast_signed(), deepest as i16, carry as i16, 0, 0]
+            }
+        }
+    }
+
+    /// What the words say; `None` when they cannot be: no such reply, no slot, or a depth above 253.
+    #[must_use]
+    pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
+        let [kind, slot_us, deepest, carry, ..] = words;
+        match kind {
+            0 => Some(Self::Torque),
+            1 if slot_us != 0 => Some(Self::Sum(Slots {
+                slot_us: slot_us.cast_unsigned(),
+                deepest: u8::try_from(deepest).ok().filter(|deepest| *deepest <= 253)?,
+                carry: carry == 1,
+            })),
+            _ => None,
+        }
+    }
+}
+
+/// When a cell sends what it measures without being asked, parameter 7. Volatile: a cell starts with
+/// [`Sensing::Off`].
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Sensing {
+    /// Only when a report asks for it.
+    #[default]
+    Off,
+    /// Every so many ms.
+    Continuous {
+        /// From one to the next.
+        period_ms: u16,
+    },
+    /// On change beyond a threshold, on release, and with each heartbeat.
+    Event,
+}
+
+impl Sensing {
+    /// The words of the parameter.
+    #[must_use]
+    pub const fn words(self) -> [i16; WORDS] {
+        match self {
+            Self::Off => [0; WORDS],
+            Self::Continuous { period_ms } => [1, period_ms.cast_signed(), 0, 0, 0, 0],
+            Self::Event => [2, 0, 0, 0, 0, 0],
+        }
+    }
+
+    /// What the words say; `None` when they cannot be: no such mode, or a period of 0.
+    #[must_use]
+    pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
+        match words {
+            [0, ..] => Some(Self::Off),
+            [1, period_ms, ..] if period_ms != 0 => {
+                Some(Self::Continuous { period_ms: period_ms.cast_unsigned() })
+            }
+            [2, ..] => Some(Self::Event),
+            _ => None,
+        }
+    }
+}
+
+/// Which changes of what a cell measures are events, parameter 8. Volatile: a cell starts with
+/// [`Events::default`].
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Events {
+    /// Of each contact word, in N.
+    pub contact: Q5_10,
+    /// Of the proximity.
+    pub proximity: Q1_14,
+    /// Of each temperature, in degrees Celsius.
+    pub temperature: Q9_6,
+    /// Of each axis' acceleration, in g.
+    pub acceleration: Q3_12,
+    /// What part of a threshold a value has to fall below it for a release, 0 to 1.
+    pub hysteresis: Q1_14,
+}
+
+impl Default for Events {
+    /// 0.1 N, 0.05, 0.5 °C, 0.1 g; a release is half a threshold below it.
+    fn default() -> Self {
+        Self {
+            contact: Q5_10::from_bits(102),
+            proximity: Q1_14::from_bits(819),
+            temperature: Q9_6::from_bits(32),
+            acceleration: Q3_12::from_bits(410),
+            hysteresis: Q1_14::from_bits(8_192),
+        }
+    }
+}
+
+impl Events {
+    /// The words of the parameter.
+    #[must_use]
+    pub const fn words(self) -> [i16; WORDS] {
+        [
+            self.contact.to_bits(),
+            self.proximity.to_bits(),
+            self.temperature.to_bits(),
+            self.acceleration.to_bits(),
+            self.hysteresis.to_bits(),
+            0,
+        ]
+    }
+
+    /// What the words say; `None` when one is negative, or the hysteresis above 1.
+    #[must_use]
+    pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
+        let [contact, proximity, temperature, acceleration, hysteresis, _] = words;
+        let sound = words.iter().all(|&word| word >= 0) && hysteresis <= 1 << 14;
+        sound.then_some(Self {
+            contact: Q5_10::from_bits(contact),
+            proximity: Q1_14::from_bits(proximity),
+            temperature: Q9_6::from_bits(temperature),
+            acceleration: Q3_12::from_bits(acceleration),
+            hysteresis: Q1_14::from_bits(hysteresis),
+        })
+    }
+}
+
+impl Cuts {
+    /// The words of the parameter.
+    #[must_use]
+    pub const fn words(self) -> [i16; WORDS] {
+        [self.deaf as i16, 0, 0, 0, 0, 0]
+    }
+
+    /// What the words say; other bits than those of ports are not looked at.
+    #[must_use]
+    pub const fn from_words(words: [i16; WORDS]) -> Self {
+        let [deaf, ..] = words;
+        Self { deaf: deaf.to_le_bytes()[0] & 0x1F }
+    }
+}
+
+/// Which ports of a cell hear nothing, neither messages nor sums, parameter 9: how a bench cuts a wire, in one
+/// direction at each end. Obeyed in test mode only.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Cuts {
+    /// Bit p: port p hears nothing; bit 4 is the wire to the gateway's side.
+    pub deaf: u8,
+}

@@ -1,0 +1,199 @@
+//! The tables of `docs/protocol.md` that list fields come from the schema.
+//!
+//! Each one stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test writes them
+//! instead of comparing.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
+
+use core::fmt::Write;
+
+use protocol::id::Kind;
+use protocol::message::State;
+use protocol::parameters::Parameter;
+use protocol::schema::{Field, Format, Layout, PACKETS, PORT_MESSAGES, PacketSchema, REASONS, Range};
+
+const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/protocol.md");
+
+/// Every table by its name.
+fn tables() -> [(&'static str, String); 4] {
+    let of = |kind| PACKETS.iter().find(|schema| schema.kind == kind).unwrap();
+    [
+        ("packets", packets()),
+        ("sensors", fields("page", of(Kind::Sensors).layouts)),
+        ("network", fields("page", of(Kind::Network).layouts)),
+        ("parameters", fields("parameter", of(Kind::Configured).layouts)),
+    ]
+}
+
+/// One line a kind or command.
+fn packets() -> String {
+    let head = "| identifier | name | from | node field | words | epoch byte | count byte |\n|---|---|---|---|---|---|---|\n";
+    let mut out = head.to_owned();
+    for schema in PACKETS {
+        let PacketSchema { kind, command, end, layouts, .. } = schema;
+        let first = *kind as u8;
+        let id = match (command, kind) {
+            (Some(command), _) => format!("`{first}{:02}`", *command as u8),
+            (None, Kind::Configure | Kind::Stimulus) => format!("`{first}nn`, `{first}FF`"),
+            (None, _) => format!("`{first}nn`"),
+        };
+        let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
+        let words = match layouts {
+            [] => "0".to_owned(),
+            [Layout { fields: [words, ..], .. }] => {
+                format!("{}, {}, {}", words.meaning, unit(words), format_of(words))
+            }
+            _ if is_parameter => "see [parameters](#parameters)".to_owned(),
+            _ => "a page".to_owned(),
+        };
+        let only = layouts.first().filter(|_| layouts.len() == 1).map_or(&[][..], |layout| layout.fields);
+        let at = |from: u8, to: u8| {
+            let there = end.iter().chain(only).filter(move |field| (from..to).contains(&field.at));
+            let mut there: Vec<_> = there.collect();
+            there.sort_by_key(|field| field.at);
+            let flag = |field: &Field| if field.at == 111 { "+ 0x80: " } else { "" };
+            let all: Vec<_> = there
+                .iter()
+                .map(|field| format!("{}{}{}", flag(field), field.meaning, range(field)))
+                .collect();
+            if all.is_empty() { "0".to_owned() } else { all.join("; ") }
+        };
+        let (from, node) = match kind {
+            Kind::Command => ("gateway", "command"),
+            Kind::Network => ("cell, gateway", "sender"),
+            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => ("cell", "sender"),
+            Kind::Configure | Kind::Stimulus => ("gateway", "addressee"),
+        };
+        let (name, epoch, count) = (schema.name(), at(96, 104), at(104, 112));
+        writeln!(out, "| {id} | {name} | {from} | {node} | {words} | {epoch} | {count} |").unwrap();
+    }
+    out
+}
+
+/// One line a field.
+fn fields(of: &str, layouts: &[Layout]) -> String {
+    let mut out =
+        format!("| {of} | word | field | format | unit | range | meaning |\n|---|---|---|---|---|---|---|\n");
+    for layout in layouts {
+        let parameter = Parameter::from_number(layout.number).filter(|_| of == "parameter");
+        let note = match parameter {
+            Some(Parameter::Row(0)) => " to 21: row of joint 1 to 6",
+            Some(Parameter::Row(_)) => continue,
+            Some(Parameter::Identity) => ", read only",
+            Some(Parameter::Commit) => ", write only",
+            Some(parameter) if parameter.is_volatile() => ", volatile",
+            _ => "",
+        };
+        let name = if note.starts_with(" to") { "" } else { layout.name };
+        let mut title = format!("{} {name}", layout.number).trim_end().to_owned() + note;
+        let mut row = |field: &Field, within: u8| {
+            let choices = field.names.iter().filter(|_| field.format == Format::Choice);
+            let names = choices.map(|(value, name)| format!("{value} {name}"));
+            let names = names.collect::<Vec<_>>().join(", ");
+            let meaning = if names.is_empty() {
+                field.meaning.to_owned()
+            } else {
+                format!("{}: {names}", field.meaning)
+            };
+            let place = words(field, within);
+            let name = if field.name.is_empty() { "" } else { field.bare_name() };
+            let (format, unit, range) = (format_of(field), unit(field), range(field));
+            let range = range.trim_start_matches(", ");
+            writeln!(out, "| {title} | {place} | {name} | {format} | {unit} | {range} | {meaning} |")
+                .unwrap();
+            title.clear();
+        };
+        for field in layout.fields.iter().filter(|field| !matches!(field.format, Format::Total(_))) {
+            row(field, 0);
+            if let Format::Group(group) = field.format {
+                group.iter().for_each(|part| row(part, field.at));
+            }
+        }
+    }
+    out
+}
+
+fn range(field: &Field) -> String {
+    match field.range {
+        Range::All => String::new(),
+        Range::NotNegative | Range::NotNegativeAtCommit => ", 0 or more".to_owned(),
+        Range::Within(least, greatest) if least == greatest => String::new(),
+        Range::Within(least, greatest) => format!(", {least} to {greatest}"),
+    }
+}
+
+/// The unit on the wire, where angles are in quarter turns.
+fn unit(field: &Field) -> &'static str {
+    if matches!(field.format, Format::Angle | Format::Position) { "quarter turns" } else { field.unit }
+}
+
+/// Where a field stands: `0`, `0 to 2`, `2, bits 8 to 15`.
+fn words(field: &Field, within: u8) -> String {
+    let (word, bit, width) = (usize::from(field.at / 16), field.at % 16, field.width());
+    let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
+    match (width, field.elements()) {
+        (32, _) => format!("{word}, {}", word + 1),
+        (16, 1) => word.to_string(),
+        (16, several) => format!("{word} to {}", word + several - 1),
+        _ if within > 0 || matches!(field.signal.get(..4), Some("port")) && field.at < 16 => bits,
+        _ => format!("{word}, {bits}"),
+    }
+}
+
+fn format_of(field: &Field) -> String {
+    match field.format {
+        Format::Unsigned(16) => "unsigned".to_owned(),
+        Format::Unsigned(bits) | Format::Parameter(bits) | Format::Page(bits) => {
+            format!("unsigned, {bits} bits")
+        }
+        Format::Signed | Format::Choice | Format::Reason => "signed".to_owned(),
+        Format::Flag(_) => "0 or 1".to_owned(),
+        Format::Hex => "16 bits".to_owned(),
+        Format::Fixed(bits) | Format::Threshold(bits) | Format::Saturating(bits) | Format::Total(bits) => {
+            format!("Q{}.{bits}", 15 - bits)
+        }
+        Format::Angle | Format::Position => "Q1.14".to_owned(),
+        Format::Port => "unsigned, 8 bits".to_owned(),
+        Format::Ports(..) => "bits".to_owned(),
+        Format::State => "state".to_owned(),
+        Format::Group(_) => "see below".to_owned(),
+    }
+}
+
+#[test]
+fn the_documents_tables_list_the_fields_of_the_schema() {
+    let mut document = std::fs::read_to_string(PATH).unwrap();
+    for (name, table) in tables() {
+        let begin = format!("<!-- fields: {name} -->\n");
+        let from = document.find(&begin).unwrap_or_else(|| panic!("no table {name}")) + begin.len();
+        let to = from + document[from..].find("<!-- end -->").expect("an end");
+        if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
+            document.replace_range(from..to, &table);
+        } else {
+            assert_eq!(document[from..to], table, "SKINBUS_TAKE_OVER=yes writes the tables anew");
+        }
+    }
+    if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
+        std::fs::write(PATH, document).unwrap();
+    }
+}
+
+#[test]
+fn the_document_names_every_reason_and_every_message_over_a_wire() {
+    let document = std::fs::read_to_string(PATH).unwrap();
+    for (number, why) in REASONS {
+        assert!(document.contains(&format!("\n| {number} | ")), "{number}: {why}");
+    }
+    for Layout { number, name, .. } in PORT_MESSAGES {
+        assert!(document.contains(&format!("\n| {number} | {name} | ")), "{name}");
+    }
+}
+
+#[test]
+fn the_document_names_every_bit_of_the_state() {
+    let document = std::fs::read_to_string(PATH).unwrap();
+    for (bit, name) in State::NAMES {
+        let row = format!("| {} | {} |", bit.0.trailing_zeros(), name.to_uppercase().replace('-', "_"));
+        assert!(document.contains(&row), "{row}");
+    }
+}
