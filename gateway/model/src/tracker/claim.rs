@@ -46,10 +46,9 @@ impl Claim {
 
     fn word(&self, heartbeat: &Heartbeat) -> Word {
         let claims = heartbeat.state.has(State::CLAIMING);
-        // The first packet of a life is a claim.
-        let is_first = claims && heartbeat.sent == 0;
         let Some(owner) = &self.owner else {
-            return if is_first { Word::Started { again: false } } else { Word::First };
+            // A cell claims its id for half a second at most.
+            return if claims { Word::Started { again: false } } else { Word::First };
         };
         if owner.serial != heartbeat.serial {
             return match (self.is_settled(), claims) {
@@ -61,7 +60,8 @@ impl Claim {
         }
         let back = owner.sent.wrapping_sub(heartbeat.sent);
         match back.cast_signed() {
-            _ if is_first => Word::Started { again: true },
+            // The first packet of a life is a claim.
+            _ if claims && heartbeat.sent == 0 => Word::Started { again: true },
             ..=0 => Word::Known,
             // The second heartbeat of a life is the one after the claim.
             _ if heartbeat.sent <= 1 || back > OVERTAKES => Word::Started { again: true },
