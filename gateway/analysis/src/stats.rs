@@ -8,11 +8,13 @@
 //! apart, and not with the frames.
 
 use model::decode::{BUSES, Decoded};
+use model::tracker::{Tracked, Word};
 use protocol::candump::Record;
 use protocol::fixed::Q;
 use protocol::id::CellId;
-use protocol::message::{Heartbeat, Message, NetworkPage, State, Tree};
+use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, PacketError};
+use protocol::time::Micros;
 use serde::Serialize;
 
 use self::foreign::Foreigners;
@@ -27,27 +29,20 @@ pub struct Stats {
     span: Option<(u64, u64)>,
     /// Time of the frame before.
     last: u64,
-    frames: u64,
-    backwards: u64,
+    /// What grows as frames come.
+    counts: Report,
     lanes: Vec<Lane>,
-    /// Frames of buses beyond those that are told apart.
-    beyond: u64,
-    /// Lost frames of which nobody says on which bus.
-    dropped: u64,
 }
 
 /// One bus.
 #[derive(Debug)]
 struct Lane {
-    bus: String,
-    frames: u64,
+    /// What grows as frames come.
+    counts: BusReport,
     kinds: [Count; NAMES.len()],
     wires: Count,
-    refused: RefusedFrames,
     foreign: Foreigners,
-    dropped: u64,
     joints: Option<Joints>,
-    epochs: Epochs,
     /// By the cell's place.
     cells: Vec<Option<Box<Cell>>>,
 }
@@ -110,27 +105,15 @@ impl Joints {
 /// What one cell said.
 #[derive(Debug, Default)]
 struct Cell {
-    packets: u64,
-    torques: u64,
-    sums: u64,
-    resent: u64,
+    tracked: Tracked,
+    /// What grows as packets come.
+    counts: CellReport,
     /// The epoch of the last sum.
     summed: Option<Epoch>,
-    tree: Option<Tree>,
     /// Time and epoch of the first torque and of the last.
     torque_span: Option<[(u64, Epoch); 2]>,
     /// The number of the joints that the last torque answers, while the contact lasts.
     touching: Option<u64>,
-    missed: u64,
-    repeated: u64,
-    saturated: u64,
-    heartbeats: u64,
-    refused: Option<u16>,
-    state: Option<State>,
-    /// What a heartbeat said had been sent before it, and packets since then, itself included.
-    sent: Option<(u16, u16)>,
-    lost: u64,
-    restarts: u64,
 }
 
 /// What the numbers come to.
@@ -151,7 +134,7 @@ pub struct Report {
 }
 
 /// One bus.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct BusReport {
     /// Its name.
     pub bus: String,
@@ -226,7 +209,7 @@ impl RefusedFrames {
 }
 
 /// One cell.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CellReport {
     /// Its number.
     pub node: u8,
@@ -270,28 +253,30 @@ impl Stats {
     /// Counts a frame.
     pub fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
-        self.frames += 1;
-        self.backwards += u64::from(nanos < self.last);
+        self.counts.frames += 1;
+        self.counts.times_backwards += u64::from(nanos < self.last);
         self.last = nanos;
         let (earliest, latest) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((earliest.min(nanos), latest.max(nanos)));
         match self.lane(record.interface) {
             Some(lane) => lane.take(record, decoded),
-            None => self.beyond += 1,
+            None => self.counts.frames_of_other_buses += 1,
         }
     }
 
     /// Frames were lost before this point; the bus is empty where nobody says which.
     pub fn dropped(&mut self, bus: &str, frames: u64) {
         let lane = if bus.is_empty() { None } else { self.lane(bus) };
-        match lane {
-            Some(lane) => lane.dropped = lane.dropped.saturating_add(frames),
-            None => self.dropped = self.dropped.saturating_add(frames),
-        }
+        let dropped = lane.map(|lane| &mut lane.counts.dropped);
+        let dropped = match dropped {
+            Some(dropped) => dropped,
+            None => &mut self.counts.dropped,
+        };
+        *dropped = dropped.saturating_add(frames);
     }
 
     fn lane(&mut self, bus: &str) -> Option<&mut Lane> {
-        let at = self.lanes.iter().position(|lane| lane.bus == bus).or_else(|| {
+        let at = self.lanes.iter().position(|lane| lane.counts.bus == bus).or_else(|| {
             (self.lanes.len() < BUSES).then(|| {
                 self.lanes.push(Lane::new(bus));
                 self.lanes.len() - 1
@@ -303,14 +288,11 @@ impl Stats {
     /// What it comes to so far.
     #[must_use]
     pub fn report(&self) -> Report {
-        let nanos = self.span.map_or(0, |(earliest, latest)| latest - earliest);
+        let span @ (earliest, latest) = self.span.unwrap_or_default();
         Report {
-            duration_s: seconds(nanos),
-            frames: self.frames,
-            times_backwards: self.backwards,
-            dropped: self.dropped,
-            frames_of_other_buses: self.beyond,
-            buses: self.lanes.iter().map(|lane| lane.report(self.span.unwrap_or_default())).collect(),
+            duration_s: seconds(latest - earliest),
+            buses: self.lanes.iter().map(|lane| lane.report(span)).collect(),
+            ..self.counts.clone()
         }
     }
 }
@@ -329,15 +311,11 @@ fn rate(count: u64, nanos: u64) -> Option<f64> {
 impl Lane {
     fn new(bus: &str) -> Self {
         Self {
-            bus: bus.to_owned(),
-            frames: 0,
+            counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
             kinds: [Count::default(); NAMES.len()],
             wires: Count::default(),
-            refused: RefusedFrames::default(),
             foreign: Foreigners::default(),
-            dropped: 0,
             joints: None,
-            epochs: Epochs::default(),
             cells: (0..CellId::COUNT).map(|_| None).collect(),
         }
     }
@@ -348,8 +326,8 @@ impl Lane {
             self.wires.take(nanos);
             return;
         }
-        self.frames += 1;
-        let refused = &mut self.refused;
+        self.counts.frames += 1;
+        let refused = &mut self.counts.refused;
         match decoded {
             Decoded::Wire(..) | Decoded::Half { .. } => {}
             Decoded::Message(message) => self.message(nanos, message),
@@ -380,14 +358,15 @@ impl Lane {
     }
 
     fn take_joints(&mut self, epoch: Epoch) {
-        self.epochs.first.get_or_insert(epoch.0);
-        self.epochs.last = Some(epoch.0);
+        let epochs = &mut self.counts.epochs;
+        epochs.first.get_or_insert(epoch.0);
+        epochs.last = Some(epoch.0);
         let step = self.joints.map_or(1, |last| epoch.since(last.epoch));
         match u64::try_from(step) {
-            Ok(0) => self.epochs.repeated += 1,
-            Ok(step) => self.epochs.missing += step - 1,
+            Ok(0) => epochs.repeated += 1,
+            Ok(step) => epochs.missing += step - 1,
             Err(_) => {
-                self.epochs.jumps += 1;
+                epochs.jumps += 1;
                 for cell in self.cells.iter_mut().flatten() {
                     cell.touching = None;
                 }
@@ -406,361 +385,76 @@ impl Lane {
         });
         let cells = CellId::all().zip(&self.cells);
         BusReport {
-            bus: self.bus.clone(),
-            frames: self.frames,
-            frames_per_s: rate(self.frames, latest - earliest),
+            frames_per_s: rate(self.counts.frames, latest - earliest),
             wires: self.wires.packets,
             wires_per_s: self.wires.per_s(),
             kinds: kinds.collect(),
-            epochs: self.epochs,
-            refused: self.refused,
             foreign: self.foreign.report(earliest),
-            dropped: self.dropped,
             cells: cells.filter_map(|(node, cell)| Some(cell.as_ref()?.report(node))).collect(),
+            ..self.counts.clone()
         }
     }
 }
 
 impl Cell {
     fn take(&mut self, nanos: u64, message: &Message, joints: Option<Joints>) {
-        match message {
-            Message::Torque { epoch, torque, .. } => {
-                let still = torque.iter().any(|word| *word != Q::ZERO);
-                self.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
-                self.torque(nanos, *epoch, still, joints);
+        self.counts.packets += 1;
+        let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
+        if let Message::Torque { epoch, torque, .. } = message {
+            let still = torque.iter().any(|word| *word != Q::ZERO);
+            self.counts.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
+            self.torque(nanos, *epoch, still, joints);
+        } else if let Message::Sum { epoch, torque, .. } = message {
+            self.counts.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
+            self.counts.sums += 1;
+            self.counts.resent += u64::from(self.summed.replace(*epoch) == Some(*epoch));
+        } else if let Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
+            self.counts.heartbeats += 1;
+            // An older word than the last torque does not end the contact.
+            let is_over = !heartbeat.state.has(State::ACTIVE)
+                && joints.and_then(|joints| joints.of(*epoch)) >= self.touching;
+            if matches!(word, Some(Word::Started { .. })) || is_over && word != Some(Word::Claimant) {
+                self.touching = None;
             }
-            Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                self.heartbeat(heartbeat);
-                // An older word than the last torque does not end the contact.
-                let said = joints.and_then(|joints| joints.of(*epoch));
-                if !heartbeat.state.has(State::ACTIVE) && said >= self.touching {
-                    self.touching = None;
-                }
-            }
-            Message::Sum { epoch, torque, .. } => {
-                self.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
-                self.sums += 1;
-                self.resent += u64::from(self.summed == Some(*epoch));
-                self.summed = Some(*epoch);
-            }
-            Message::Network { page: NetworkPage::Tree(tree), .. } => self.tree = Some(*tree),
-            Message::Network { .. }
-            | Message::Sensors { .. }
-            | Message::Configured { .. }
-            | Message::Halt
-            | Message::Joints { .. }
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Configure { .. }
-            | Message::Stimulus { .. } => {}
-        }
-        self.packets += 1;
-        if let Some((_, since)) = &mut self.sent {
-            *since = since.wrapping_add(1);
         }
     }
 
     fn torque(&mut self, nanos: u64, epoch: Epoch, still: bool, joints: Option<Joints>) {
-        self.torques += 1;
+        self.counts.torques += 1;
         let [first, last] = self.torque_span.unwrap_or([(nanos, epoch); 2]);
-        let again = self.torques > 1
+        let again = self.counts.torques > 1
             && last.1 == epoch
             && joints.is_some_and(|joints| joints.of(epoch) == self.touching);
-        self.repeated += u64::from(again);
+        self.counts.repeated += u64::from(again);
         self.torque_span = Some([first, (nanos, epoch)]);
         let number = joints.and_then(|joints| joints.of(epoch));
         if let (Some(before), Some(number)) = (self.touching, number) {
-            self.missed += number.saturating_sub(before + 1);
+            self.counts.missed += number.saturating_sub(before + 1);
         }
         self.touching = if still { number } else { None };
-    }
-
-    fn heartbeat(&mut self, heartbeat: &Heartbeat) {
-        self.heartbeats += 1;
-        self.refused = Some(heartbeat.rejected);
-        self.state = Some(heartbeat.state);
-        if heartbeat.state.has(State::CLAIMING) && self.packets > 0 {
-            self.restarts += 1;
-            self.touching = None;
-        } else if let Some((sent, since)) = self.sent {
-            // Below zero it was started anew, or frames stand here twice.
-            let lost = heartbeat.sent.wrapping_sub(sent).wrapping_sub(since).cast_signed();
-            self.lost += u64::try_from(lost).unwrap_or(0);
-        }
-        self.sent = Some((heartbeat.sent, 0));
     }
 
     fn report(&self, node: CellId) -> CellReport {
         let span = self.torque_span;
         let time = span.map_or(0, |[first, last]| last.0.saturating_sub(first.0));
-        let state = self.state.unwrap_or_default();
+        let (uplink, tree) = (self.tracked.account.uplink(), self.tracked.pages().tree);
+        let heartbeat = self.tracked.claim().heartbeat();
+        let says = |bit| heartbeat.is_some_and(|heartbeat| heartbeat.state.has(bit));
         CellReport {
             node: node.get(),
-            packets: self.packets,
-            torques: self.torques,
-            torques_per_s: rate(self.torques.saturating_sub(1), time),
-            sums: self.sums,
-            resent: self.resent,
-            parent: self.tree.and_then(|tree| tree.parent),
-            depth: self.tree.filter(|tree| tree.parent.is_some()).map(|tree| tree.depth),
+            torques_per_s: rate(self.counts.torques.saturating_sub(1), time),
+            parent: tree.and_then(|tree| tree.parent),
+            depth: tree.filter(|tree| tree.parent.is_some()).map(|tree| tree.depth),
             first_epoch: span.map(|[first, _]| first.1.0),
             last_epoch: span.map(|[_, last]| last.1.0),
-            missed: self.missed,
-            repeated: self.repeated,
-            saturated: self.saturated,
-            heartbeats: self.heartbeats,
-            refused: self.refused,
-            lost: self.lost,
-            restarts: self.restarts,
-            state: State::NAMES.iter().filter(|(bit, _)| state.has(*bit)).map(|(_, name)| *name).collect(),
+            refused: heartbeat.map(|heartbeat| heartbeat.rejected),
+            lost: uplink.lost,
+            restarts: uplink.restarts.into(),
+            state: State::NAMES.iter().filter(|(bit, _)| says(*bit)).map(|(_, name)| *name).collect(),
+            ..self.counts.clone()
         }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use model::decode::settle::Settler;
-    use protocol::can::{Format, Frame};
-    use protocol::candump::Timestamp;
-    use protocol::fixed::{Q3_12, Q7_8};
-    use protocol::id::Node;
-    use protocol::message;
-    use protocol::time::Micros;
-    use protocol::wire;
-
-    /// A capture that is being written.
-    #[derive(Default)]
-    struct Tape {
-        stats: Stats,
-        settler: Option<Settler<(u64, String, Frame)>>,
-        ms: u64,
-    }
-
-    impl Tape {
-        fn frame(&mut self, bus: &str, frame: Frame) {
-            self.ms += 1;
-            let nanos = self.ms * 1_000_000;
-            let settler = self.settler.get_or_insert_with(|| Settler::new(None));
-            settler.push(Micros(nanos / 1_000), bus, &frame, (nanos, bus.to_owned(), frame));
-            settler.finish();
-            while let Some(((nanos, bus, frame), decoded)) = settler.pop() {
-                let time = Timestamp { nanos, nine_digits: false };
-                self.stats.take(&Record { time, interface: &bus, frame, direction: None }, &decoded);
-            }
-        }
-
-        fn say(&mut self, message: &Message) {
-            let frame = message.encode().frames(Format::Fd).next().unwrap();
-            self.frame("vcan0", frame);
-        }
-
-        fn joints(&mut self, epoch: u8) {
-            self.say(&Message::Joints {
-                epoch: Epoch(epoch),
-                joints: message::Joints { in_use: 6, ..message::Joints::default() },
-            });
-        }
-
-        fn torque(&mut self, epoch: u8, word: i16) {
-            self.say(&Message::Torque {
-                from: cell(),
-                epoch: Epoch(epoch),
-                torque: [Q3_12::from_bits(word); 6],
-            });
-        }
-
-        fn heartbeat(&mut self, epoch: u8, sent: u16, state: State) {
-            let heartbeat = Heartbeat { sent, state, rejected: 3, ..Heartbeat::default() };
-            let page = NetworkPage::Heartbeat(heartbeat);
-            self.say(&Message::Network { from: Node::Cell(cell()), epoch: Epoch(epoch), page });
-        }
-
-        fn bus(&self) -> BusReport {
-            self.stats.report().buses.remove(0)
-        }
-
-        fn cell(&self) -> CellReport {
-            self.bus().cells.remove(0)
-        }
-    }
-
-    fn cell() -> CellId {
-        CellId::new(12).unwrap()
-    }
-
-    #[test]
-    fn joints_that_are_missing_or_come_again_are_counted_around_the_corner() {
-        let mut tape = Tape::default();
-        for epoch in [254, 255, 1, 1, 4, 0] {
-            tape.joints(epoch);
-        }
-        let expected = Epochs { first: Some(254), last: Some(0), missing: 1 + 2, repeated: 1, jumps: 1 };
-        assert_eq!(tape.bus().epochs, expected);
-        assert_eq!(
-            tape.bus().kinds,
-            [KindReport { kind: "joints", packets: 6, packets_per_s: Some(1_000.0) }]
-        );
-    }
-
-    #[test]
-    fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not() {
-        let mut tape = Tape::default();
-        for epoch in 250..=255 {
-            tape.joints(epoch);
-        }
-        tape.torque(250, 7);
-        tape.torque(251, 7);
-        tape.torque(254, 7);
-        tape.torque(254, 7);
-        tape.joints(0);
-        tape.joints(1);
-        tape.torque(1, 0);
-        // Not in contact: silence is right.
-        for epoch in 2..=9 {
-            tape.joints(epoch);
-        }
-        tape.torque(9, i16::MAX);
-        let cell = tape.cell();
-        assert_eq!((cell.missed, cell.repeated, cell.saturated), (2 + 2, 1, 1));
-        assert_eq!((cell.first_epoch, cell.last_epoch, cell.torques), (Some(250), Some(9), 6));
-        // A heartbeat after it says that the contact has ended: its last word was lost.
-        tape.heartbeat(9, 0, State::default());
-        tape.joints(10);
-        tape.joints(11);
-        tape.joints(12);
-        tape.torque(12, 7);
-        assert_eq!(tape.cell().missed, 4);
-    }
-
-    #[test]
-    fn an_old_heartbeat_does_not_end_a_contact() {
-        let mut tape = Tape::default();
-        tape.joints(1);
-        tape.joints(2);
-        tape.torque(2, 7);
-        tape.heartbeat(1, 1, State::default());
-        tape.joints(3);
-        tape.joints(4);
-        tape.torque(4, 7);
-        assert_eq!(tape.cell().missed, 1);
-    }
-
-    #[test]
-    fn what_a_cell_counts_and_is_not_here_is_lost() {
-        let mut tape = Tape::default();
-        tape.heartbeat(0, 65_534, State::CONFIGURED);
-        tape.joints(1);
-        tape.torque(1, 7);
-        tape.heartbeat(1, 0, State::CONFIGURED);
-        assert_eq!(tape.cell().lost, 0);
-        tape.heartbeat(1, 4, State::CONFIGURED.with(State::ACTIVE, true));
-        let cell = tape.cell();
-        assert_eq!((cell.lost, cell.heartbeats, cell.refused, cell.restarts), (3, 3, Some(3), 0));
-        assert_eq!(cell.state, ["configured", "active"]);
-        tape.heartbeat(1, 0, State::CLAIMING);
-        tape.heartbeat(1, 1, State::CONFIGURED);
-        let cell = tape.cell();
-        assert_eq!((cell.lost, cell.restarts), (3, 1));
-    }
-
-    #[test]
-    fn what_is_refused_is_counted_by_reason_and_bus() {
-        let mut tape = Tape::default();
-        let packet = "20C##1001000F80100000000000000070175D6";
-        for text in [
-            packet,
-            packet,
-            "1F334455#11",
-            "20C#R8",
-            "20000004#0001000000000000",
-            "20D##1001000F80100000000000000070175D6",
-            "20C##10011",
-            "20C##1001000F80100000000000000070175D7",
-            "20C#001000F801000000",
-        ] {
-            let frame = protocol::candump::parse_frame(text).unwrap();
-            for bus in ["can0", "can1"] {
-                tape.frame(bus, frame);
-            }
-        }
-        tape.stats.dropped("can1", 5);
-        tape.stats.dropped("", 7);
-        let report = tape.stats.report();
-        let expected = RefusedFrames { length: 1, crc: 1, meaning: 0, incomplete: 1 };
-        for bus in &report.buses {
-            assert_eq!((bus.refused, bus.frames), (expected, 9));
-            let ForeignFrames { frames, standard, extended, remote, error, .. } = bus.foreign;
-            assert_eq!((frames, standard, extended, remote, error), (4, 1, 1, 1, 1));
-            let ids: Vec<_> = bus.foreign.identifiers.iter().map(|id| (id.id.as_str(), id.of)).collect();
-            let (data, remote, error) = (FrameType::Data, FrameType::Remote, FrameType::Error);
-            assert_eq!(ids, [("20D", data), ("1F334455", data), ("20C", remote), ("20000004", error)]);
-            assert_eq!(bus.foreign.identifiers[0].wrong_crc, 1);
-        }
-        let dropped: Vec<_> = report.buses.iter().map(|bus| (bus.bus.as_str(), bus.dropped)).collect();
-        assert_eq!((dropped, report.dropped), (vec![("can0", 0), ("can1", 5)], 7));
-    }
-
-    #[test]
-    fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
-        let mut tape = Tape::default();
-        let lane = wire::Lane { wire: 3, back: false };
-        tape.joints(0);
-        tape.frame("vcan0", lane.frame(wire::PortMessage::Join));
-        tape.frame("vcan0", lane.frame(wire::PortMessage::Leave));
-        tape.joints(1);
-        let bus = tape.bus();
-        assert_eq!((bus.frames, bus.wires, bus.wires_per_s), (2, 2, Some(1_000.0)));
-        assert_eq!(
-            (bus.refused, bus.kinds.len(), tape.stats.report().frames),
-            (RefusedFrames::default(), 1, 4)
-        );
-    }
-
-    #[test]
-    fn sums_said_again_and_the_place_in_the_tree_are_told() {
-        let mut tape = Tape::default();
-        let sum = |epoch, word, count| {
-            let torque = [Q7_8::from_bits(word); 6];
-            Message::Sum { from: cell(), epoch: Epoch(epoch), torque, count }
-        };
-        for message in [sum(1, 5, 1), sum(1, 6, 2), sum(2, i16::MAX, 2)] {
-            tape.say(&message);
-        }
-        assert_eq!((tape.cell().parent, tape.cell().depth), (None, None));
-        let tree = |parent, depth| {
-            let page = NetworkPage::Tree(Tree { parent, depth, ..Tree::default() });
-            Message::Network { from: Node::Cell(cell()), epoch: Epoch(2), page }
-        };
-        tape.say(&tree(Some(7), 3));
-        let cell = tape.cell();
-        assert_eq!((cell.sums, cell.resent, cell.saturated), (3, 1, 1));
-        assert_eq!((cell.parent, cell.depth), (Some(7), Some(3)));
-        tape.say(&tree(None, 3));
-        assert_eq!((tape.cell().parent, tape.cell().depth), (None, None));
-    }
-
-    #[test]
-    fn memory_is_bounded_whatever_buses_a_capture_names() {
-        let mut tape = Tape::default();
-        let frame = Frame::classic(1, &[]).unwrap();
-        for bus in 0..1_000 {
-            tape.frame(&format!("can{bus}"), frame);
-        }
-        let report = tape.stats.report();
-        assert_eq!((report.buses.len(), report.frames_of_other_buses, report.frames), (BUSES, 936, 1_000));
-    }
-
-    #[test]
-    fn times_that_run_backwards_are_counted_and_the_duration_is_that_of_all() {
-        let mut tape = Tape::default();
-        for ms in [1_000, 3_000, 2_000] {
-            tape.ms = ms;
-            tape.joints(0);
-        }
-        let report = tape.stats.report();
-        assert_eq!((report.times_backwards, report.frames), (1, 3));
-        assert!((report.duration_s - 2.0).abs() < 1e-9, "{report:?}");
-    }
-}
+mod tests;

@@ -3,6 +3,7 @@
 //! | module | what |
 //! |---|---|
 //! | [`decode`] | frames into packets, and packets into words |
+//! | [`tracker`] | what is known of a cell by what it says: who it is, whether it started again, what is lost |
 //! | [`table`] | what a live bus has said: each cell, and sums |
 //! | [`central`] | torques computed centrally, in double precision |
 //! | [`network`] | the tree of cells, and whether it is as the skin says |
@@ -21,3 +22,4 @@ pub mod stimuli;
 pub mod table;
 #[doc(hidden)]
 pub mod testing;
+pub mod tracker;

@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 
 use protocol::can::Format;
-use protocol::id::Node;
 use protocol::message::{Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Tree};
 use protocol::time::{Micros, Span};
+
+use crate::tracker::{Claim, Word};
 
 /// What one cell has said.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -20,8 +21,9 @@ pub struct Cell {
     pub tree: Option<Tree>,
     /// What its ports lead to.
     pub ports: Option<Ports>,
-    /// The serial number that spoke under this number before the present one.
+    /// The serial number that claims its number, or spoke under it before.
     pub other: Option<u32>,
+    claim: Claim,
     /// When it said its last word.
     last: Micros,
 }
@@ -31,6 +33,25 @@ impl Cell {
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
         now.since(self.last)
+    }
+
+    fn says(&mut self, page: &NetworkPage) {
+        match *page {
+            NetworkPage::Heartbeat(heartbeat) => {
+                let before = self.claim.serial();
+                if self.claim.hear(&heartbeat) == Word::Claimant {
+                    self.other = Some(heartbeat.serial);
+                } else if before.is_some_and(|before| before != heartbeat.serial) {
+                    // Whatever is known is the other's.
+                    *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
+                }
+                self.heartbeat = self.claim.heartbeat();
+            }
+            NetworkPage::Heard(heard) => self.heard = Some(heard),
+            NetworkPage::Refused(refused) => self.refused = Some(refused),
+            NetworkPage::Tree(tree) => self.tree = Some(tree),
+            NetworkPage::Ports(ports) => self.ports = Some(ports),
+        }
     }
 }
 
@@ -51,22 +72,9 @@ impl Listing {
 
     /// Takes a message, which came in frames of this format.
     pub fn hear(&mut self, now: Micros, format: Format, message: &Message) {
-        let from = match *message {
-            Message::Network { from: Node::Cell(cell), .. }
-            | Message::Torque { from: cell, .. }
-            | Message::Sum { from: cell, .. }
-            | Message::Sensors { from: cell, .. }
-            | Message::Configured { from: cell, .. } => cell,
-            Message::Joints { .. } | Message::Network { .. } => {
-                self.gateway = true;
-                return;
-            }
-            Message::Halt
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Configure { .. }
-            | Message::Stimulus { .. } => return,
+        let Some(from) = message.encode().id.sender() else {
+            self.gateway |= matches!(message, Message::Joints { .. } | Message::Network { .. });
+            return;
         };
         self.format.get_or_insert(format);
         let cell = self.cells.entry(from.get()).or_default();
@@ -96,27 +104,8 @@ impl Listing {
     /// Whether a cell with this serial number was heard, and under which number.
     #[must_use]
     pub fn number_of(&self, serial: u32) -> Option<u8> {
-        let is = |cell: &Cell| cell.heartbeat.is_some_and(|heartbeat| heartbeat.serial == serial);
+        let is = |cell: &Cell| cell.claim.serial() == Some(serial);
         self.cells.iter().find(|(_, cell)| is(cell)).map(|(&number, _)| number)
-    }
-}
-
-impl Cell {
-    fn says(&mut self, page: &NetworkPage) {
-        match *page {
-            NetworkPage::Heartbeat(heartbeat) => {
-                let before = self.heartbeat.map(|before| before.serial);
-                if let Some(before) = before.filter(|&before| before != heartbeat.serial) {
-                    // Whatever is known is the other's.
-                    *self = Self { other: Some(before), last: self.last, ..Self::default() };
-                }
-                self.heartbeat = Some(heartbeat);
-            }
-            NetworkPage::Heard(heard) => self.heard = Some(heard),
-            NetworkPage::Refused(refused) => self.refused = Some(refused),
-            NetworkPage::Tree(tree) => self.tree = Some(tree),
-            NetworkPage::Ports(ports) => self.ports = Some(ports),
-        }
     }
 }
 
@@ -146,7 +135,7 @@ pub fn ports(ports: &Ports) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::id::CellId;
+    use protocol::id::{CellId, Node};
     use protocol::message::{PortState, State};
     use protocol::packet::Epoch;
 
@@ -195,5 +184,18 @@ mod tests {
 
     fn parent_of(tree: Tree) -> String {
         parent(&tree)
+    }
+
+    #[test]
+    fn a_cell_whose_number_another_one_claims_stays_and_both_are_named() {
+        let mut listing = Listing::new();
+        let owner = Heartbeat { serial: 7, sent: 40, state: State::CONFIGURED, ..Heartbeat::default() };
+        let claim = Heartbeat { serial: 8, state: State::CLAIMING, ..Heartbeat::default() };
+        let heard = NetworkPage::Heard(Heard::default());
+        for page in [NetworkPage::Heartbeat(owner), heard, NetworkPage::Heartbeat(claim)] {
+            listing.hear(Micros(0), Format::Fd, &says(3, page));
+        }
+        let (_, cell) = listing.cells().next().unwrap();
+        assert_eq!((cell.heartbeat, cell.heard, cell.other), (Some(owner), Some(Heard::default()), Some(8)));
     }
 }

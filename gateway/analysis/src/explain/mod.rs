@@ -11,11 +11,9 @@
 //! the exact one that makes the very word. What a capture does not tell is named in [`Explanation::missing`] and
 //! left open.
 
-mod felt;
 mod watch;
 
-pub use felt::Origin;
-pub use watch::{Asked, CellMoment, Moment, NotFound, Watch};
+pub use watch::{Asked, CellMoment, Moment, NotFound, Origin, Watch};
 
 use protocol::fixed::{Q, Q3_12};
 use protocol::message::{SkinSensors, State};

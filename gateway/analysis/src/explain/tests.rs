@@ -230,3 +230,21 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
                     come, and is not used; the words are without it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
+
+#[test]
+fn a_claim_of_a_number_that_is_taken_changes_nothing() {
+    let skin = skin();
+    let claim = {
+        let heartbeat = Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() };
+        let page = NetworkPage::Heartbeat(heartbeat);
+        Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
+    };
+    let mut said =
+        vec![heartbeat(0x266D), press(From::Next, 1.0), joints(6), joints(7), torque(7, [-1075, 3195])];
+    let without = explained(&skin, &said, first(7)).unwrap();
+    // In the place of other joints, so that the times are the same.
+    said[2] = claim;
+    let with = explained(&skin, &said, first(7)).unwrap();
+    assert_eq!(with, without);
+    assert_eq!((with.missing, with.cells.len()), (Vec::new(), 1));
+}

@@ -1,21 +1,51 @@
 //! Finds the joints that are asked about, and what each cell felt and answered then.
 
+use model::tracker::{Claim, Contact, LATEST, PerCell, Word, is_late};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::message::{
+    Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
+use serde::Serialize;
 use thiserror::Error;
 
-use super::felt::{Felt, Origin};
-
-/// Joints after the ones that are asked about, within which a torque may come.
-const LATE: u32 = 4;
 /// Joints after them, within which late torques and the configurations of cells are waited for.
 const PATIENCE: u32 = 32;
 /// Runs of epochs that an error names.
 const RUNS: usize = 8;
+
+/// How it is known what a cell felt.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "kebab-case", tag = "by")]
+pub enum Origin {
+    /// It had just started: nothing touched it.
+    Start {
+        /// When it said so.
+        at_ns: u64,
+    },
+    /// Its mode was written, which forgets what it felt.
+    Mode {
+        /// When.
+        at_ns: u64,
+    },
+    /// A stimulus.
+    Stimulus {
+        /// When it was sent.
+        at_ns: u64,
+        /// The epoch from which on it was to hold; none for the next joints.
+        from_epoch: Option<u8>,
+        /// Whether it came after the joints of that epoch.
+        late: bool,
+    },
+    /// The cell said itself what it felt.
+    Said {
+        /// When.
+        at_ns: u64,
+    },
+}
 
 /// Which joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -113,7 +143,7 @@ struct Lane {
     moment: Option<Moment>,
     /// Joints since the moment.
     since: u32,
-    cells: Vec<Cell>,
+    cells: PerCell<Cell>,
     runs: Vec<Run>,
     /// Runs beyond those that are kept.
     further_runs: u64,
@@ -121,9 +151,8 @@ struct Lane {
 
 #[derive(Clone, Debug, Default)]
 struct Cell {
-    felt: Felt,
-    test_mode: Option<bool>,
-    state: Option<State>,
+    claim: Claim,
+    contact: Contact<Origin>,
     hash: Option<u16>,
 }
 
@@ -139,11 +168,7 @@ impl<'a> Watch<'a> {
     /// Begins before the first frame.
     #[must_use]
     pub fn new(skin: &'a Skin, asked: Asked) -> Self {
-        let lane = |bus| Lane {
-            cells_here: skin.cells_of(bus).next().is_some(),
-            cells: vec![Cell::default(); CellId::COUNT],
-            ..Lane::default()
-        };
+        let lane = |bus| Lane { cells_here: skin.cells_of(bus).next().is_some(), ..Lane::default() };
         let lanes = (0..skin.buses.len()).map(lane).collect();
         Self { skin, asked, first: None, lanes, others: Vec::new() }
     }
@@ -249,7 +274,7 @@ impl Lane {
         let known = |moment: &Moment| moment.cells.iter().all(settled);
         self.moment
             .as_ref()
-            .is_some_and(|moment| self.since >= PATIENCE || self.since >= LATE && known(moment))
+            .is_some_and(|moment| self.since >= PATIENCE || self.is_too_late() && known(moment))
     }
 
     fn take(&mut self, nanos: u64, after: u64, message: &Message, asked: Asked, robot: usize) {
@@ -264,16 +289,14 @@ impl Lane {
                 }
             }
             Message::Stimulus { to, from, page } => {
-                self.each(to, |cell| {
-                    if cell.test_mode != Some(false) {
-                        cell.felt.push(nanos, from, page, last);
-                    }
-                });
+                let from_epoch = if let From::Epoch(epoch) = from { Some(epoch.0) } else { None };
+                let origin = Origin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
+                self.cells.named(to).iter_mut().for_each(|cell| cell.contact.push(from, page, origin, last));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
                 if Parameter::from_number(number) == Some(Parameter::Mode) {
-                    let obeys = words.first() == Some(&1);
-                    self.each(to, |cell| cell.mode(obeys, Origin::Mode { at_ns: nanos }));
+                    let (obeys, origin) = (words.first() == Some(&1), Origin::Mode { at_ns: nanos });
+                    self.cells.named(to).iter_mut().for_each(|cell| cell.mode(obeys, origin));
                 }
             }
             Message::Configured { from, answer: Answer::Value { number, written, words }, .. } => {
@@ -283,35 +306,25 @@ impl Lane {
                     Some(Parameter::Identity) => identity,
                     Some(_) | None => return,
                 };
-                self.each(Node::Cell(from), |cell| cell.hash = Some(hash));
+                if let Some(cell) = self.cells.get_mut(from) {
+                    cell.hash = Some(hash);
+                }
                 self.learn(from, hash);
             }
             Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                let state = heartbeat.state;
-                let obeys = state.has(State::TEST_MODE);
-                self.each(Node::Cell(from), |cell| {
-                    if state.has(State::CLAIMING) && heartbeat.sent == 0 {
-                        cell.mode(obeys, Origin::Start { at_ns: nanos });
-                    } else if !obeys {
-                        cell.felt.forget();
-                    }
-                    cell.test_mode = Some(obeys);
-                    cell.state = Some(state);
-                    cell.hash = Some(heartbeat.configuration);
-                });
-                self.learn(from, heartbeat.configuration);
+                if self.cells.get_mut(from).is_some_and(|cell| cell.heartbeat(nanos, &heartbeat)) {
+                    self.learn(from, heartbeat.configuration);
+                }
             }
-            Message::Sensors { from, epoch, page: SensorPage::Skin(skin) } => {
-                if last == Some(epoch) || last.is_none() {
-                    self.each(Node::Cell(from), |cell| {
-                        if cell.test_mode != Some(false) {
-                            cell.felt.said(nanos, skin);
-                        }
-                    });
+            Message::Sensors { from, epoch, page: page @ SensorPage::Skin(skin) } => {
+                let origin = Origin::Said { at_ns: nanos };
+                let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
+                if let Some(cell) = cell.filter(|_| last.is_none_or(|last| last == epoch)) {
+                    cell.contact.learn(page, origin);
                 }
                 // A cell that measures has read its sensors at these very joints.
                 if let Some((cell, _)) = self.answering(from, epoch, asked) {
-                    cell.felt.get_or_insert((skin, Origin::Said { at_ns: nanos }));
+                    cell.felt.get_or_insert((skin, origin));
                 }
             }
             Message::Torque { from, epoch, torque } => {
@@ -343,10 +356,10 @@ impl Lane {
         } else if epoch == asked.epoch && after >= asked.from_ns {
             self.occurrences += 1;
             if self.occurrences == asked.occurrence {
-                let cells = self.cells.iter().map(|Cell { felt, test_mode, state, hash }| CellMoment {
-                    felt: felt.now(),
-                    test_mode: *test_mode,
-                    state: *state,
+                let cells = self.cells.iter().map(|(_, Cell { claim, contact, hash })| CellMoment {
+                    felt: contact.skin().copied(),
+                    test_mode: contact.obeys(),
+                    state: claim.heartbeat().map(|heartbeat| heartbeat.state),
                     hash: *hash,
                     ..CellMoment::default()
                 });
@@ -358,9 +371,7 @@ impl Lane {
 
     fn latch(&mut self, epoch: Epoch) {
         self.last = Some(epoch);
-        for cell in &mut self.cells {
-            cell.felt.latch(epoch);
-        }
+        self.cells.iter_mut().for_each(|(_, cell)| cell.contact.latch(epoch, |_| {}));
     }
 
     /// Notes which epochs there are.
@@ -376,9 +387,14 @@ impl Lane {
         }
     }
 
+    /// Whether so many joints have come since the moment that answers are of no use any more.
+    const fn is_too_late(&self) -> bool {
+        self.since as usize > LATEST
+    }
+
     /// The cell at the moment, when it speaks of it; and whether that is in time.
     fn answering(&mut self, from: CellId, epoch: Epoch, asked: Asked) -> Option<(&mut CellMoment, bool)> {
-        let in_time = self.since < LATE;
+        let in_time = !self.is_too_late();
         let moment = self.moment.as_mut().filter(|_| epoch == asked.epoch)?;
         Some((moment.cells.get_mut(from.index())?, in_time))
     }
@@ -390,24 +406,29 @@ impl Lane {
             cell.hash.get_or_insert(hash);
         }
     }
-
-    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Cell)) {
-        for (cell, state) in CellId::all().zip(&mut self.cells) {
-            if to.names(cell) {
-                act(state);
-            }
-        }
-    }
 }
 
 impl Cell {
-    /// It begins to obey stimuli, or to measure.
+    /// Takes a heartbeat under the cell's node id; whether it is the cell's.
+    fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
+        let obeys = heartbeat.state.has(State::TEST_MODE);
+        match self.claim.hear(heartbeat) {
+            Word::Claimant | Word::Overtaken => return false,
+            Word::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
+            Word::First | Word::Known if !obeys => self.contact.reset(),
+            Word::First | Word::Known => {}
+        }
+        self.contact.set_obeys(obeys);
+        self.hash = Some(heartbeat.configuration);
+        true
+    }
+
+    /// It begins to obey stimuli, and nothing touches it; or to measure, and what it feels does not come by the bus.
     fn mode(&mut self, obeys: bool, origin: Origin) {
-        self.test_mode = Some(obeys);
+        self.contact.reset();
+        self.contact.set_obeys(obeys);
         if obeys {
-            self.felt.clear(origin);
-        } else {
-            self.felt.forget();
+            self.contact.learn(SensorPage::Skin(SkinSensors::default()), origin);
         }
     }
 }

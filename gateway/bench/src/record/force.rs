@@ -13,14 +13,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::can::{Format, Frame};
-use protocol::id::{CellId, Id, Kind, Node};
-use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State};
+use protocol::id::{Id, Kind};
+use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{self, Epoch, Half, Packet, Paired};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
-
-use model::stimuli::Waiting;
 
 /// A frame that somebody saw.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,7 +41,7 @@ struct Said {
 
 type Kept = Option<Arc<Said>>;
 
-/// A page that a cell feels: who said it, the last joints before that, and those from which on it holds.
+/// Where a page that a cell feels stands: who said it, the last joints before that, and those from which on it holds.
 #[derive(Clone, Debug)]
 struct Felt {
     said: Arc<Said>,
@@ -53,6 +52,7 @@ struct Felt {
 /// What is in force for one cell.
 #[derive(Clone, Debug, Default)]
 struct Cell {
+    claim: Claim,
     /// Its last heartbeat.
     heartbeat: Kept,
     /// The first and the last heartbeat of its last start.
@@ -67,11 +67,7 @@ struct Cell {
     /// By number: the last writes since then, and a commit that has not been answered.
     staged: BTreeMap<u8, Arc<Said>>,
     asked: Kept,
-    /// The skin's page and the acceleration, once something is known of them.
-    felt: [Option<Felt>; 2],
-    waiting: Waiting<(usize, Felt)>,
-    /// It was told to measure: then it refuses stimuli.
-    measures: bool,
+    contact: Contact<Felt>,
 }
 
 /// The packets of one bus that are in force.
@@ -79,7 +75,7 @@ struct Cell {
 pub struct InForce {
     /// Packets so far.
     places: u64,
-    cells: Vec<Cell>,
+    cells: PerCell<Cell>,
     joints: Option<(Epoch, Arc<Said>)>,
     /// The last halt or resume.
     halt: Kept,
@@ -93,7 +89,7 @@ impl Default for InForce {
     fn default() -> Self {
         Self {
             places: 0,
-            cells: vec![Cell::default(); CellId::COUNT],
+            cells: PerCell::default(),
             joints: None,
             halt: None,
             halves: vec![(Half::NONE, None); 1 << 11],
@@ -104,23 +100,30 @@ impl Default for InForce {
 
 impl Cell {
     /// It has started, or was told its mode: it forgets what it felt.
-    fn clear(&mut self, measures: bool) {
-        self.felt = [None, None];
-        self.waiting.clear();
-        self.measures = measures;
+    fn clear(&mut self, obeys: bool) {
+        self.contact.reset();
+        self.contact.set_obeys(obeys);
     }
 
-    /// What a start forgets.
-    fn start(&mut self, said: &Arc<Said>, is_first: bool) {
-        self.clear(false);
-        self.switches.clear();
-        self.staged.clear();
-        self.asked = None;
-        let [first, last] = &mut self.starts;
-        if is_first {
-            *first = Some(Arc::clone(said));
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, said: &Arc<Said>) {
+        let word = self.claim.hear(heartbeat);
+        if word == Word::Claimant {
+            return;
         }
-        *last = Some(Arc::clone(said));
+        if let Word::Started { .. } = word {
+            self.clear(true);
+            self.switches.clear();
+            self.staged.clear();
+            self.asked = None;
+        }
+        if heartbeat.state.has(State::CLAIMING) {
+            let [first, last] = &mut self.starts;
+            if heartbeat.sent == 0 {
+                *first = Some(Arc::clone(said));
+            }
+            *last = Some(Arc::clone(said));
+        }
+        self.heartbeat = Some(Arc::clone(said));
     }
 
     fn write(&mut self, number: u8, said: &Arc<Said>, obeys: bool) {
@@ -133,7 +136,7 @@ impl Cell {
             self.staged.insert(number, Arc::clone(said));
         }
         if parameter == Some(Parameter::Mode) {
-            self.clear(!obeys);
+            self.clear(obeys);
         }
     }
 
@@ -147,37 +150,21 @@ impl Cell {
     }
 
     /// What the cell itself says that it feels, when nothing else is known of it.
-    fn learn(&mut self, page: usize, felt: Felt) {
+    fn learn(&mut self, page: SensorPage, felt: Felt) {
         let joints = felt.before.as_ref().map_or(0, |joints| joints.place);
-        let waits = self.waiting.iter().any(|(_, (_, felt))| felt.said.place < joints);
-        if let Some(known @ None) = self.felt.get_mut(page).filter(|_| !waits) {
-            *known = Some(felt);
-        }
-    }
-
-    fn latch(&mut self, epoch: Epoch, joints: &Arc<Said>) {
-        for (page, felt) in self.waiting.latch(epoch) {
-            if let Some(known) = self.felt.get_mut(page) {
-                *known = Some(Felt { since: Some(Arc::clone(joints)), ..felt });
-            }
+        if !self.contact.waiting().iter().any(|(_, _, felt)| felt.said.place < joints) {
+            self.contact.learn(page, felt);
         }
     }
 
     fn packets(&self) -> impl Iterator<Item = &Arc<Said>> {
         let said = [&self.heartbeat, &self.tree, &self.commit, &self.asked].into_iter().chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
-        let felt = self.felt.iter().flatten().chain(self.waiting.iter().map(|(_, (_, felt))| felt));
+        let waiting = self.contact.waiting().iter().map(|(_, _, felt)| felt);
+        let felt = self.contact.latched().map(|(_, felt)| felt).chain(waiting);
         let felt =
             felt.flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
         said.flatten().chain(written).chain(felt)
-    }
-}
-
-/// Where a page stands in [`Cell::felt`].
-const fn place_of(page: &SensorPage) -> usize {
-    match page {
-        SensorPage::Skin(_) => 0,
-        SensorPage::Acceleration(_) => 1,
     }
 }
 
@@ -228,49 +215,50 @@ impl InForce {
 
     fn hear(&mut self, message: &Message, said: &Arc<Said>) {
         let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
-        let before = self.joints.as_ref().map(|(_, joints)| Arc::clone(joints));
+        let felt = || Felt {
+            said: Arc::clone(said),
+            before: self.joints.as_ref().map(|(_, joints)| Arc::clone(joints)),
+            since: None,
+        };
         match *message {
             Message::Joints { epoch, .. } => {
                 // Cells drop joints of the last epoch.
                 if last != Some(epoch) {
-                    self.cells.iter_mut().for_each(|cell| cell.latch(epoch, said));
+                    for (_, cell) in self.cells.iter_mut() {
+                        cell.contact.latch(epoch, |felt| felt.since = Some(Arc::clone(said)));
+                    }
                 }
                 self.joints = Some((epoch, Arc::clone(said)));
             }
             Message::Halt | Message::Resume => self.halt = Some(Arc::clone(said)),
-            Message::Network { from: Node::Cell(from), page, .. } => {
-                let Some(cell) = self.cells.get_mut(from.index()) else { return };
-                match page {
-                    NetworkPage::Heartbeat(heartbeat) => {
-                        if heartbeat.state.has(State::CLAIMING) {
-                            cell.start(said, heartbeat.sent == 0);
-                        }
-                        cell.heartbeat = Some(Arc::clone(said));
-                    }
-                    NetworkPage::Tree(_) => cell.tree = Some(Arc::clone(said)),
-                    NetworkPage::Heard(_) | NetworkPage::Refused(_) | NetworkPage::Ports(_) => {}
-                }
+            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                self.cells.named(from).iter_mut().for_each(|cell| cell.heartbeat(&heartbeat, said));
+            }
+            Message::Network { from, page: NetworkPage::Tree(_), .. } => {
+                self.cells.named(from).iter_mut().for_each(|cell| cell.tree = Some(Arc::clone(said)));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
-                self.each(to, |cell| cell.write(number, said, words.first() == Some(&1)));
+                let obeys = words.first() == Some(&1);
+                self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, said, obeys));
             }
             Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. } => {
-                if number == Parameter::Commit.number() {
-                    self.each(Node::Cell(from), Cell::commit);
+                if let Some(cell) = self.cells.get_mut(from).filter(|_| number == Parameter::Commit.number())
+                {
+                    cell.commit();
                 }
             }
             Message::Stimulus { to, from, page } => {
-                let felt = Felt { said: Arc::clone(said), before, since: None };
-                self.each(to, |cell| {
-                    if !cell.measures {
-                        cell.waiting.push(from, (place_of(&page), felt.clone()), last);
-                    }
-                });
+                let felt = felt();
+                self.cells
+                    .named(to)
+                    .iter_mut()
+                    .for_each(|cell| cell.contact.push(from, page, felt.clone(), last));
             }
             Message::Sensors { from, epoch, page } => {
-                if last.is_none_or(|last| last == epoch) {
-                    let felt = Felt { said: Arc::clone(said), before, since: None };
-                    self.each(Node::Cell(from), |cell| cell.learn(place_of(&page), felt.clone()));
+                let felt = felt();
+                if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch))
+                {
+                    cell.learn(page, felt);
                 }
             }
             Message::Sync
@@ -283,19 +271,11 @@ impl InForce {
         }
     }
 
-    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Cell)) {
-        for (cell, it) in CellId::all().zip(&mut self.cells) {
-            if to.names(cell) {
-                act(it);
-            }
-        }
-    }
-
     /// All of them, in the bus' order.
     #[must_use]
     pub fn frames(&self) -> Vec<Seen> {
         let joints = self.joints.iter().map(|(_, joints)| joints);
-        let packets = self.cells.iter().flat_map(Cell::packets).chain(joints).chain(&self.halt);
+        let packets = self.cells.iter().flat_map(|(_, cell)| cell.packets()).chain(joints).chain(&self.halt);
         let ordered: BTreeMap<_, _> = packets.map(|said| (said.place, said)).collect();
         ordered.values().flat_map(|said| said.frames.iter().flatten().copied()).collect()
     }
@@ -305,7 +285,8 @@ impl InForce {
 mod tests {
     use super::*;
     use protocol::fixed::{Q1_14, Q5_10};
-    use protocol::message::{From, Heartbeat, Joints, SkinSensors, Tree};
+    use protocol::id::{CellId, Node};
+    use protocol::message::{From, Joints, SkinSensors, Tree};
     use protocol::packet::WORDS;
 
     fn say(force: &mut InForce, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
@@ -431,5 +412,23 @@ mod tests {
         assert_eq!(take(5, theirs[0]), [false; 3]);
         assert_eq!(take(6, ours[0]), [true, true, false]);
         assert_eq!(take(7, ours[1]), [false; 3]);
+    }
+
+    #[test]
+    fn a_claim_of_a_number_that_is_taken_takes_nothing_out_of_force() {
+        let to = Node::Cell(CellId::new(3).unwrap());
+        let beat = |serial, sent, state| {
+            let beat = Heartbeat { serial, sent, state, ..Heartbeat::default() };
+            Message::Network { from: to, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
+        };
+        let write =
+            |number| Message::Configure { to, tag: 0, request: Request::Write { number, words: [1; 6] } };
+        let said =
+            [beat(7, 40, State::CONFIGURED), write(7), write(1), joints(1), stimulus(3, 1.0, 2), joints(2)];
+        let mut force = InForce::default();
+        (0..).zip(&said).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
+        let before = force.frames();
+        say(&mut force, 9, Format::Fd, &beat(9, 0, State::CLAIMING));
+        assert_eq!(force.frames(), before);
     }
 }

@@ -202,9 +202,8 @@ impl Live {
     /// What makes the cells of a bus that are there forget what they felt, and obey what comes.
     fn forgetting(&self, lane: usize) -> Vec<Message> {
         let judge = self.hall.judge();
-        let obeys = |cell: &super::judge::Present| {
-            cell.is_settled() && cell.heartbeat.is_some_and(|heartbeat| heartbeat.state.has(Flags::TEST_MODE))
-        };
+        let obeys =
+            |cell: &super::judge::Present| cell.claim.is_settled() && cell.claim.says(Flags::TEST_MODE);
         let obeying: Vec<_> =
             judge.present(lane).filter(|(_, cell)| obeys(cell)).map(|(cell, _)| cell).collect();
         obeying.into_iter().map(|cell| mode(Node::Cell(cell), true)).collect()

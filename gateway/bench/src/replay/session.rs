@@ -106,7 +106,7 @@ impl<'a> Session<'a> {
         let judge = self.hall.judge();
         let lanes = 0..self.routes.names.len();
         let there: usize =
-            lanes.map(|lane| judge.present(lane).filter(|(_, cell)| cell.is_settled()).count()).sum();
+            lanes.map(|lane| judge.present(lane).filter(|(_, cell)| cell.claim.is_settled()).count()).sum();
         if there == 0 && (self.options.expect || self.options.lockstep || wearing.is_some()) {
             let names: Vec<_> = self.routes.names.iter().map(|(_, name)| name.as_str()).collect();
             return Err(RunError::Failed(format!(

@@ -315,7 +315,7 @@ impl Buses {
             let settled = |(lane, cells): (usize, &BTreeSet<CellId>)| {
                 judge
                     .present(lane)
-                    .filter(|(cell, present)| cells.contains(cell) && present.is_settled())
+                    .filter(|(cell, present)| cells.contains(cell) && present.claim.is_settled())
                     .count()
             };
             let there: usize = wanted.iter().enumerate().map(settled).sum();
@@ -408,9 +408,10 @@ impl Checks {
         let (mut checked, mut absent, mut other) = (0_usize, String::new(), String::new());
         let (mut others, mut count) = (0_usize, 0_usize);
         for (lane, ((bus, name), cells)) in self.routes.names.iter().zip(self.recorded()).enumerate() {
-            let there = judge.present(lane).filter(|(_, present)| present.is_settled());
-            let there: Vec<_> =
-                there.filter_map(|(cell, present)| Some((cell, present.heartbeat?.configuration))).collect();
+            let there = judge.present(lane).filter(|(_, present)| present.claim.is_settled());
+            let there: Vec<_> = there
+                .filter_map(|(cell, present)| Some((cell, present.claim.heartbeat()?.configuration)))
+                .collect();
             let missing: Vec<_> =
                 cells.iter().copied().filter(|cell| !there.iter().any(|(it, _)| it == cell)).collect();
             if !missing.is_empty() {
@@ -471,10 +472,9 @@ impl Checks {
                 let recorded = self.survey.buses.get(*bus).and_then(|bus| bus.cells.get(cell));
                 recorded.is_some_and(|recorded| !recorded.measured)
             };
-            let now = judge.present(lane).filter(|(_, present)| {
-                let state = present.heartbeat.map(|heartbeat| heartbeat.state);
-                present.is_settled() && state.is_some_and(|state| !state.has(Flags::TEST_MODE))
-            });
+            let now = judge
+                .present(lane)
+                .filter(|(_, present)| present.claim.is_settled() && !present.claim.says(Flags::TEST_MODE));
             now.map(|(cell, _)| cell).filter(obeyed).collect()
         };
         self.routes.names.iter().enumerate().map(measures).collect()
@@ -505,7 +505,7 @@ pub(super) fn into_test_mode(
         let obeys = |(lane, cells): (usize, &Vec<CellId>)| {
             cells.iter().all(|cell| {
                 let mut present = judge.present(lane).filter(|(it, _)| it == cell);
-                present.any(|(_, it)| it.heartbeat.is_some_and(|beat| beat.state.has(Flags::TEST_MODE)))
+                present.any(|(_, it)| it.claim.says(Flags::TEST_MODE))
             })
         };
         if measuring.iter().enumerate().all(obeys) {

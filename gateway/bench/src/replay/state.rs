@@ -10,156 +10,84 @@
 //! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
 //! were said.
 
+use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{
-    From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State as Flags,
-};
+use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 
 use super::touched::Touched;
-use model::stimuli::Waiting;
 
 /// Messages since the last joints that are kept as they were said.
 const SINCE: usize = 16_384;
 
-/// What one cell feels, by the protocol's rules.
-#[derive(Clone, Debug, Default)]
-struct Feeling {
-    /// In force, once something has been said of it.
-    skin: Option<SkinSensors>,
-    acceleration: Option<[Q3_12; 3]>,
-    pending: Waiting<SensorPage>,
-    /// It was told to measure: then it refuses stimuli.
-    measures: bool,
+/// What one cell feels.
+type Feeling = Contact<()>;
+
+/// Nothing touches it, in either mode.
+fn clear(feeling: &mut Feeling, obeys: bool) {
+    feeling.reset();
+    feeling.set_obeys(obeys);
 }
 
-impl Feeling {
-    fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
-        if !self.measures {
-            self.pending.push(from, page, last);
-        }
+/// Whether something touches it from the joints of an epoch on, if that is known.
+fn is_touched_from(feeling: &Feeling, epoch: Epoch) -> Option<bool> {
+    let touches =
+        |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
+    if feeling.waiting().is_empty() {
+        return feeling.skin().map(touches);
     }
+    let mut then = feeling.clone();
+    then.latch(epoch, |()| {});
+    then.skin().map(touches)
+}
 
-    fn latch(&mut self, epoch: Epoch) {
-        let mut pending = std::mem::take(&mut self.pending);
-        pending.latch(epoch).for_each(|page| self.feel(page));
-        self.pending = pending;
-    }
-
-    const fn feel(&mut self, page: SensorPage) {
-        match page {
-            SensorPage::Skin(skin) => self.skin = Some(skin),
-            SensorPage::Acceleration(acceleration) => self.acceleration = Some(acceleration),
-        }
-    }
-
-    /// What the cell itself says that it feels, when nothing else is known of it.
-    fn learn(&mut self, page: SensorPage) {
-        let unknown = match page {
-            SensorPage::Skin(_) => self.skin.is_none(),
-            SensorPage::Acceleration(_) => self.acceleration.is_none(),
-        };
-        if unknown && self.pending.is_empty() {
-            self.feel(page);
-        }
-    }
-
-    /// Whether something touches it from the joints of an epoch on, if that is known.
-    fn is_touched_from(&self, epoch: Epoch) -> Option<bool> {
-        let touches = |skin: &SkinSensors| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
-        if self.pending.is_empty() {
-            return self.skin.as_ref().map(touches);
-        }
-        let mut then = self.clone();
-        then.latch(epoch);
-        then.skin.as_ref().map(touches)
-    }
-
-    /// Nothing, in either mode.
-    fn clear(&mut self, measures: bool) {
-        *self = Self { measures, ..Self::default() };
-    }
-
-    /// The pages in force.
-    fn pages(&self) -> impl Iterator<Item = SensorPage> + use<> {
-        let skin = self.skin.filter(|skin| *skin != SkinSensors::default()).map(SensorPage::Skin);
-        let acceleration = self.acceleration.filter(|xyz| *xyz != [Q3_12::ZERO; 3]);
-        skin.into_iter().chain(acceleration.map(SensorPage::Acceleration))
-    }
+/// The pages that are latched, without those that say what every cell feels at its start.
+fn pages(feeling: &Feeling) -> impl Iterator<Item = SensorPage> {
+    let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
+    feeling.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 
 /// What held on a bus before its last joints.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 struct Before {
     /// Parameters that were written, in order, without those that were written over.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
-    /// By the cell's place.
-    cells: Vec<Feeling>,
+    cells: PerCell<Feeling>,
 }
 
 /// What holds on one bus.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct State {
     before: Before,
+    /// Who has which node id.
+    claims: PerCell<Claim>,
     /// The last joints. Whether a cell was in contact at them depends on what held before.
     joints: Option<(Epoch, Joints)>,
     /// What was said since then, as it was said.
     since: Vec<Message>,
 }
 
-impl Default for State {
-    fn default() -> Self {
-        let cells = vec![Feeling::default(); CellId::COUNT];
-        let before = Before { writes: Vec::new(), halted: false, cells };
-        Self { before, joints: None, since: Vec::new() }
-    }
-}
-
 impl Before {
     /// Takes in what was said after the joints `last`.
     fn take(&mut self, message: &Message, last: Option<Epoch>) {
-        match *message {
-            Message::Halt => self.halted = true,
-            Message::Resume => self.halted = false,
-            Message::Stimulus { to, from, page } => self.each(to, |cell| cell.push(from, page, last)),
-            Message::Configure { to, request: Request::Write { number, words }, .. } => {
-                self.write(to, number, *message);
-                if number == Parameter::Mode.number() {
-                    self.each(to, |cell| cell.clear(words.first() != Some(&1)));
-                }
-            }
-            Message::Configure { .. }
-            | Message::Joints { .. }
-            | Message::Network { .. }
-            | Message::Sync
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Configured { .. } => {}
-        }
-    }
-
-    fn latch(&mut self, epoch: Epoch) {
-        for cell in &mut self.cells {
-            cell.latch(epoch);
-        }
-    }
-
-    fn each(&mut self, to: Node, mut act: impl FnMut(&mut Feeling)) {
-        for (cell, feeling) in CellId::all().zip(&mut self.cells) {
-            if to.names(cell) {
-                act(feeling);
+        if let Message::Halt | Message::Resume = message {
+            self.halted = *message == Message::Halt;
+        } else if let Message::Stimulus { to, from, page } = *message {
+            self.cells.named(to).iter_mut().for_each(|cell| cell.push(from, page, (), last));
+        } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
+            self.write(to, number, *message);
+            if number == Parameter::Mode.number() {
+                self.cells.named(to).iter_mut().for_each(|cell| clear(cell, words.first() == Some(&1)));
             }
         }
     }
 
-    /// A cell that has started anew has forgotten what it felt, and what was switched.
-    fn start_anew(&mut self, cell: Node) {
-        self.each(cell, |cell| cell.clear(false));
+    /// A cell that has started again has forgotten what it felt, and what was switched.
+    fn start_again(&mut self, cell: Node) {
+        self.cells.named(cell).iter_mut().for_each(|cell| clear(cell, true));
         self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
     }
 
@@ -187,55 +115,60 @@ fn is_volatile(number: u8) -> bool {
 impl State {
     /// Takes in the bus' next message.
     pub fn take(&mut self, message: &Message) {
-        match *message {
+        if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
-            Message::Joints { epoch, joints } => {
-                if self.joints.is_none_or(|(last, _)| last != epoch) {
-                    self.fold();
-                    self.joints = Some((epoch, joints));
-                }
+            if self.joints.is_none_or(|(last, _)| last != epoch) {
+                self.fold();
+                self.joints = Some((epoch, joints));
             }
-            Message::Halt
-            | Message::Resume
-            | Message::Stimulus { .. }
-            | Message::Configure { request: Request::Write { .. }, .. } => {
-                if self.since.len() == SINCE {
-                    self.fold();
-                }
-                self.since.push(*message);
+        } else if let Message::Halt
+        | Message::Resume
+        | Message::Stimulus { .. }
+        | Message::Configure { request: Request::Write { .. }, .. } = message
+        {
+            if self.since.len() == SINCE {
+                self.fold();
             }
-            Message::Sensors { from, epoch, page } => {
-                if self.joints.is_none_or(|(last, _)| last == epoch) {
-                    self.before.each(Node::Cell(from), |cell| cell.learn(page));
-                }
+            self.since.push(*message);
+        } else if let Message::Sensors { from, epoch, page } = *message {
+            // What the cell itself says that it feels, when nothing else is known of it.
+            let cell = self.before.cells.get_mut(from).filter(|cell| cell.waiting().is_empty());
+            if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
+                cell.learn(page, ());
             }
-            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. }
-                if heartbeat.state.has(Flags::CLAIMING) =>
-            {
-                self.before.start_anew(from);
-                let stimulus = |it: &Message| matches!(it, Message::Stimulus { to, .. } if *to == from);
-                let switch = |it: &Message| matches!(it, Message::Configure { to, request: Request::Write { number, .. }, .. } if *to == from && is_volatile(*number));
-                self.since.retain(|message| !stimulus(message) && !switch(message));
+        } else if let Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
+            let started = |claim: &mut Claim| matches!(claim.hear(heartbeat), Word::Started { .. });
+            if self.claims.named(*from).iter_mut().any(started) {
+                self.start_again(*from);
             }
-            Message::Configure { .. }
-            | Message::Network { .. }
-            | Message::Sync
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Configured { .. } => {}
         }
+    }
+
+    fn start_again(&mut self, cell: Node) {
+        self.before.start_again(cell);
+        let is_forgotten = |message: &Message| {
+            let feels = matches!(message, Message::Stimulus { to, .. } if *to == cell);
+            let switched = matches!(message, Message::Configure { to, request: Request::Write { number, .. }, .. } if *to == cell && is_volatile(*number));
+            feels || switched
+        };
+        self.since.retain(|message| !is_forgotten(message));
     }
 
     /// What was said until now holds before what comes.
     fn fold(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
-            self.before.latch(epoch);
+            self.before.cells.iter_mut().for_each(|(_, cell)| cell.latch(epoch, |()| {}));
         }
         for message in self.since.drain(..) {
             self.before.take(&message, last);
         }
+    }
+
+    /// Who has a node id.
+    #[must_use]
+    pub fn claim(&self, cell: CellId) -> Option<&Claim> {
+        self.claims.get(cell)
     }
 
     /// The epoch of the last joints.
@@ -249,8 +182,8 @@ impl State {
     pub fn touched(&self) -> Touched {
         let mut touched = Touched::default();
         let Some((epoch, _)) = self.joints else { return touched };
-        for (cell, feeling) in CellId::all().zip(&self.before.cells) {
-            if let Some(is_touched) = feeling.is_touched_from(epoch) {
+        for (cell, feeling) in self.before.cells.iter() {
+            if let Some(is_touched) = is_touched_from(feeling, epoch) {
                 touched.insert(cell, is_touched);
             }
         }
@@ -261,7 +194,7 @@ impl State {
     #[must_use]
     pub fn is_fresh(&self) -> bool {
         let Before { writes, halted, cells } = &self.before;
-        let felt = cells.iter().any(|cell| cell.pages().next().is_some() || !cell.pending.is_empty());
+        let felt = cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.waiting().is_empty());
         !felt && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
     }
 
@@ -283,15 +216,15 @@ impl State {
         let (cut, others): (Vec<_>, Vec<_>) = writes.iter().partition(cuts);
         let mut messages: Vec<_> = others.iter().chain(&cut).map(|(_, _, message)| *message).collect();
         messages.push(Message::Resume);
-        let known: Vec<_> = CellId::all().zip(feelings).filter(|(cell, _)| cells(*cell)).collect();
+        let known: Vec<_> = feelings.iter().filter(|(cell, _)| cells(*cell)).collect();
         let stimulus = |cell, from, page| Message::Stimulus { to: Node::Cell(cell), from, page };
         let felt: Vec<_> = known
             .iter()
-            .flat_map(|(cell, feeling)| feeling.pages().map(|page| stimulus(*cell, From::Next, page)))
+            .flat_map(|(cell, feeling)| pages(feeling).map(|page| stimulus(*cell, From::Next, page)))
             .collect();
         let pending = known
             .iter()
-            .flat_map(|(cell, it)| it.pending.iter().map(|&(from, page)| stimulus(*cell, from, page)));
+            .flat_map(|(cell, it)| it.waiting().iter().map(|&(from, page, ())| stimulus(*cell, from, page)));
         let pending: Vec<_> = pending.collect();
         let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
             epoch: epoch.plus(0_u8.wrapping_sub(steps)),
@@ -319,7 +252,7 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::message::Heartbeat;
+    use protocol::message::{Heartbeat, State as Flags};
 
     fn press(newtons: f64) -> SensorPage {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
@@ -490,5 +423,26 @@ mod tests {
         state.take(&joints(1));
         let messages = state.restoring(|it| it.get() == 7, None);
         assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, From::Next, 1.0), joints(1)]);
+    }
+
+    #[test]
+    fn a_claim_of_a_number_that_is_taken_takes_nothing_away() {
+        let says = |serial, sent, state| {
+            let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
+            Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }
+        };
+        let (owner, claim) = (says(7, 40, Flags::CONFIGURED), says(9, 0, Flags::CLAIMING));
+        let write = |number| Message::Configure {
+            to: Node::Cell(cell(1)),
+            tag: 0,
+            request: Request::Write { number, words: [1; 6] },
+        };
+        let said =
+            [owner, write(7), to(1, From::Next, 1.0), joints(1), joints(2), to(1, From::Next, 2.0), write(8)];
+        let whole = restored(&said);
+        for at in 1..=said.len() {
+            let (before, after) = said.split_at(at);
+            assert_eq!(restored(&[before, &[claim], after].concat()), whole, "a claim after {at} messages");
+        }
     }
 }

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use model::tracker::{Account, DEAD_AFTER, Tracked, Word};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
@@ -16,7 +17,7 @@ use model::decode::{Decoded, Decoder};
 use trace::capture::InForce;
 
 /// A cell that says nothing for so long is not there, in ns.
-const SILENT_NS: u64 = 600_000_000;
+const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
 /// A part of a capture, in ns after its first frame.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -79,8 +80,9 @@ pub struct Bus {
 }
 
 /// What is known of a cell from before the capture.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug, Default)]
 struct Before {
+    tracked: Tracked,
     /// When it was heard last, in ns since 1970.
     heard: u64,
     hash: Known<u16>,
@@ -106,18 +108,27 @@ pub struct Cell {
     accounted: Vec<(u64, u64)>,
     /// Whether counters account for anything on its bus; else whatever is lacking is a difference.
     is_accounted: bool,
+    tracked: Tracked,
     /// Since when it claims its number, which it does after each start.
     claims: Option<u64>,
-    /// Packets since the last heartbeat, which says how many were sent before it.
-    counted: Option<(u16, u64)>,
     /// Its counters at the last report, the joints until then, and the time of the last of them.
     report: Option<(Heard, u64, u64)>,
 }
 
-/// Something that may have been learnt too late.
+/// Where a frame stands.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Place {
+    /// Before the part that is replayed.
+    Before,
+    In,
+    After,
+}
+
+/// Something that may have been learnt too late.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Known<T> {
     /// Nothing has been said of it.
+    #[default]
     No,
     /// It has changed before anything was said of it.
     TooLate,
@@ -158,23 +169,20 @@ impl Survey {
         let bus = self.bus(record.interface);
         bus.frames += 1;
         bus.has_fd |= record.frame.format() == Format::Fd;
-        if let (Ok(id), Decoded::Message(_) | Decoded::Meaningless { .. }) =
-            (data_id(&record.frame), &decoded)
-            && let Some(cell) = id.sender()
-        {
+        let from = data_id(&record.frame).ok().and_then(Id::sender);
+        if let (Some(cell), Decoded::Message(_) | Decoded::Meaningless { .. }) = (from, &decoded) {
             bus.heard(cell, nanos);
         }
-        match decoded {
-            Decoded::Message(message) => {
-                let format = record.frame.format();
-                bus.format.get_or_insert(format);
-                bus.take(&message, nanos, nanos < begins, (begins..ends).contains(&nanos));
-            }
-            Decoded::Foreign(_)
-            | Decoded::Wire(..)
-            | Decoded::Half { .. }
-            | Decoded::Damaged { .. }
-            | Decoded::Meaningless { .. } => {}
+        if let Decoded::Message(message) = decoded {
+            bus.format.get_or_insert(record.frame.format());
+            let place = if nanos < begins {
+                Place::Before
+            } else if nanos < ends {
+                Place::In
+            } else {
+                Place::After
+            };
+            bus.take(&message, from, nanos, place);
         }
     }
 
@@ -241,34 +249,24 @@ impl Bus {
 
     /// Takes in what was said before the capture and is in force at its beginning.
     fn take_before(&mut self, message: &Message, nanos: u64) {
-        match *message {
-            Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                let is_settled = !heartbeat.state.has(Flags::CLAIMING);
-                let measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
-                let hash = if is_settled { Known::Yes(heartbeat.configuration) } else { Known::No };
-                self.before.insert(from, Before { heard: nanos, hash, measures });
+        if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
+            *message
+        {
+            let is_settled = !heartbeat.state.has(Flags::CLAIMING);
+            let before = self.before.entry(from).or_default();
+            if before.tracked.hear(Micros(nanos / 1_000), message, None).word != Some(Word::Claimant) {
+                before.heard = nanos;
+                before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
+                before.hash = if is_settled { Known::Yes(heartbeat.configuration) } else { Known::No };
             }
-            Message::Configure { to, request: Request::Write { number, words }, .. } => {
-                for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.names(**cell)) {
-                    if number == Parameter::Mode.number() {
-                        before.measures = words.first() != Some(&1);
-                    } else if number == Parameter::Commit.number() {
-                        before.hash = Known::No;
-                    }
+        } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
+            for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.names(**cell)) {
+                if number == Parameter::Mode.number() {
+                    before.measures = words.first() != Some(&1);
+                } else if number == Parameter::Commit.number() {
+                    before.hash = Known::No;
                 }
             }
-            Message::Halt
-            | Message::Joints { .. }
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. }
-            | Message::Stimulus { .. } => {}
         }
     }
 
@@ -277,56 +275,23 @@ impl Bus {
         self.cells.entry(cell).or_insert_with(|| Cell::new(nanos, before)).hear(nanos);
     }
 
-    fn take(&mut self, message: &Message, nanos: u64, is_before: bool, is_in_part: bool) {
-        if is_before {
+    fn take(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: Place) {
+        if place == Place::Before {
             self.state.take(message);
         }
-        match *message {
-            Message::Joints { epoch, joints } => {
-                self.joints += 1;
-                self.last_joints = self.last_joints.max(nanos);
-                if is_in_part {
-                    self.first_joints.get_or_insert((epoch, joints));
-                }
+        self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
+        self.sums += u64::from(matches!(message, Message::Sum { .. }));
+        let joints = (self.joints, self.last_joints);
+        if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
+            cell.take(message, nanos, place, joints, self.at_report);
+        } else if let Message::Joints { epoch, joints } = *message {
+            self.joints += 1;
+            self.last_joints = self.last_joints.max(nanos);
+            if place == Place::In {
+                self.first_joints.get_or_insert((epoch, joints));
             }
-            Message::Report => self.at_report = Some((self.joints, self.last_joints)),
-            Message::Sum { .. } => self.sums += 1,
-            Message::Network { from: Node::Cell(from), page, .. } => {
-                let (at_report, joints) = (self.at_report, (self.joints, self.last_joints));
-                self.is_accounted |= matches!(page, NetworkPage::Heard(_));
-                let Some(cell) = self.cells.get_mut(&from) else { return };
-                match page {
-                    NetworkPage::Heartbeat(heartbeat) => {
-                        cell.claim(&heartbeat, nanos, joints);
-                        cell.heartbeat(&heartbeat, is_before, is_in_part);
-                    }
-                    NetworkPage::Heard(heard) => cell.report(heard, at_report),
-                    NetworkPage::Refused(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
-                }
-            }
-            // Configured anew before its first heartbeat: what it computed with before, nobody knows.
-            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. }
-                if number == Parameter::Commit.number() =>
-            {
-                if let Some(cell) = self.cells.get_mut(&from)
-                    && (is_before || cell.hash == Known::No)
-                {
-                    cell.hash = if is_before { Known::No } else { Known::TooLate };
-                }
-            }
-            Message::Sensors { .. }
-            | Message::Halt
-            | Message::Sync
-            | Message::Resume
-            | Message::Torque { .. }
-            | Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. }
-            | Message::Stimulus { .. } => {}
-        }
-        // After a heartbeat has been read: what it says was sent is what was sent before it.
-        if let Some(cell) = message.encode().id.sender().and_then(|cell| self.cells.get_mut(&cell)) {
-            cell.count();
+        } else if *message == Message::Report {
+            self.at_report = Some(joints);
         }
     }
 
@@ -342,6 +307,9 @@ impl Cell {
         // A cell that has just spoken before the capture was there when it began.
         let first =
             before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
+        let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
+        // What it sent between the two is not known to be lost.
+        tracked.account = Account::default();
         Self {
             hash: before.map_or(Known::No, |before| before.hash),
             measured: before.is_some_and(|before| before.measures),
@@ -351,8 +319,8 @@ impl Cell {
             untaken: 0,
             accounted: Vec::new(),
             is_accounted: false,
+            tracked,
             claims: None,
-            counted: None,
             report: None,
         }
     }
@@ -367,41 +335,60 @@ impl Cell {
 
     /// The capture is at its end.
     fn end(&mut self, nanos: u64) {
+        self.unrecorded = self.tracked.account.uplink().lost;
         let from = self.claims.unwrap_or(self.heard.1);
         if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
             self.silences.push((from, u64::MAX));
         }
     }
 
-    /// While it claims its number it answers nothing, and after a start its counters begin anew.
-    fn claim(&mut self, heartbeat: &Heartbeat, nanos: u64, (joints, last): (u64, u64)) {
+    /// Takes in what it says, after so many joints of which the last was at some time; a report was asked for last after
+    /// others.
+    fn take(
+        &mut self,
+        message: &Message,
+        nanos: u64,
+        place: Place,
+        joints: (u64, u64),
+        at_report: Option<(u64, u64)>,
+    ) {
+        let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
+        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
+            match word {
+                Some(Word::Claimant | Word::Overtaken) | None => return,
+                // After a start its counters begin anew.
+                Some(Word::Started { .. }) => self.report = Some((Heard::default(), joints.0, joints.1)),
+                Some(Word::First | Word::Known) => {}
+            }
+            self.heartbeat(heartbeat, nanos, place);
+        } else if let Message::Network { page: NetworkPage::Heard(heard), .. } = *message {
+            self.report(heard, at_report);
+        } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
+            *message
+            && number == Parameter::Commit.number()
+        {
+            // Configured anew before its first heartbeat: what it computed with before, nobody knows.
+            self.hash = match self.hash {
+                _ if place == Place::Before => Known::No,
+                Known::No => Known::TooLate,
+                known @ (Known::TooLate | Known::Yes(_)) => known,
+            };
+        }
+    }
+
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: Place) {
+        // While it claims its number it answers nothing.
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
-            self.counted = None;
-            self.report = Some((Heard::default(), joints, last));
-        } else if let Some(since) = self.claims.take() {
+            return;
+        }
+        if let Some(since) = self.claims.take() {
             self.silences.push((since, nanos));
         }
-    }
-
-    /// One packet more.
-    const fn count(&mut self) {
-        if let Some((_, packets)) = &mut self.counted {
-            *packets += 1;
-        }
-    }
-
-    fn heartbeat(&mut self, heartbeat: &Heartbeat, is_before: bool, is_in_part: bool) {
-        let settled = !heartbeat.state.has(Flags::CLAIMING);
-        if let Some((sent, packets)) = self.counted {
-            let difference = u64::from(heartbeat.sent.wrapping_sub(sent));
-            self.unrecorded += difference.saturating_sub(packets);
-        }
-        self.counted = Some((heartbeat.sent, 0));
-        if settled && (is_before || self.hash == Known::No) {
+        if place == Place::Before || self.hash == Known::No {
             self.hash = Known::Yes(heartbeat.configuration);
         }
-        self.measured |= settled && is_in_part && !heartbeat.state.has(Flags::TEST_MODE);
+        self.measured |= place == Place::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
     /// Counters that were asked for at some joints. When that was before the capture, nobody knows which joints they

@@ -175,7 +175,7 @@ impl Commission {
             tasks,
             by_serial,
             elsewhere,
-            roster: Roster::new(),
+            roster: Roster::default(),
             phase: Phase::Listen(now + LISTEN),
             calls: VecDeque::new(),
             call: None,
@@ -435,7 +435,7 @@ impl Commission {
         let fits = self.roster.all().count() <= self.room;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
         let ours = |serial| known(serial).is_some_and(|task| !is_failed(task.stage));
-        fits && (matches!(ask, Ask::Read(_)) || self.roster.all().all(|(_, seat)| ours(seat.serial)))
+        fits && (matches!(ask, Ask::Read(_)) || self.roster.all().all(|(_, serial)| ours(serial)))
     }
 
     /// Writes that are the same for all cells that need any.
@@ -521,12 +521,12 @@ impl Commission {
                 }
             },
         };
-        let stranger = |(number, seat): (CellId, roster::Seat)| Stranger {
+        let stranger = |(number, serial): (CellId, u32)| Stranger {
             number,
-            serial: seat.serial,
-            belongs: self.elsewhere.get(&seat.serial).cloned(),
+            serial,
+            belongs: self.elsewhere.get(&serial).cloned(),
         };
-        let unknown = self.roster.all().filter(|(_, seat)| !self.by_serial.contains_key(&seat.serial));
+        let unknown = self.roster.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
         Report {
             cells: self.tasks.iter().map(cell).collect(),
             strangers: unknown.map(stranger).collect(),

@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
+use model::tracker::{Claim, Word};
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, State as Flags};
+use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, WORDS};
 
 use super::WINDOW;
@@ -22,8 +23,8 @@ const AT_THE_END: u64 = 8;
 /// A cell as it is on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Present {
-    /// Its last heartbeat.
-    pub heartbeat: Option<Heartbeat>,
+    /// Who it is, and its last heartbeat.
+    pub claim: Claim,
     /// Its counters when they came first, and last.
     pub heard: Option<(Heard, Heard)>,
     /// Whether it is waited for no longer: it did not answer.
@@ -32,14 +33,6 @@ pub struct Present {
     pub(super) done: u64,
     /// Heartbeats since the last announcement.
     pub(super) heartbeats: u32,
-}
-
-impl Present {
-    /// Whether its number is its own, and so it answers.
-    #[must_use]
-    pub fn is_settled(&self) -> bool {
-        self.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(Flags::CLAIMING))
-    }
 }
 
 /// Something of the capture, and the same of now.
@@ -221,6 +214,38 @@ impl Lane {
         self.rounds.get_mut(usize::try_from(at).ok()?)
     }
 
+    /// The round of the latest recorded joints of an epoch.
+    pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut Round> {
+        let number = self.recorded.get(usize::from(epoch.0)).copied().flatten()?;
+        self.round(number)
+    }
+
+    /// The announcement of the latest joints of an epoch.
+    fn asked(&self, epoch: Epoch) -> Option<Asked> {
+        self.asked.get(usize::from(epoch.0)).copied().flatten()
+    }
+
+    /// The round that was asked last under an epoch, and its number.
+    pub(super) fn asked_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
+        let number = self.asked(epoch)?.round?;
+        Some((number, self.round(number)?))
+    }
+
+    /// Why a torque or sum of the part has no joints in it, if that is counted.
+    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Lacking) {
+        if self.is_earlier(epoch) {
+            lacking.joints_earlier += 1;
+        } else if !self.rounds.is_empty() {
+            lacking.joints_unrecorded += 1;
+        }
+    }
+
+    /// All that was announced so far is to be done with another word of each cell.
+    pub(super) fn announce(&mut self) {
+        self.announcements += 1;
+        self.roll.values_mut().for_each(|present| present.heartbeats = 0);
+    }
+
     /// Forgets recorded replies to what was not sent. What was sent after the last joints nobody knows, so replies to
     /// that are not missed.
     pub(super) fn forget_the_unsent(&mut self) {
@@ -289,8 +314,13 @@ impl Lane {
         }
     }
 
+    /// Whether the cell that has a node id in the capture claims it only.
+    pub(super) fn is_claiming(&self, cell: CellId) -> bool {
+        self.state.claim(cell).is_some_and(|claim| !claim.is_settled())
+    }
+
     /// Whether a reply of this epoch, which no joints of the part have had yet, answers joints from before it.
-    pub(super) fn is_earlier(&self, epoch: Epoch) -> bool {
+    fn is_earlier(&self, epoch: Epoch) -> bool {
         let rounds = self.rounds_so_far() - self.first_round;
         let last = if rounds == 0 { self.state.last_epoch() } else { self.earlier };
         self.begins_later && rounds < WINDOW && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
@@ -319,22 +349,24 @@ impl Lane {
 
     /// Where its sums go as it says now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
-        let last = self.asked.get(usize::from(epoch.0)).copied().flatten().and_then(|asked| asked.round);
+        let last = self.asked(epoch).and_then(|asked| asked.round);
         self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
     pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
-        let announcement = self.asked.get(usize::from(epoch.0)).copied().flatten();
+        let announcement = self.asked(epoch);
         let present = self.roll.entry(cell).or_default();
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
-                present.heartbeat = Some(heartbeat);
+                if present.claim.hear(&heartbeat) == Word::Claimant {
+                    return;
+                }
                 present.is_given_up = false;
                 present.heartbeats += 1;
                 if let Some(asked) = announcement {
                     present.done = present.done.max(asked.announcement);
                 }
-                if heartbeat.state.has(Flags::CLAIMING) {
+                if !present.claim.is_settled() {
                     self.hear_parent(cell, epoch, None);
                 }
             }
@@ -357,7 +389,7 @@ impl Lane {
     /// The cells that are waited for.
     pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
         let waits =
-            |present: &Present| present.is_settled() && !present.is_given_up && !self.has_done(present);
+            |present: &Present| present.claim.is_settled() && !present.is_given_up && !self.has_done(present);
         self.roll.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
     }
 }

@@ -18,7 +18,7 @@ mod tally;
 use std::collections::BTreeMap;
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State as Flags};
+use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
@@ -82,31 +82,25 @@ impl Judge {
             return;
         };
         lane.record_state(message, is_in_part);
-        if let (Message::Configured { from, tag, answer }, true) = (*message, is_in_part)
-            && is_compared(answer)
-            && !lane.record_answer(from, tag, answer)
-        {
-            tally.lacking.asked_earlier += 1;
-        }
         match *message {
+            Message::Configured { from, tag, answer }
+                if is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer) =>
+            {
+                tally.lacking.asked_earlier += 1;
+            }
             Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Tree(tree) } => {
                 lane.record_parent(cell, epoch, tree.parent);
             }
-            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Heartbeat(heartbeat) }
-                if heartbeat.state.has(Flags::CLAIMING) =>
+            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Heartbeat(_) }
+                if lane.is_claiming(cell) =>
             {
                 lane.record_parent(cell, epoch, None);
             }
-            Message::Sum { from, epoch, torque, count } => {
-                let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
-                let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
-                match number.and_then(|number| lane.round(number)) {
-                    Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
-                    None if is_in_part && is_earlier => tally.lacking.joints_earlier += 1,
-                    None if is_in_part && has_rounds => tally.lacking.joints_unrecorded += 1,
-                    None => {}
-                }
-            }
+            Message::Sum { from, epoch, torque, count } => match lane.recorded_round(epoch) {
+                Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
+                None if is_in_part => lane.count_without_joints(epoch, &mut tally.lacking),
+                None => {}
+            },
             Message::Configure { request: Request::Write { number, words }, .. }
                 if number == Parameter::Sensing.number() =>
             {
@@ -130,18 +124,13 @@ impl Judge {
             // Of no joints, even if joints of that epoch stood on the bus by then.
             return;
         }
-        let number = lane.recorded.get(usize::from(epoch.0)).copied().flatten();
         let measured = lane.excuses.get(&cell).is_some_and(|excuse| excuse.cell.measured);
-        let (has_rounds, is_earlier) = (!lane.rounds.is_empty(), lane.is_earlier(epoch));
-        match number.and_then(|number| lane.round(number)) {
+        match lane.recorded_round(epoch) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
-            None if is_in_part && what == What::Torque && is_earlier => {
-                tally.lacking.joints_earlier += 1;
-            }
             // Before the first joints there are replies of sensors without any.
-            None if is_in_part && has_rounds && what == What::Torque => {
-                tally.lacking.joints_unrecorded += 1;
+            None if is_in_part && what == What::Torque => {
+                lane.count_without_joints(epoch, &mut tally.lacking)
             }
             None => {}
         }
@@ -162,13 +151,10 @@ impl Judge {
     /// Takes in that joints are about to be sent: those of a round, or others.
     pub fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch) {
         let Some(it) = self.lanes.get_mut(lane) else { return };
-        it.announcements += 1;
+        it.announce();
         let asked = Asked { announcement: it.announcements, round };
         if let Some(place) = it.asked.get_mut(usize::from(epoch.0)) {
             *place = Some(asked);
-        }
-        for present in it.roll.values_mut() {
-            present.heartbeats = 0;
         }
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
@@ -187,13 +173,10 @@ impl Judge {
     /// Takes in that all that was sent so far shall be done: a sync without joints.
     pub fn announce_again(&mut self, lane: usize) {
         let Some(it) = self.lanes.get_mut(lane) else { return };
-        it.announcements += 1;
+        it.announce();
         let (announcement, last) = (it.announcements, it.announcements - 1);
         if let Some(asked) = it.asked.iter_mut().flatten().find(|asked| asked.announcement == last) {
             asked.announcement = announcement;
-        }
-        for present in it.roll.values_mut() {
-            present.heartbeats = 0;
         }
     }
 
@@ -209,57 +192,33 @@ impl Judge {
         let Some(lane) = self.lanes.get_mut(index) else { return };
         lane.is_down = false;
         take_first_joints(&mut lane.untouched.now, message);
-        match *message {
-            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
-                self.rival.get_or_insert(index);
-            }
-            Message::Network { from: Node::Cell(cell), epoch, page } => lane.network(cell, epoch, &page),
-            Message::Configured { from, tag, answer }
-                if self.expects && !self.is_muted && is_compared(answer) =>
-            {
-                lane.answers.entry(from).or_default().now.push_back((tag, answer));
-            }
-            Message::Halt
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Network { from: Node::Everyone, .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. }
-            | Message::Stimulus { .. } => {}
+        if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
+            lane.network(cell, epoch, &page);
+        } else if let Message::Joints { .. } | Message::Network { .. } = message {
+            self.rival.get_or_insert(index);
         }
-        if self.expects && !self.is_muted {
-            self.hear_reply(index, message);
+        if !self.expects || self.is_muted {
+            return;
         }
-    }
-
-    fn hear_sum(&mut self, index: usize, cell: CellId, epoch: Epoch, sum: Sum) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
-        let round = asked.and_then(|asked| asked.round).and_then(|number| lane.round(number));
-        if let Some(round) = round.filter(|round| round.asked_as == epoch) {
-            round.sums.now.take(cell, sum);
+        if let Message::Configured { from, tag, answer } = *message
+            && is_compared(answer)
+        {
+            lane.answers.entry(from).or_default().now.push_back((tag, answer));
+        } else if let Message::Sum { from, epoch, torque, count } = *message
+            && let Some((_, round)) = lane.asked_round(epoch).filter(|(_, round)| round.asked_as == epoch)
+        {
+            round.sums.now.take(from, Sum { torque, count });
         }
+        self.hear_reply(index, message);
     }
 
     fn hear_reply(&mut self, index: usize, message: &Message) {
-        if let Message::Sum { from, epoch, torque, count } = *message {
-            return self.hear_sum(index, from, epoch, Sum { torque, count });
-        }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let Some(lane) = self.lanes.get_mut(index) else { return };
         if what != What::Torque && lane.untouched.now.get(&cell) == Some(&epoch) {
             return;
         }
-        let asked = lane.asked.get(usize::from(epoch.0)).copied().flatten();
-        let Some((number, round)) =
-            asked.and_then(|asked| asked.round).and_then(|number| Some((number, lane.round(number)?)))
-        else {
-            return;
-        };
+        let Some((number, round)) = lane.asked_round(epoch) else { return };
         let pair = round.replies.entry((cell, what)).or_default();
         let (epoch, nanos) = (round.epoch, round.nanos);
         match pair.now {
@@ -356,7 +315,7 @@ impl Judge {
     #[must_use]
     pub fn without_a_way(&self, lane: usize) -> Vec<CellId> {
         let Some(lane) = self.lanes.get(lane) else { return Vec::new() };
-        let settled = lane.roll.iter().filter(|(_, present)| present.is_settled());
+        let settled = lane.roll.iter().filter(|(_, present)| present.claim.is_settled());
         settled.map(|(cell, _)| *cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
     }
 
@@ -408,29 +367,14 @@ fn is_compared(answer: Answer) -> bool {
 
 /// A reply that says which joints it answers, or came after.
 fn reply(message: &Message) -> Option<(CellId, Epoch, What, [i16; WORDS])> {
-    match *message {
-        Message::Torque { from, epoch, .. } => Some((from, epoch, What::Torque, words(message))),
-        Message::Sensors { from, epoch, page: SensorPage::Skin(_) } => {
-            Some((from, epoch, What::Skin, words(message)))
-        }
-        Message::Sensors { from, epoch, page: SensorPage::Acceleration(_) } => {
-            Some((from, epoch, What::Acceleration, words(message)))
-        }
-        Message::Halt
-        | Message::Joints { .. }
-        | Message::Sync
-        | Message::Resume
-        | Message::Report
-        | Message::Sum { .. }
-        | Message::Network { .. }
-        | Message::Configure { .. }
-        | Message::Configured { .. }
-        | Message::Stimulus { .. } => None,
-    }
-}
-
-fn words(message: &Message) -> [i16; WORDS] {
-    message.encode().words
+    let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
+        (from, epoch, What::Torque)
+    } else if let Message::Sensors { from, epoch, page } = *message {
+        (from, epoch, if matches!(page, SensorPage::Skin(_)) { What::Skin } else { What::Acceleration })
+    } else {
+        return None;
+    };
+    Some((from, epoch, what, message.encode().words))
 }
 
 #[cfg(test)]

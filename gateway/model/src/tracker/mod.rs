@@ -1,0 +1,153 @@
+//! What is known of cells by what the bus carries: worked out here once, for whoever follows cells.
+//!
+//! ```text
+//!                                ┌─ Claim    who has the node id, and when it started again
+//!   a cell's packets ─> Tracked ─┼─ Account  what it sent, and what of that is lost
+//!                                ├─ Pages    what it said last since it started
+//!                                └─          alive or silent
+//!   stimuli, joints ──> Contact ────────────> what it feels, and what waits for its epoch
+//! ```
+//!
+//! Live tables, statistics, explanations, replays, the recorder and listings read these; each adds what is its own.
+//! The work for a packet is bounded, and nothing is allocated for it.
+
+mod claim;
+mod contact;
+mod per_cell;
+mod uplink;
+
+use protocol::message::{Heard, Message, NetworkPage, Ports, Refused, Tree};
+use protocol::time::{Micros, Span};
+
+pub use claim::{Claim, Word};
+pub use contact::{Contact, PENDING, is_late};
+pub use per_cell::PerCell;
+pub use uplink::{Account, Uplink};
+
+/// A cell that has said nothing for so long is dead: two heartbeats, and the jitter of a busy machine,
+/// so that one lost frame kills nobody.
+pub const DEAD_AFTER: Span = Span::from_millis(600);
+
+/// An answer may be of the newest joints, or of those so many before them; later ones are of no use.
+pub const LATEST: usize = 3;
+
+/// The last page of each kind that a cell has said since it started.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Pages {
+    /// What became of what it heard.
+    pub heard: Option<Heard>,
+    /// What it refused.
+    pub refused: Option<Refused>,
+    /// Its place in the tree.
+    pub tree: Option<Tree>,
+    /// What its ports lead to.
+    pub ports: Option<Ports>,
+}
+
+impl Pages {
+    /// Takes a page.
+    const fn take(&mut self, page: &NetworkPage) {
+        match *page {
+            NetworkPage::Heartbeat(_) => {}
+            NetworkPage::Heard(heard) => self.heard = Some(heard),
+            NetworkPage::Refused(refused) => self.refused = Some(refused),
+            NetworkPage::Tree(tree) => self.tree = Some(tree),
+            NetworkPage::Ports(ports) => self.ports = Some(ports),
+        }
+    }
+}
+
+/// What a packet of a cell tells beside what it says.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct News {
+    /// What its heartbeat is, if it is one.
+    pub word: Option<Word>,
+    /// The cell was thought dead.
+    pub revived: bool,
+    /// It is the cell's first heartbeat since the bus was lost, and it has not started since.
+    pub returned: bool,
+}
+
+/// One cell, by what comes under its node id.
+#[derive(Clone, Debug, Default)]
+pub struct Tracked {
+    /// Packets sent and arrived.
+    pub account: Account,
+    claim: Claim,
+    pages: Pages,
+    last_word: Option<Micros>,
+    dead: bool,
+}
+
+impl Tracked {
+    /// Takes a packet that came at `at`; `joints` is the number of the newest joints.
+    pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> News {
+        let is_first = self.last_word.replace(at).is_none();
+        let revived = core::mem::take(&mut self.dead);
+        self.account.arrive();
+        let Message::Network { page, .. } = message else { return News { revived, ..News::default() } };
+        let NetworkPage::Heartbeat(heartbeat) = page else {
+            self.pages.take(page);
+            if let NetworkPage::Tree(tree) = page {
+                self.account.sums_sent(tree.sent, joints);
+            }
+            return News { revived, ..News::default() };
+        };
+        let away = self.account.is_interrupted();
+        let word = match self.claim.hear(heartbeat) {
+            Word::Started { .. } if !is_first => Word::Started { again: true },
+            word => word,
+        };
+        match word {
+            Word::Known => self.account.settle(heartbeat.sent),
+            Word::First => self.account.begin(heartbeat.sent, false),
+            Word::Started { again } => {
+                self.account.begin(heartbeat.sent, again);
+                self.pages = Pages::default();
+            }
+            Word::Overtaken => {}
+            Word::Claimant => self.account.intrude(),
+        }
+        self.account.heartbeat_at(joints);
+        let returned = away && matches!(word, Word::First | Word::Known);
+        News { word: Some(word), revived, returned }
+    }
+
+    /// Who has the node id, and what its last heartbeat said.
+    #[must_use]
+    pub const fn claim(&self) -> &Claim {
+        &self.claim
+    }
+
+    /// What it has said since it started.
+    #[must_use]
+    pub const fn pages(&self) -> &Pages {
+        &self.pages
+    }
+
+    /// When its last packet came.
+    #[must_use]
+    pub const fn last_word(&self) -> Option<Micros> {
+        self.last_word
+    }
+
+    /// Takes in what time it is; whether the cell has just been silent for too long.
+    pub fn falls_silent(&mut self, now: Micros) -> bool {
+        let silent = self.is_silent(now);
+        let falls = silent && !self.dead;
+        self.dead |= silent;
+        falls
+    }
+
+    /// Whether it has been found dead, and not been heard since.
+    #[must_use]
+    pub const fn is_dead(&self) -> bool {
+        self.dead
+    }
+
+    /// Whether it was heard, and has then been silent for too long.
+    #[must_use]
+    pub fn is_silent(&self, now: Micros) -> bool {
+        self.last_word.is_some_and(|last| now.since(last) > DEAD_AFTER)
+    }
+}

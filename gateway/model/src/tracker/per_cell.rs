@@ -1,0 +1,46 @@
+//! Something for each node id.
+
+use protocol::id::{CellId, Node};
+
+/// Something for each node id of a bus.
+#[derive(Clone, Debug)]
+pub struct PerCell<T>(Box<[T]>);
+
+impl<T: Default> Default for PerCell<T> {
+    fn default() -> Self {
+        Self(CellId::all().map(|_| T::default()).collect())
+    }
+}
+
+impl<T> PerCell<T> {
+    /// That of one cell.
+    #[must_use]
+    pub fn get(&self, cell: CellId) -> Option<&T> {
+        self.0.get(cell.index())
+    }
+
+    /// That of one cell, to be changed.
+    pub fn get_mut(&mut self, cell: CellId) -> Option<&mut T> {
+        self.0.get_mut(cell.index())
+    }
+
+    /// Those of the cells that an addressee names, by number.
+    pub fn named(&mut self, to: Node) -> &mut [T] {
+        let places = match to {
+            Node::Gateway => 0..0,
+            Node::Cell(cell) => cell.index()..cell.index() + 1,
+            Node::Everyone => 0..CellId::COUNT,
+        };
+        self.0.get_mut(places).unwrap_or_default()
+    }
+
+    /// All of them, by number.
+    pub fn iter(&self) -> impl Iterator<Item = (CellId, &T)> {
+        CellId::all().zip(&self.0)
+    }
+
+    /// All of them, by number, to be changed.
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = (CellId, &mut T)> {
+        CellId::all().zip(&mut self.0)
+    }
+}
