@@ -39,11 +39,13 @@ pub mod witness;
 mod wrench;
 
 pub use projection::Projection;
-pub use scalar::{PaperWord, Scalar};
+pub use scalar::{Operations, PaperWord, Scalar, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters};
+
+use crate::sine::FINE;
 
 /// A way to compute the Jacobian of a cell's normal force.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
@@ -56,6 +58,17 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     ///
     /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];
+}
+
+/// A length of the robot's table; none where it is zero, for then it costs nothing.
+fn length<S: Scalar>(word: Q1_14) -> Option<S> {
+    (word != Q1_14::ZERO).then(|| S::word(word))
+}
+
+/// A joint's angle from its position and its offset, an addition that a zero does not cost.
+#[inline]
+fn angle<S: Scalar>(position: Q1_14, offset: Q1_14) -> Q1_14 {
+    if offset == Q1_14::ZERO { position } else { S::plus_angle(position, offset) }
 }
 
 /// How a link's twist alpha turns y and z into each other.
@@ -85,10 +98,7 @@ impl<S: Scalar> Twist<S> {
             -0x4000 => Self::Quarters(Quarters::Back),
             _ => {
                 let [sine, cosine, _] = S::fine_turn(alpha);
-                Self::Other {
-                    sine: S::settle::<{ crate::sine::FINE }>(sine),
-                    cosine: S::settle::<{ crate::sine::FINE }>(cosine),
-                }
+                Self::Other { sine: S::settle::<FINE>(sine), cosine: S::settle::<FINE>(cosine) }
             }
         }
     }

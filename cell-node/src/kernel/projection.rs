@@ -20,7 +20,7 @@
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-use super::{Kernel, Quarters, Scalar, Twist};
+use super::{Kernel, Quarters, Scalar, Twist, angle, length};
 
 /// The projection kernel, of one cell.
 ///
@@ -96,7 +96,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::ZERO; MAX_JOINTS];
+        let mut jacobian = [S::zero(); MAX_JOINTS];
         let links = self.links.get(..self.joint).unwrap_or_default();
 
         let [mut x, mut y, mut z] = Component::BASE;
@@ -121,7 +121,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (x, y, z);
         let to_base = |[a, b, c]: [S; 3]| {
             let row = |x, y, z| Sum::Nothing.plus(a, x).plus(b, y).plus(c, z).component().number();
-            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::ZERO } else { row(x2, y2, z2) }]
+            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::zero() } else { row(x2, y2, z2) }]
         };
         let force = to_base(self.force);
         let mut position = to_base(self.position);
@@ -144,7 +144,6 @@ impl<S: Scalar> Link<S> {
     };
 
     fn new(row: &Row, first: bool, last: bool) -> Self {
-        let length = |word: Q1_14| (word != Q1_14::ZERO).then(|| S::word(word));
         let ends = last || row.alpha != Q1_14::ZERO;
         let a = length(row.a);
         Self {
@@ -159,7 +158,7 @@ impl<S: Scalar> Link<S> {
 
     /// The angle from the axes before the group of parallel joints to this joint's.
     fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
-        let own = if self.offset == Q1_14::ZERO { position } else { S::plus_angle(position, self.offset) };
+        let own = angle::<S>(position, self.offset);
         group.map_or(own, |group| S::plus_angle(group, own))
     }
 
@@ -226,9 +225,9 @@ impl<S: Scalar> Component<S> {
 
     fn number(self) -> S {
         match self {
-            Self::Zero => S::ZERO,
-            Self::One => S::ONE,
-            Self::MinusOne => S::ONE.negative(),
+            Self::Zero => S::zero(),
+            Self::One => S::one(),
+            Self::MinusOne => S::one().negative(),
             Self::Varies(number) => number,
         }
     }
@@ -247,8 +246,14 @@ impl<S: Scalar> Sum<S> {
     fn plus(self, factor: S, component: Component<S>) -> Self {
         match component {
             Component::Zero => self,
-            Component::One => self.plus_word(factor),
-            Component::MinusOne => self.minus_word(factor),
+            Component::One => match self.wide() {
+                None => Self::Word(factor),
+                Some(sum) => Self::Wide(S::plus(sum, factor.widen())),
+            },
+            Component::MinusOne => match self.wide() {
+                None => Self::Word(factor.negative()),
+                Some(sum) => Self::Wide(S::minus(sum, factor.widen())),
+            },
             Component::Varies(number) => Self::Wide(match self.wide() {
                 None => factor.times(number),
                 Some(sum) => S::plus(sum, factor.times(number)),
@@ -258,23 +263,11 @@ impl<S: Scalar> Sum<S> {
 
     /// Without the product of a number and a component.
     fn minus(self, factor: S, component: Component<S>) -> Self {
-        match component {
-            Component::Zero => self,
-            Component::One => self.minus_word(factor),
-            Component::MinusOne => self.plus_word(factor),
-            Component::Varies(number) => Self::Wide(match self.wide() {
-                None => factor.negative().times(number),
-                Some(sum) => S::minus(sum, factor.times(number)),
-            }),
-        }
-    }
-
-    fn plus_word(self, word: S) -> Self {
-        self.wide().map_or(Self::Word(word), |sum| Self::Wide(S::plus(sum, word.widen())))
-    }
-
-    fn minus_word(self, word: S) -> Self {
-        self.wide().map_or_else(|| Self::Word(word.negative()), |sum| Self::Wide(S::minus(sum, word.widen())))
+        let Component::Varies(number) = component else { return self.plus(factor, component.negative()) };
+        Self::Wide(match self.wide() {
+            None => factor.negative().times(number),
+            Some(sum) => S::minus(sum, factor.times(number)),
+        })
     }
 
     fn wide(self) -> Option<S::Wide> {

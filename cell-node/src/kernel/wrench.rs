@@ -20,7 +20,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
 
-use super::{Kernel, Quarters, Scalar, Twist};
+use super::{Kernel, Quarters, Scalar, Twist, angle, length};
 
 /// The wrench kernel, of one cell.
 ///
@@ -58,20 +58,24 @@ struct Link<S> {
 }
 
 /// Which components of a wrench somebody reads.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Live {
     force: [bool; 3],
     moment: [bool; 3],
 }
 
+impl Live {
+    const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
+}
+
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
-        let nothing = Wrenched { force: [S::ZERO; 3], moment: [S::ZERO; 3] };
+        let nothing = Wrenched { force: [S::zero(); 3], moment: [S::zero(); 3] };
         let mut kernel = Self { joint: chain.len(), contact: nothing, links: [Link::IDLE; MAX_JOINTS - 1] };
         let Some((last, rest)) = chain.split_last() else { return kernel };
         kernel.contact = fold(&parameters.pose, last);
-        let mut read = Live::default(); // by the links further down: nothing below joint 1
+        let mut read = Live::NOTHING; // by the links further down: nothing below joint 1
         for ((link, row), above) in kernel.links.iter_mut().zip(rest).zip(chain.iter().skip(1)) {
             (*link, read) = Link::new(row, above.theta_offset, read);
         }
@@ -79,7 +83,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::ZERO; MAX_JOINTS];
+        let mut jacobian = [S::zero(); MAX_JOINTS];
         let mut wrench = self.contact;
         let Some((last, rest)) = jacobian.get_mut(..self.joint).and_then(<[S]>::split_last_mut) else {
             return jacobian;
@@ -96,9 +100,9 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 
 impl<S: Scalar> Link<S> {
     const IDLE: Self = Self {
-        turned: Live { force: [false; 3], moment: [false; 3] },
+        turned: Live::NOTHING,
         offset: Q1_14::ZERO,
-        twisted: Live { force: [false; 3], moment: [false; 3] },
+        twisted: Live::NOTHING,
         twist: Twist::Quarters(Quarters::None),
         a: None,
         d: None,
@@ -107,7 +111,6 @@ impl<S: Scalar> Link<S> {
     /// The link below the turn of the joint `above`, when the turn after it reads `read`; and what it
     /// reads itself.
     fn new(row: &Row, offset: Q1_14, read: Live) -> (Self, Live) {
-        let length = |word: Q1_14| (word != Q1_14::ZERO).then(|| S::word(word));
         let twist = Twist::new(row.alpha);
         let (a, d) = (length(row.a), length(row.d));
 
@@ -142,7 +145,7 @@ impl<S: Scalar> Link<S> {
         if !(fx || fy || mx || my) {
             return wrench;
         }
-        let angle = if self.offset == Q1_14::ZERO { position } else { S::plus_angle(position, self.offset) };
+        let angle = angle::<S>(position, self.offset);
         let (sine, cosine) = (S::sine(angle), S::cosine(angle));
         let turn = |[x, y, z]: [S; 3], [live_x, live_y, _]: [bool; 3]| {
             [
