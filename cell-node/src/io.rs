@@ -15,7 +15,9 @@ use protocol::packet;
 use protocol::time::Micros;
 use protocol::wire::{Lane, PORTS};
 
-use crate::node::{Flash, Identity, Node};
+use crate::flash::Flash;
+use crate::identity::Identity;
+use crate::node::Node;
 use clock::Clock;
 use ears::Ears;
 use sockets::Hearing;

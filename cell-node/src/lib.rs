@@ -3,6 +3,7 @@
 
 pub mod contact;
 pub mod flash;
+pub mod identity;
 #[cfg(feature = "host")]
 pub mod io;
 pub mod kernel;

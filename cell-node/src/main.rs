@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
-use cell_node::flash::Kept;
+use cell_node::flash::{Flash, Kept};
+use cell_node::identity::Identity;
 use cell_node::io::{Cells, FlashFile, Lanes, Line, Sockets, Stopped};
-use cell_node::node::{Flash, Identity};
 use clap::Parser;
 use protocol::bus::Choice;
 use protocol::id::CellId;

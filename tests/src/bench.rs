@@ -15,7 +15,8 @@
 use std::collections::HashMap;
 
 use analysis::bus_model::Attempt;
-use cell_node::node::{Flash, Identity};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
 use model::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;

@@ -15,8 +15,10 @@
 use std::collections::{BTreeSet, HashMap, VecDeque};
 
 use cell_node::contact::{Force, Torque};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
 use cell_node::kernel::{Kernel, Wrench};
-use cell_node::node::{Flash, Identity, Node};
+use cell_node::node::Node;
 use cell_node::sum::Words;
 use model::network::Uplinks;
 use protocol::can::{Format, Frame};

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use protocol::id::CellId;
 use rustix::fs::OFlags;
 
-use crate::flash::{self, FlashError, Kept};
-use crate::node::{Flash, Identity};
+use crate::flash::{self, Flash, FlashError, Kept};
+use crate::identity::Identity;
 
 /// Bytes that are read of a file; what flash holds is far less.
 const LONGEST: u64 = 64 << 10;

@@ -4,9 +4,7 @@ use std::cell::Cell;
 
 use protocol::fixed::Q1_14;
 
-use super::{Scalar, Word};
-
-pub use super::Operations;
+use super::{Operations, Scalar, Word};
 
 /// The witness: real numbers, the library's sine and cosine, no rounding.
 impl Scalar for f64 {

@@ -18,12 +18,13 @@ mod port;
 mod way;
 
 use heapless::Deque;
+use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK};
 
-use numbers::Walking;
+use numbers::Numbers;
 use port::Port;
 
 /// From one hello to the next.
@@ -82,7 +83,7 @@ impl LeftBehind {
 pub struct Network {
     wired: u8,
     deaf: u8,
-    number: u8,
+    numbers: Numbers,
     ports: [Port; ALL],
     parent: Option<Parent>,
     /// The best label that this cell ever had: only better ones are followed.
@@ -100,10 +101,6 @@ pub struct Network {
     passed_on: Option<(u8, bool, Micros)>,
     /// The parent that was left last.
     left: Option<LeftBehind>,
-    walking: Option<Walking>,
-    last_walk: Option<u8>,
-    given: Option<u8>,
-    was_unnumbered: bool,
     reported: Option<[PortState; PORTS]>,
     changes: u16,
     tree_changed: bool,
@@ -118,7 +115,7 @@ impl Network {
         Self {
             wired: 0,
             deaf: 0,
-            number: 0,
+            numbers: Numbers::default(),
             ports: [Port::default(); ALL],
             parent: None,
             best: None,
@@ -129,10 +126,6 @@ impl Network {
             seek: None,
             passed_on: None,
             left: None,
-            walking: None,
-            last_walk: None,
-            given: None,
-            was_unnumbered: false,
             reported: None,
             changes: 0,
             tree_changed: false,
@@ -143,8 +136,8 @@ impl Network {
 
     /// The same cell with wires at the ports `wired`; hellos of many cells are spread by `phase`.
     #[must_use]
-    pub fn wired(mut self, wired: u8, number: u8, phase: Span) -> Self {
-        (self.wired, self.number) = (wired, number);
+    pub fn wired(mut self, wired: u8, number: Option<CellId>, phase: Span) -> Self {
+        (self.wired, self.numbers.own) = (wired, number);
         self.next_hello = self.next_hello + phase;
         self
     }
@@ -194,13 +187,13 @@ impl Network {
     pub fn parent_number(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
-            port => self.number_at(port),
+            port => self.number_at(port).map(CellId::get),
         }
     }
 
     /// The number of the cell at a port.
     #[must_use]
-    pub fn number_at(&self, port: usize) -> Option<u8> {
+    pub fn number_at(&self, port: usize) -> Option<CellId> {
         self.ports.get(port)?.number()
     }
 
@@ -212,7 +205,7 @@ impl Network {
 
     /// The port where the child with this number is.
     #[must_use]
-    pub fn child_with(&self, number: u8) -> Option<usize> {
+    pub fn child_with(&self, number: CellId) -> Option<usize> {
         (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
     }
 
@@ -280,8 +273,8 @@ impl Network {
     }
 
     /// A number that a walk gave this cell, once.
-    pub const fn given(&mut self) -> Option<u8> {
-        self.given.take()
+    pub const fn given(&mut self) -> Option<CellId> {
+        self.numbers.given.take()
     }
 
     /// The next message for a port.
@@ -314,7 +307,7 @@ impl Network {
         let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
         let hello = Hello {
             version: VERSION,
-            number: self.number,
+            number: self.numbers.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
             hears,
             up: self.up() == Some(port),

@@ -12,19 +12,19 @@
 
 use protocol::fixed::Q3_12;
 use protocol::id::CellId;
-use protocol::message::{SensorPage, SkinSensors};
+use protocol::message::{Message, SensorPage, SkinSensors};
 use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact};
 
-use super::{Claim, Node, spread};
+use super::{Node, spread};
 
 /// Every so many heartbeats bring the acceleration too: it tells no touch, and is seldom wanted.
 const BEATS_PER_ACCELERATION: u8 = 4;
 
 /// Which pages are to be said.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-struct Pages {
+pub(super) struct Pages {
     skin: bool,
     acceleration: bool,
 }
@@ -32,7 +32,7 @@ struct Pages {
 impl Pages {
     const NONE: Self = Self { skin: false, acceleration: false };
     const SKIN: Self = Self { skin: true, acceleration: false };
-    const BOTH: Self = Self { skin: true, acceleration: true };
+    pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
 /// All that a cell feels.
@@ -168,24 +168,24 @@ impl Node {
     pub(super) fn sense(&mut self, now: Micros) {
         // Whose number is in doubt says nothing; what is felt is compared with what was sent, so that
         // nothing is forgotten.
-        if self.claim != Claim::Settled {
+        if !self.claim.is_settled() {
             return;
         }
         let felt = Felt { skin: *self.stimuli.skin(), acceleration: self.stimuli.acceleration() };
         let (mode, events, cell) = (self.switches.sensing, self.switches.events, self.identity.cell);
         let pages = self.sensing.look(now, mode, &events, cell, &felt);
-        self.say_felt(pages);
+        self.push_sensors(pages);
     }
 
     /// Says what goes with a regular heartbeat.
     pub(super) fn sense_with_heartbeat(&mut self, now: Micros) {
         let pages = self.sensing.beat(now);
-        self.say_felt(pages);
+        self.push_sensors(pages);
     }
 
     /// When it has something to say by itself; not while its number is in doubt.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
-        self.sensing.due.filter(|_| self.claim == Claim::Settled)
+        self.sensing.due.filter(|_| self.claim.is_settled())
     }
 
     /// Says what is due.
@@ -194,28 +194,30 @@ impl Node {
             return;
         }
         let pages = self.sensing.pass(now, now + Span(1));
-        self.say_felt(pages);
+        self.push_sensors(pages);
     }
 
     /// What is due before the next joints is said now, while the cell is awake. Not where it would be said
     /// once for each joints or more often: all cells would say it at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
-        let joints = Span(in_use.parameters.period_us.into());
+        let joints = in_use.period();
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints
         {
             let pages = self.sensing.pass(now, now + joints);
-            self.say_felt(pages);
+            self.push_sensors(pages);
         }
     }
 
-    fn say_felt(&mut self, pages: Pages) {
-        if pages.skin {
-            self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
-        }
-        if pages.acceleration {
-            self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
+    /// Says what is felt.
+    pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
+        let Some(from) = self.identity.cell else { return };
+        let skin = skin.then(|| SensorPage::Skin(*self.stimuli.skin()));
+        let acceleration = acceleration.then(|| SensorPage::Acceleration(self.stimuli.acceleration()));
+        for page in skin.into_iter().chain(acceleration) {
+            self.sensing.sends(&page);
+            self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
         }
     }
 }
