@@ -7,7 +7,7 @@ pub mod identity;
 #[cfg(feature = "host")]
 pub mod io;
 pub mod kernel;
-pub mod network;
+mod network;
 pub mod node;
 pub mod sine;
 pub mod sum;

@@ -116,7 +116,7 @@ impl Node {
             | Parameter::Row(_)
             | Parameter::Commit => return self.configuration.stage(parameter, words),
         };
-        self.summing.network.set_deaf(switches.cuts.deaf);
+        self.summing.network.deaf = switches.cuts.deaf;
         self.summing.sum.set_slots(match switches.reply {
             Reply::Torque => None,
             Reply::Sum(slots) => Some(slots),

@@ -24,9 +24,10 @@ const STEADY: u8 = 8;
 const TREE: Span = Span::from_millis(50);
 
 /// The parent that an epoch's sum is for.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 enum Parent {
     /// There is none.
+    #[default]
     None,
     /// The gateway's side, which sends no sums.
     Gateway,
@@ -35,7 +36,7 @@ enum Parent {
 }
 
 /// When a cell says where it is in the tree.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct TreeReport {
     /// There is news.
     due: bool,
@@ -46,7 +47,7 @@ struct TreeReport {
 }
 
 /// A cell's network, its sums, and what one is to the other.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
@@ -76,21 +77,8 @@ pub(super) struct Summing {
 impl Summing {
     /// A cell that is not wired.
     pub(super) fn new(now: Micros) -> Self {
-        Self {
-            network: Network::new(now),
-            sum: Sum::default(),
-            heard: [None; PORTS],
-            hears_changed: false,
-            parent: Parent::None,
-            said_before: false,
-            unanswered: None,
-            patience: 0,
-            suspected: None,
-            steady: 0,
-            waits_for_children: false,
-            changes: 0,
-            report: TreeReport { due: true, next: now, round: 0 },
-        }
+        let report = TreeReport { due: true, next: now, round: 0 };
+        Self { network: Network::new(now), report, ..Self::default() }
     }
 
     /// By port, whose sums are heard.
@@ -132,7 +120,7 @@ impl Summing {
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.up() == Some(port);
         self.sum.heard_after(age);
-        self.network.set_busy(self.sum.is_busy());
+        self.network.busy = self.sum.is_busy();
         if let PortMessage::State(epoch) = message {
             if self.network.is_child(port) {
                 self.sum.state(now, port, epoch);
@@ -160,8 +148,7 @@ impl Summing {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
             self.sum.disown(port);
         }
-        let changes = self.network.changes();
-        if core::mem::replace(&mut self.changes, changes) != changes {
+        if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
             self.unanswered = None;
             self.sum.break_off();
             // What was said in this epoch may have been taken by the parent before.
@@ -391,7 +378,7 @@ impl Node {
 
     pub(super) fn push_ports(&mut self, now: Micros) {
         let Summing { network, .. } = &self.summing;
-        let ports = Ports { ports: network.port_states(now), changes: network.changes() };
+        let ports = Ports { ports: network.port_states(now), changes: network.changes };
         self.push_network(NetworkPage::Ports(ports));
     }
 }
