@@ -249,7 +249,7 @@ impl Sum {
 
     /// Wires to the root, as many as there may be where there is no way up.
     fn depth(&self) -> u8 {
-        self.begin.depth.or(self.slots.map(|slots| slots.deepest)).unwrap_or(0)
+        self.begin.depth.or_else(|| self.slots.map(|slots| slots.deepest)).unwrap_or(0)
     }
 
     /// After joints, by when a sum that waits for a late child is said: half a slot for each wire to the root before all
@@ -342,9 +342,9 @@ impl Sum {
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// The last sum that was sent, and its epoch.
-    pub(crate) const fn said(&self) -> Option<(Epoch, Words)> {
-        self.said
+    /// Whether the last sum was said in this epoch.
+    pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
+        self.said.is_some_and(|(of, _)| of == epoch)
     }
 
     /// Whether a sum went up in this epoch or the one before, and others are to follow.

@@ -74,28 +74,25 @@ fn angle<S: Scalar>(position: Q1_14, offset: Q1_14) -> Q1_14 {
 /// How a link's twist alpha turns y and z into each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Twist<S> {
-    /// By no turn, one, two or three quarter turns.
-    Quarters(Quarters),
+    /// Not at all.
+    None,
+    /// By a quarter turn.
+    Ahead,
+    /// By half a turn.
+    Half,
+    /// By a quarter turn the other way.
+    Back,
     /// By any other angle.
     Other { sine: S, cosine: S },
-}
-
-/// Whole quarter turns.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Quarters {
-    None,
-    Ahead,
-    Half,
-    Back,
 }
 
 impl<S: Scalar> Twist<S> {
     fn new(alpha: Q1_14) -> Self {
         match alpha.to_bits() {
-            0 => Self::Quarters(Quarters::None),
-            0x4000 => Self::Quarters(Quarters::Ahead),
-            i16::MIN => Self::Quarters(Quarters::Half),
-            -0x4000 => Self::Quarters(Quarters::Back),
+            0 => Self::None,
+            0x4000 => Self::Ahead,
+            i16::MIN => Self::Half,
+            -0x4000 => Self::Back,
             _ => {
                 let [sine, cosine, _] = S::fine_turn(alpha);
                 Self::Other { sine: S::settle::<FINE>(sine), cosine: S::settle::<FINE>(cosine) }

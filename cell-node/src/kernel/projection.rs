@@ -20,7 +20,7 @@
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-use super::{Kernel, Quarters, Scalar, Twist, angle, length};
+use super::{Kernel, Scalar, Twist, angle, length};
 
 /// The projection kernel, of one cell.
 ///
@@ -80,10 +80,10 @@ struct Step<S> {
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
-        let mut links = [Link::IDLE; MAX_JOINTS];
-        for (index, (link, row)) in links.iter_mut().zip(chain).enumerate() {
-            *link = Link::new(row, index == 0, index + 1 == chain.len());
-        }
+        let links = core::array::from_fn(|index| {
+            let row = parameters.rows.get(index).copied().unwrap_or_default();
+            Link::new(&row, index == 0, index + 1 == chain.len())
+        });
         let (_, below) = chain.split_last().unzip();
         let upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
         Self {
@@ -134,15 +134,6 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 }
 
 impl<S: Scalar> Link<S> {
-    const IDLE: Self = Self {
-        offset: Q1_14::ZERO,
-        twist: Twist::Quarters(Quarters::None),
-        a: None,
-        d: None,
-        x: false,
-        ends: false,
-    };
-
     fn new(row: &Row, first: bool, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
         let a = length(row.a);
@@ -177,10 +168,10 @@ impl<S: Scalar> Twist<S> {
     /// The second and the third axis after the twist, from those before it.
     fn turn_axes(self, v: Axis<S>, z: Axis<S>) -> [Axis<S>; 2] {
         match self {
-            Self::Quarters(Quarters::None) => [v, z],
-            Self::Quarters(Quarters::Ahead) => [z, v.map(Component::negative)],
-            Self::Quarters(Quarters::Half) => [v.map(Component::negative), z.map(Component::negative)],
-            Self::Quarters(Quarters::Back) => [z.map(Component::negative), v],
+            Self::None => [v, z],
+            Self::Ahead => [z, v.map(Component::negative)],
+            Self::Half => [v.map(Component::negative), z.map(Component::negative)],
+            Self::Back => [z.map(Component::negative), v],
             Self::Other { sine, cosine } => [
                 combine(v, z, |v, z| Sum::Nothing.plus(cosine, v).plus(sine, z)),
                 combine(v, z, |v, z| Sum::Nothing.plus(cosine, z).minus(sine, v)),

@@ -211,11 +211,7 @@ impl Network {
 
     /// What the ports lead to.
     pub(crate) fn port_states(&self, now: Micros) -> [PortState; PORTS] {
-        let mut states = [PortState::default(); PORTS];
-        for (state, port) in states.iter_mut().zip(&self.ports) {
-            *state = port.state(now);
-        }
-        states
+        core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
     /// Whether the ports lead to something else than when this was asked last.

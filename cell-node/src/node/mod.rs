@@ -166,19 +166,16 @@ impl Node {
     #[must_use]
     pub fn hears_aside(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
-            return self.summing.waits_for_children();
+            return self.summing.waits_for_children;
         }
         self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
     /// By slot of a pair's waiting half.
     fn slots(&self) -> [Option<Id>; HEARD] {
-        let mut slots = [None; HEARD];
-        let sums = self.summing.heard_sums().map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
-        for (slot, id) in slots.iter_mut().zip(self.identity.hears().into_iter().chain(sums)) {
-            *slot = id;
-        }
-        slots
+        let sums = self.summing.heard.map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
+        let mut ids = self.identity.hears().into_iter().chain(sums);
+        core::array::from_fn(|_| ids.next().flatten())
     }
 
     /// Takes in that time has passed. Harmless when called early.
@@ -278,7 +275,7 @@ impl Node {
         count(&mut self.heard.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
-        let force = in_use.force(self.stimuli.skin());
+        let force = in_use.force(&self.stimuli.felt.skin);
         let torque =
             force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));
         if self.summing.sum.is_on() {

@@ -139,7 +139,6 @@ impl Node {
 
 /// These words, and zeros.
 fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
-    let mut words = [0; WORDS];
-    words.iter_mut().zip(first).for_each(|(word, first)| *word = first);
-    words
+    let mut first = first.into_iter();
+    core::array::from_fn(|_| first.next().unwrap_or(0))
 }

@@ -52,7 +52,7 @@ pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
     /// By port, whose sums are heard.
-    heard: [Option<CellId>; PORTS],
+    pub(super) heard: [Option<CellId>; PORTS],
     hears_changed: bool,
     parent: Parent,
     /// Whether a sum was said in the epoch before the present one.
@@ -68,7 +68,7 @@ pub(super) struct Summing {
     /// Epochs in a row in which a child was waited for and nothing was amiss.
     steady: u8,
     /// Joints are heard aside: what wakes this cell is its children.
-    waits_for_children: bool,
+    pub(super) waits_for_children: bool,
     /// How often the parent had changed when that was looked at last.
     changes: u16,
     report: TreeReport,
@@ -81,19 +81,9 @@ impl Summing {
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
-    /// By port, whose sums are heard.
-    pub(super) const fn heard_sums(&self) -> [Option<CellId>; PORTS] {
-        self.heard
-    }
-
     /// The parent whose sums are heard.
     pub(super) fn heard_parent(&self) -> Option<CellId> {
         self.heard.get(self.network.up()?).copied().flatten()
-    }
-
-    /// Whether it is woken by its children's sums, and not by joints.
-    pub(super) const fn waits_for_children(&self) -> bool {
-        self.waits_for_children
     }
 
     /// Whether what is heard, or what wakes the cell, has changed since the last call.
@@ -159,11 +149,10 @@ impl Summing {
         }
         self.report.due |= self.network.tree_changed();
         // The sums of the parent and of the children.
-        let mut heard = [None; PORTS];
-        for (port, heard) in heard.iter_mut().enumerate().filter(|_| self.sum.is_on()) {
+        let heard = core::array::from_fn(|port| {
             let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
-            *heard = self.network.number_at(port).filter(|_| is_ours);
-        }
+            self.network.number_at(port).filter(|_| is_ours && self.sum.is_on())
+        });
         self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
     }
 
@@ -181,7 +170,7 @@ impl Summing {
         own: Option<Torque>,
     ) {
         let (at, up) = (now - age, self.network.up());
-        self.said_before = self.sum.said().is_some_and(|(of, _)| of.next() == epoch);
+        self.said_before = self.sum.said_in(epoch.before());
         // A parent that was left and may not know it takes no sum from who was silent for an epoch.
         if !self.said_before {
             self.network.forget_left(at);
@@ -237,7 +226,7 @@ impl Summing {
         for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
             self.network.say(port, PortMessage::Missed(epoch));
         }
-        let said = self.said_in(epoch);
+        let said = self.sum.said_in(epoch);
         let borne = self.borne();
         let mut lost = None;
         match (&mut self.unanswered, self.parent) {
@@ -268,16 +257,11 @@ impl Summing {
     fn was_missed(&mut self, epoch: Epoch) {
         self.sum.break_off();
         let before = self.sum.epoch().is_some_and(|present| epoch.next() == present);
-        if (self.sum.epoch() == Some(epoch) && self.said_in(epoch)) || (before && self.said_before) {
+        if (self.sum.epoch() == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
             // It was thought to be taken.
             self.unanswered = self.unanswered.or(Some(0));
             self.ask_parent();
         }
-    }
-
-    /// Whether the last sum was said in this epoch.
-    fn said_in(&self, epoch: Epoch) -> bool {
-        self.sum.said().is_some_and(|(of, _)| of == epoch)
     }
 
     /// Epochs in a row without an answer that are borne.
