@@ -6,8 +6,8 @@
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "it prints, and stops where it cannot")]
 
-use cell_node::kernel::witness::{Counted, Operations};
-use cell_node::kernel::{Kernel, PaperWord, Projection, Wrench};
+use cell_node::kernel::witness::Counted;
+use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Scalar, Word, Wrench};
 use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
 use protocol::fixed::{Q1_14, Q3_12};
 
@@ -27,48 +27,29 @@ fn main() {
     println!("\nOne Jacobian on a UR5\n");
     println!("| kernel | k | mul | add | sin | cos | negations | angle additions | roundings |");
     println!("|---|---|---|---|---|---|---|---|---|");
-    for joint in (1..=6).rev() {
-        operations::<Wrench<Counted>>("wrench", joint);
-    }
-    for joint in (1..=6).rev() {
-        operations::<Projection<Counted>>("projection", joint);
-    }
+    (1..=6).rev().for_each(|joint| operations::<Wrench<_>>("wrench", joint));
+    (1..=6).rev().for_each(|joint| operations::<Projection<_>>("projection", joint));
     println!("| paper, Eq. 27 | 6 | 103 | 57 | 6 | 6 | | | |");
 
     println!("\nTorques of loaded joints on a UR5, Nm\n");
     println!("| kernel and numbers | mean error | greatest error |\n|---|---|---|");
-    let wrench = Errors::of_words(|parameters, joints| Wrench::new(parameters).jacobian(joints));
+    let wrench = of_kernel::<Q1_14, Wrench>();
     torques("wrench, words", wrench);
-    torques(
-        "projection, words",
-        Errors::of_words(|parameters, joints| Projection::new(parameters).jacobian(joints)),
-    );
-    torques(
-        "wrench, words, paper's sine",
-        Errors::of_words(|parameters, joints| {
-            Wrench::<PaperWord>::new(parameters).jacobian(joints).map(|row| row.0)
-        }),
-    );
-    torques(
-        "projection, words, paper's sine",
-        Errors::of_words(|parameters, joints| {
-            Projection::<PaperWord>::new(parameters).jacobian(joints).map(|row| row.0)
-        }),
-    );
+    torques("projection, words", of_kernel::<Q1_14, Projection>());
+    torques("wrench, words, paper's sine", of_kernel::<PaperWord, Wrench<_>>());
+    torques("projection, words, paper's sine", of_kernel::<PaperWord, Projection<_>>());
     let real = |case: &Case| {
         Wrench::<f64>::new(&case.parameters()).jacobian(&case.words()).map(|row| row * case.force)
     };
     torques("either, real numbers, from the same words", Errors::of(real));
-    torques(
-        "the same, rounded to Q3.12",
-        Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64())),
-    );
-    println!(
-        "\n{} torques in {} poses; {} poses left out, beyond Q3.12",
-        wrench.torques,
-        Case::all().len(),
-        wrench.left_out
-    );
+    let rounded = Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64()));
+    torques("the same, rounded to Q3.12", rounded);
+    let (poses, Errors { torques, left_out, .. }) = (Case::all().len(), wrench);
+    println!("\n{torques} torques in {poses} poses; {left_out} poses left out, beyond Q3.12");
+}
+
+fn of_kernel<W: Word + Scalar, K: Kernel<W>>() -> Errors {
+    Errors::of_words(|parameters, joints| K::new(parameters).jacobian(joints).map(W::to_word))
 }
 
 fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, witness: impl Fn(f64) -> f64) {
@@ -84,11 +65,11 @@ fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
     let case = Case::all().into_iter().find(|case| case.joint == joint).unwrap();
     let kernel = K::new(&case.parameters());
     let (_, done) = Operations::count(|| kernel.jacobian(&case.words()));
-    let Operations { multiplications, additions, sines, cosines, negations, angle_additions, roundings } =
-        done;
+    let work = [done.multiplications, done.additions, done.sines, done.cosines];
+    let rest = [done.negations, done.angle_additions, done.roundings];
     println!(
-        "| {name} | {joint} | {multiplications} | {additions} | {sines} | {cosines} | {negations} | \
-         {angle_additions} | {roundings} |"
+        "| {name} | {joint} | {} |",
+        work.iter().chain(&rest).map(u32::to_string).collect::<Vec<_>>().join(" | ")
     );
 }
 

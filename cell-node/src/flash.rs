@@ -12,7 +12,7 @@ use protocol::packet::crc16;
 use protocol::parameters::{IMAGE_BYTES, Parameters};
 use thiserror::Error;
 
-use crate::node::Identity;
+use crate::identity::Identity;
 
 const MAGIC: &[u8; 4] = b"SKIN";
 const VERSION: u8 = 2;
@@ -28,6 +28,17 @@ pub struct Kept {
     pub number: Option<CellId>,
     /// What it computes with, if it has been told.
     pub parameters: Option<Parameters>,
+}
+
+/// What flash held when the cell started.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Flash {
+    /// Nothing yet.
+    Empty,
+    /// Something that its CRC does not vouch for.
+    Damaged,
+    /// Sound parameters.
+    Sound(Parameters),
 }
 
 /// Why an image is not used.

@@ -15,7 +15,9 @@ use protocol::packet;
 use protocol::time::Micros;
 use protocol::wire::{Lane, PORTS};
 
-use crate::node::{Flash, Identity, Node};
+use crate::flash::Flash;
+use crate::identity::Identity;
+use crate::node::Node;
 use clock::Clock;
 use ears::Ears;
 use sockets::Hearing;
@@ -104,18 +106,12 @@ impl Cells {
     /// Starts a cell with what flash holds and the wires it has; a simulated cell has no sensors, so it obeys
     /// stimuli.
     pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile, lanes: Lanes) {
-        let place = self.cells.len();
-        let mut node = Node::new(identity, self.format, flash, true, self.clock.now());
-        let wired = (0_u8..).zip(&lanes).filter(|(_, lane)| lane.is_some());
-        let wired = wired.fold(0, |ports, (port, _)| ports | 1 << port);
-        if wired != 0 {
-            node = node.with_ports(wired);
+        let mut wired = 0;
+        for (port, lane) in lanes.iter().enumerate().filter_map(|(port, lane)| Some((port, (*lane)?))) {
+            wired |= 1 << port;
+            self.ears.wire(lane.reversed(), self.cells.len(), port);
         }
-        for (port, lane) in lanes.iter().enumerate() {
-            if let Some(lane) = *lane {
-                self.ears.wire(lane.reversed(), place, port);
-            }
-        }
+        let node = Node::new(identity, self.format, flash, true, self.clock.now()).with_ports(wired);
         self.cells.push(Seat { node, file, lanes });
         self.hears_changed = true;
     }
@@ -180,7 +176,7 @@ impl Cells {
                     self.outbox.clear();
                     std::thread::sleep(DOWN);
                 }
-                Err(Stopped::Bus(error)) if line.is_gone(&error) => {
+                Err(Stopped::Bus(error)) if line.reconnect && error.is_closed() => {
                     self.outbox.clear();
                     sockets = self.open_again(line)?;
                 }
@@ -218,23 +214,25 @@ impl Cells {
             self.hears_changed = true;
             return Err(error.into());
         }
-        self.flush(sockets)?;
+        if !self.outbox.is_empty() {
+            sockets.send(&self.outbox)?;
+            self.outbox.clear();
+        }
         Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
     }
 
     /// Gives a frame to the cells that hear it, and takes at once what they say to it.
     fn take(&mut self, received: &Received, bus: &str, now: Micros) -> Result<(), Stopped> {
-        let frame = &received.frame;
+        let (frame, age) = (&received.frame, self.clock.age(now, received.at_nanos));
         if let Some(lane) = Lane::from_raw_id(frame.raw_id()) {
-            let Some((place, port)) = self.ears.of_lane(lane) else { return Ok(()) };
-            let age = self.clock.age(now, received.at_nanos);
-            if let (Some(seat), Some(message)) = (self.cells.get_mut(place), lane.read(frame)) {
+            if let Some((place, port)) = self.ears.of_lane(lane)
+                && let (Some(seat), Some(message)) = (self.cells.get_mut(place), lane.read(frame))
+            {
                 seat.node.handle_port(now, age, port, message);
                 self.hears_changed |= seat.collect(self.format, &mut self.outbox);
             }
             return Ok(());
         }
-        let age = self.clock.age(now, received.at_nanos);
         let Ok(id) = packet::data_id(frame) else {
             // Each counts what it cannot use.
             self.cells.iter_mut().for_each(|seat| seat.node.handle_frame(now, age, frame));
@@ -253,15 +251,6 @@ impl Cells {
                 return Err(Stopped::Taken { bus, cell, serial });
             }
             self.hears_changed |= seat.collect(self.format, &mut self.outbox);
-        }
-        Ok(())
-    }
-
-    /// Sends what is to be sent.
-    fn flush(&mut self, sockets: &Sockets) -> Result<(), Stopped> {
-        if !self.outbox.is_empty() {
-            sockets.send(&self.outbox)?;
-            self.outbox.clear();
         }
         Ok(())
     }

@@ -3,10 +3,11 @@
 
 pub mod contact;
 pub mod flash;
+pub mod identity;
 #[cfg(feature = "host")]
 pub mod io;
 pub mod kernel;
-pub mod network;
+mod network;
 pub mod node;
 pub mod sine;
 pub mod sum;

@@ -4,14 +4,14 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result, bail};
-use cell_node::flash::Kept;
+use anyhow::{Context, Result, bail, ensure};
+use cell_node::flash::{Flash, Kept};
+use cell_node::identity::Identity;
 use cell_node::io::{Cells, FlashFile, Lanes, Line, Sockets, Stopped};
-use cell_node::node::{Flash, Identity};
 use clap::Parser;
 use protocol::bus::Choice;
 use protocol::id::CellId;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{Reply, Skin, Wires};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// A tactile skin cell: hears joint positions, answers with its joint torques.
@@ -57,14 +57,11 @@ struct Arguments {
 }
 
 fn range(text: &str) -> Result<(u8, u8), String> {
-    let parse = || {
-        let (first, last) = text.split_once('-')?;
-        Some((first.parse().ok()?, last.parse().ok()?))
-    };
-    match parse() {
-        Some((first, last)) if 1 <= first && first <= last && last <= CellId::MAX.get() => Ok((first, last)),
-        _ => Err("two numbers of 1 to 254, the lesser one first, such as 1-64".to_owned()),
-    }
+    let numbers =
+        text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
+    numbers
+        .filter(|&(first, last)| 1 <= first && first <= last && last <= CellId::MAX.get())
+        .ok_or_else(|| "two numbers of 1 to 254, the lesser one first, such as 1-64".to_owned())
 }
 
 /// One line in one piece, for hundreds of cells may share this standard error.
@@ -106,53 +103,26 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
         // Not TERM, which a stopped process would not take before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
         // It may have ended before that.
-        if getppid() != Pid::from_raw(parent) {
-            bail!("process {parent} is not the parent of this one");
-        }
+        ensure!(getppid() == Pid::from_raw(parent), "process {parent} is not the parent of this one");
     }
     if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
         bail!("--flash {}: there is no such directory; make it first", flash.display());
     }
     let skin = Skin::read(&arguments.skin)?;
-    let file = arguments.skin.display();
     let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        format!("bus {} is not in {file}, which has {names}", arguments.bus)
+        format!("bus {} is not in {}, which has {names}", arguments.bus, arguments.skin.display())
     })?;
     let bus = skin.buses.get(bus_index).context("the bus that was found")?;
     let wires = match bus.reply {
         Reply::Torque => None,
         Reply::Sum { .. } => Some(skin.wires(bus_index)),
     };
-    let (first, last) = match (arguments.node, arguments.nodes) {
-        (Some(node), _) => (node, node),
-        (None, Some(nodes)) => nodes,
-        (None, None) => bail!("--node or --nodes is needed"),
-    };
+    let one = arguments.node.map(|node| (node, node));
+    let (first, last) = one.or(arguments.nodes).context("--node or --nodes is needed")?;
     let mut cells = Cells::new(bus.format);
     for number in first..=last {
-        let cell = CellId::new(i64::from(number))?;
-        let described = skin.cells_of(bus_index).find(|described| described.node == cell);
-        let described =
-            described.with_context(|| format!("cell {cell} is not on {} in {file}", arguments.bus))?;
-        // Nobody gives a number to a cell without wires.
-        let is_nameless = arguments.fresh && wires.is_some();
-        let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
-        let flash_file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
-        let (number, mut flash, damage) = flash_file.load().with_context(|| flash_file.name())?;
-        if let Some(damage) = damage {
-            let name = flash_file.name();
-            say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
-        }
-        identity.cell = identity.cell.or(number);
-        if flash == Flash::Empty && !arguments.fresh {
-            let parameters = skin.parameters(described);
-            let kept = Kept { number: Some(cell), parameters: Some(parameters) };
-            flash_file.store(&kept).with_context(|| flash_file.name())?;
-            flash = Flash::Sound(parameters);
-        }
-        let lanes = wires.as_ref().map_or_else(Lanes::default, |wires| wires.of_cell(cell));
-        cells.start(identity, &flash, flash_file, lanes);
+        start(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
     }
     let line = Line {
         name: arguments.bus.clone(),
@@ -171,4 +141,42 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
         opened => opened?,
     };
     Ok((cells, sockets, line))
+}
+
+/// Starts a cell with what its flash holds, which is first filled from the description.
+fn start(
+    cells: &mut Cells,
+    arguments: &Arguments,
+    skin: &Skin,
+    bus_index: usize,
+    wires: Option<&Wires>,
+    cell: CellId,
+) -> Result<()> {
+    let described = skin.cells_of(bus_index).find(|described| described.node == cell).with_context(|| {
+        format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
+    })?;
+    // Nobody gives a number to a cell without wires.
+    let is_nameless = arguments.fresh && wires.is_some();
+    let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
+    let file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
+    let flash = match file.load().with_context(|| file.name())? {
+        Ok(Kept { parameters: None, .. }) if !arguments.fresh => {
+            let parameters = skin.parameters(described);
+            let kept = Kept { number: Some(cell), parameters: Some(parameters) };
+            file.store(&kept).with_context(|| file.name())?;
+            Flash::Sound(parameters)
+        }
+        Ok(Kept { number, parameters }) => {
+            identity.cell = identity.cell.or(number);
+            parameters.map_or(Flash::Empty, Flash::Sound)
+        }
+        Err(damage) => {
+            let name = file.name();
+            say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
+            Flash::Damaged
+        }
+    };
+    let lanes = wires.map_or_else(Lanes::default, |wires| wires.of_cell(cell));
+    cells.start(identity, &flash, file, lanes);
+    Ok(())
 }

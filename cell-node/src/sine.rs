@@ -20,7 +20,7 @@ use protocol::fixed::Q1_14;
 /// One, in the 16 fraction bits in which the polynomials are evaluated.
 const ONE: i32 = 1 << 16;
 /// A quarter turn as a word.
-const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
+pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 
 /// The odd polynomial of seventh order for a quarter turn: coefficients of z, z^3, z^5, z^7.
 ///

@@ -46,7 +46,7 @@ impl Words {
 
 /// Whether it is time to look who is missing.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Check {
+pub(crate) enum Check {
     /// Not yet, or not at all.
     NotYet,
     /// Now.
@@ -74,11 +74,10 @@ struct Child {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sum {
     slots: Option<Slots>,
+    /// The present epoch.
     epoch: Option<Epoch>,
-    /// When the joints of this epoch stood on the bus.
-    began: Micros,
-    period: Span,
-    depth: u8,
+    /// How it began, or the last one that did.
+    begin: Begin,
     /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
     own: Option<[i32; WORDS]>,
     /// It spoke in the epoch before: without anything to add it says so once.
@@ -86,10 +85,6 @@ pub struct Sum {
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
-    /// Bit p: the cell at port p is a child in the present epoch.
-    ports: u8,
-    /// Whether the present epoch's sum may be sent.
-    speaks: bool,
     /// It waits for a sign of the parent.
     held: bool,
     /// When it is to be sent.
@@ -111,7 +106,7 @@ pub struct Sum {
 }
 
 /// An epoch, as sums see it.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Begin {
     /// Its number.
     pub epoch: Epoch,
@@ -137,8 +132,7 @@ impl Sum {
     }
 
     /// Whether sums are said.
-    #[must_use]
-    pub const fn is_on(&self) -> bool {
+    pub(crate) const fn is_on(&self) -> bool {
         self.slots.is_some()
     }
 
@@ -153,23 +147,16 @@ impl Sum {
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
             *child = Child { last, heard: false, taken: None, waiting, missing: child.missing };
         }
-        self.period = begin.period;
-        self.began = begin.at;
-        self.depth = begin.depth.unwrap_or(slots.deepest);
-        self.speaks = begin.speaks && begin.depth.is_some();
+        self.begin = *begin;
         self.held = false;
-        self.own = match own {
-            Some(exact) => Some(self.round(exact, slots.carry)),
-            None => {
-                self.carry = [0; WORDS];
-                None
-            }
-        };
+        if own.is_none() {
+            self.carry = [0; WORDS];
+        }
+        self.own = own.map(|exact| self.round(exact, slots.carry));
         // What was said last is not to be held for ever.
         self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
-        self.ports = begin.children;
         self.due = None;
-        self.plan(self.began);
+        self.plan(begin.at);
         (self.judged, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
             self.watch();
@@ -177,15 +164,15 @@ impl Sum {
     }
 
     /// It is looked who is missing before the next joints come, while there is time to do something about it.
-    pub const fn watch(&mut self) {
+    pub(crate) fn watch(&mut self) {
         if !self.judged && self.epoch.is_some() {
-            self.check = Some(self.settled_at());
+            self.check = Some(self.begin.at + self.settles());
         }
     }
 
-    /// By when all has been said that is said in an epoch.
-    const fn settled_at(&self) -> Micros {
-        Micros(self.began.0 + self.period.0 * 7 / 8)
+    /// How long after joints all has been said that is said in an epoch.
+    const fn settles(&self) -> Span {
+        Span(self.begin.period.0 * 7 / 8)
     }
 
     /// Q7.8, to the nearest; what that took away goes into the next one.
@@ -240,14 +227,15 @@ impl Sum {
             return;
         }
         let width = u64::from(slots.slot_us);
-        let slot = u64::from(slots.deepest.saturating_sub(self.depth)) * width;
+        let slot = u64::from(slots.deepest.saturating_sub(self.depth())) * width;
         if self.said.is_some_and(|(of, _)| Some(of) == self.epoch) {
-            let next = (now.since(self.began).0 / width + 1) * width;
-            let at = self.began + Span(next.max(slot));
+            let next = (now.since(self.begin.at).0 / width + 1) * width;
+            let at = self.begin.at + Span(next.max(slot));
             self.due = Some(self.due.map_or(at, |due| due.min(at)));
             return;
         }
-        let is_in = |(port, child): (usize, &Child)| self.ports >> port & 1 == 0 || child.taken.is_some();
+        let is_in =
+            |(port, child): (usize, &Child)| self.begin.children >> port & 1 == 0 || child.taken.is_some();
         let is_late = |child: &Child| child.last.is_some() && child.taken.is_none();
         let at = if self.children.iter().enumerate().all(is_in) {
             0
@@ -256,30 +244,33 @@ impl Sum {
         } else {
             slot
         };
-        self.due = Some(self.began + Span(at));
+        self.due = Some(self.begin.at + Span(at));
+    }
+
+    /// Wires to the root, as many as there may be where there is no way up.
+    fn depth(&self) -> u8 {
+        self.begin.depth.or_else(|| self.slots.map(|slots| slots.deepest)).unwrap_or(0)
     }
 
     /// After joints, by when a sum that waits for a late child is said: half a slot for each wire to the root before all
     /// is said, so that who waits above does not wait in vain.
     fn late(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
-        Span((self.period.0 * 7 / 8).saturating_sub(u64::from(self.depth) * width / 2))
+        Span(self.settles().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
 
     /// Whether a child's sum is waited for in each epoch: its lease runs.
-    #[must_use]
-    pub fn awaits_children(&self) -> bool {
+    pub(crate) fn awaits_children(&self) -> bool {
         self.children.iter().any(|child| child.last.is_some())
     }
 
     /// By when the sum of the next epoch has to be said that waits for a late child.
-    #[must_use]
-    pub fn late_at_next(&self) -> Micros {
-        self.began + self.period + self.late()
+    pub(crate) fn late_at_next(&self) -> Micros {
+        self.begin.at + self.begin.period + self.late()
     }
 
     /// A child is none any more.
-    pub fn disown(&mut self, port: usize) {
+    pub(crate) fn disown(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
             // What was taken in this epoch stays: its sender sends no other for it.
             child.last = None;
@@ -289,30 +280,23 @@ impl Sum {
     }
 
     /// The way up is lost: nothing more of this epoch is said.
-    pub const fn fall_silent(&mut self) {
-        self.speaks = false;
+    pub(crate) const fn fall_silent(&mut self) {
+        self.begin.speaks = false;
         self.due = None;
     }
 
     /// What is to be said waits until it is released.
-    pub const fn hold(&mut self) {
+    pub(crate) const fn hold(&mut self) {
         self.held = true;
     }
 
     /// What waited may be said.
-    pub const fn release(&mut self) {
+    pub(crate) const fn release(&mut self) {
         self.held = false;
     }
 
-    /// Whether what is to be said waits.
-    #[must_use]
-    pub const fn is_held(&self) -> bool {
-        self.held
-    }
-
     /// When there is something to do.
-    #[must_use]
-    pub fn poll_timeout(&self) -> Option<Micros> {
+    pub(crate) fn poll_timeout(&self) -> Option<Micros> {
         self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
     }
 
@@ -321,7 +305,7 @@ impl Sum {
     pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
         let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
-        if !self.speaks {
+        if !self.begin.speaks || self.begin.depth.is_none() {
             return None;
         }
         let words = self.words()?;
@@ -352,40 +336,35 @@ impl Sum {
         }
         let mut torque = [Q7_8::ZERO; WORDS];
         for ((word, sum), saturated) in torque.iter_mut().zip(sum).zip(saturated) {
-            let least = i64::from(i16::MIN);
-            let held = if saturated { if sum < 0 { least } else { i16::MAX.into() } } else { sum };
-            let fits = held.clamp(least, i16::MAX.into());
-            *word = Q7_8::from_bits(i16::try_from(fits).unwrap_or(i16::MAX));
+            let fits = i16::try_from(sum).ok().filter(|_| !saturated);
+            *word = Q7_8::from_bits(fits.unwrap_or(if sum < 0 { i16::MIN } else { i16::MAX }));
         }
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// The last sum that was sent, and its epoch.
-    #[must_use]
-    pub const fn said(&self) -> Option<(Epoch, Words)> {
-        self.said
+    /// Whether the last sum was said in this epoch.
+    pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
+        self.said.is_some_and(|(of, _)| of == epoch)
     }
 
     /// Whether a sum went up in this epoch or the one before, and others are to follow.
-    #[must_use]
-    pub fn is_busy(&self) -> bool {
+    pub(crate) fn is_busy(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
         self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
     }
 
     /// The present epoch.
-    #[must_use]
-    pub const fn epoch(&self) -> Option<Epoch> {
+    pub(crate) const fn epoch(&self) -> Option<Epoch> {
         self.epoch
     }
 
     /// The parent did not take the last sum: the next one has to be stated anew.
-    pub const fn break_off(&mut self) {
+    pub(crate) const fn break_off(&mut self) {
         self.restate = true;
     }
 
     /// Joints that are not answered: whoever goes on after them has to be stated anew.
-    pub fn skip(&mut self) {
+    pub(crate) fn skip(&mut self) {
         self.epoch = None;
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
@@ -395,28 +374,21 @@ impl Sum {
 
     /// Something was heard so long after it stood on the bus: when that is more than a quarter of a period, the machine
     /// itself is late, nobody is to blame, and it is not looked who is missing in this epoch.
-    pub const fn heard_after(&mut self, age: Span) {
-        if age.0 * 4 > self.period.0 && self.period.0 > 0 {
+    pub(crate) const fn heard_after(&mut self, age: Span) {
+        if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
             self.judged = true;
             self.check = None;
         }
     }
 
-    /// Whether it has been looked who is missing in this epoch.
-    #[must_use]
-    pub const fn is_judged(&self) -> bool {
-        self.judged
-    }
-
     /// Whether all of this epoch is done.
-    #[must_use]
-    pub fn is_settled(&self, now: Micros) -> bool {
-        self.epoch.is_none() || now >= self.settled_at()
+    pub(crate) fn is_settled(&self, now: Micros) -> bool {
+        self.epoch.is_none() || now >= self.begin.at + self.settles()
     }
 
     /// Whether the time has come to look before the next joints; who looks late looks then, when all that came
     /// before them has been heard.
-    pub fn check(&mut self, now: Micros) -> Check {
+    pub(crate) fn check(&mut self, now: Micros) -> Check {
         match self.check.take_if(|check| *check <= now) {
             None => Check::NotYet,
             Some(check) if now.since(check) > PUNCTUAL => Check::Late,
@@ -426,7 +398,7 @@ impl Sum {
 
     /// Looks once in an epoch: bit p says that the sum of the child at port p should have come and did not. Such a
     /// sum is not taken any more.
-    pub fn judge(&mut self) -> Option<(Epoch, u8)> {
+    pub(crate) fn judge(&mut self) -> Option<(Epoch, u8)> {
         if core::mem::replace(&mut self.judged, true) {
             return None;
         }

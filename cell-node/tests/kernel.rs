@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::contact::{Force, Torque};
-use cell_node::kernel::witness::{Counted, Operations};
-use cell_node::kernel::{Kernel, PaperWord, Projection, Wrench};
+use cell_node::kernel::witness::Counted;
+use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Wrench};
 use proptest::prelude::*;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};

@@ -12,19 +12,22 @@
     reason = "a harness may stop when it is asked for what is not there; of messages it wants three"
 )]
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+mod place;
+mod sums;
+mod survey;
 
-use cell_node::contact::{Force, Torque};
-use cell_node::kernel::{Kernel, Wrench};
-use cell_node::node::{Flash, Identity, Node};
+use std::collections::{HashMap, VecDeque};
+
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
 use cell_node::sum::Words;
 use model::network::Uplinks;
-use protocol::can::{Format, Frame};
-use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
-use protocol::id::CellId;
-use protocol::message::{From, Joints, Message, NetworkPage, Ports, Request, SensorPage, SkinSensors, Tree};
+use protocol::can::Format;
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{self, Epoch, WORDS};
-use protocol::parameters::{Contact, Cuts, Parameter, Parameters, Pose, Reply, Row, Slots};
+use protocol::parameters::{Cuts, Parameter, Reply, Slots};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
 use rand::seq::{IndexedRandom, SliceRandom};
@@ -32,6 +35,9 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
+use place::{Inlet, Life};
+
+pub use place::Place;
 
 /// From one broadcast to the next.
 pub const PERIOD: Span = Span(16_000);
@@ -49,47 +55,6 @@ pub enum End {
     Cell(usize, usize),
     /// The gateway's side; the root with this place.
     Gateway(usize),
-}
-
-/// How a cell is.
-#[derive(Debug)]
-enum Life {
-    Off,
-    Runs(Box<Node>),
-    Hangs(Box<Node>, VecDeque<(Micros, Inlet)>),
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Inlet {
-    Frame(Frame),
-    Port(usize, PortMessage),
-}
-
-/// One cell.
-#[derive(Debug)]
-pub struct Place {
-    /// Its number, once it has one; kept over restarts as in flash.
-    pub number: Option<CellId>,
-    /// What its ports lead to.
-    pub wires: [Option<End>; PORTS + 1],
-    /// Port p hears nothing.
-    pub deaf: [bool; PORTS + 1],
-    /// The last page of its place in the tree.
-    pub tree: Option<Tree>,
-    /// The last page of its ports.
-    pub ports: Option<Ports>,
-    /// Its own torque, as it enters sums.
-    own: [i32; WORDS],
-    serial: u32,
-    parameters: Parameters,
-    force: Force,
-    life: Life,
-    wake: Option<Micros>,
-    /// What it hears aside, and when that stood on the bus: it does not wake it.
-    aside: VecDeque<(Micros, Frame)>,
-    newest: Micros,
-    /// What it said in each of the last epochs: words, and who is in it.
-    said: HashMap<u8, Vec<(Words, u128)>>,
 }
 
 #[derive(Debug)]
@@ -232,12 +197,6 @@ impl Wiring {
     #[must_use]
     pub const fn now(&self) -> Micros {
         self.agenda.now
-    }
-
-    /// Whether a cell works.
-    #[must_use]
-    pub fn runs(&self, cell: usize) -> bool {
-        matches!(self.cells[cell].life, Life::Runs(_))
     }
 
     /// A cell is switched on, or off and on.
@@ -432,91 +391,6 @@ impl Wiring {
         *newest
     }
 
-    /// A cell says a sum: who is in it, and who hears it.
-    fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
-        let cells = self.decode(cell, epoch, words);
-        let said = &mut self.cells[cell].said;
-        if said.len() > 8 {
-            said.retain(|of, _| Epoch(*of).since(epoch) >= -4);
-        }
-        said.entry(epoch.0).or_default().push((words, cells));
-        let frame = Message::Sum { from, epoch, torque: words.torque, count: words.count }.encode();
-        let frame = frame.frames(Format::Fd).next().expect("one frame");
-        let neighbours: BTreeSet<usize> = self.cells[cell]
-            .wires
-            .iter()
-            .filter_map(|end| match end {
-                Some(End::Cell(other, _)) => Some(*other),
-                Some(End::Gateway(_)) | None => None,
-            })
-            .collect();
-        for other in neighbours {
-            let hears = match &self.cells[other].life {
-                Life::Runs(node) | Life::Hangs(node, _) => node.hears().any(|id| id == frame_id(from)),
-                Life::Off => false,
-            };
-            if hears {
-                let at = self.arrival(Some(other));
-                self.agenda.enter(at, Event::Deliver(other, Inlet::Frame(frame)));
-            }
-        }
-        let root = self.roots.iter().position(|&root| root == cell);
-        if root.is_some_and(|root| self.uplinks.is_child(root)) && self.epoch == Some(epoch) {
-            let best = self.root_sums.entry(cell).or_insert((words, cells));
-            if words.count >= best.0.count {
-                *best = (words, cells);
-            }
-            if let Some(took) = self.took.last_mut() {
-                took.frames += 1;
-                took.cells = 0;
-                for (root, (_, cells)) in &self.root_sums {
-                    assert_eq!(
-                        took.cells & cells,
-                        0,
-                        "root {root} counts cells of another one in {epoch:?}: {:?}; {}",
-                        self.root_sums,
-                        self.ways()
-                    );
-                    took.cells |= cells;
-                }
-            }
-        }
-    }
-
-    /// Which cells are in a sum: its own torque or not, and some of the sums that its neighbours said.
-    fn decode(&self, cell: usize, epoch: Epoch, words: Words) -> u128 {
-        let place = &self.cells[cell];
-        let mut heard: Vec<Vec<(Words, u128)>> = Vec::new();
-        let mut seen = BTreeSet::new();
-        for end in place.wires.iter().flatten() {
-            if let End::Cell(other, _) = end
-                && seen.insert(*other)
-                && let Some(said) = self.cells[*other].said.get(&epoch.0)
-            {
-                heard.push(said.clone());
-            }
-        }
-        let wanted = words.torque.map(|word| i32::from(word.to_bits()));
-        let mut found = None;
-        for own in [1_u32, 0] {
-            let sum = if own == 1 { place.own } else { [0; WORDS] };
-            choose(&heard, sum, own, u128::from(own) << cell, (&wanted, words.count.into()), &mut found);
-        }
-        // The end of a contact: zeros of its own, and no torque.
-        if words.is_end() {
-            return 0;
-        }
-        let cells = found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));
-        assert_ne!(
-            cells,
-            TWICE,
-            "cell {cell} counts a cell twice in {epoch:?} at {:?}: {words:?} of {heard:?}; {}",
-            self.agenda.now,
-            self.ways()
-        );
-        cells
-    }
-
     fn gateway_says(&mut self) {
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if self.loss > 0.0 && self.dice.random_bool(self.loss) {
@@ -558,13 +432,6 @@ impl Wiring {
         self.ticking = false;
     }
 
-    /// Whether a cell is woken by its children and not by joints.
-    #[must_use]
-    pub fn waits_for_children(&self, cell: usize) -> bool {
-        let joints = protocol::id::Id::command(protocol::id::Command::Joints);
-        matches!(&self.cells[cell].life, Life::Runs(node) if node.hears_aside(joints))
-    }
-
     /// Every cell is told to answer with sums.
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
@@ -581,157 +448,5 @@ impl Wiring {
         let contact = if pressed { [word, Q5_10::ZERO, Q5_10::ZERO] } else { [Q5_10::ZERO; 3] };
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
         self.say(&Message::Stimulus { to: protocol::id::Node::Cell(number), from: From::Next, page });
-    }
-
-    /// Cells that have a way to the gateway, by wires that work in both directions and cells that run.
-    #[must_use]
-    pub fn reachable(&self) -> BTreeSet<usize> {
-        let mut reached = BTreeSet::new();
-        let mut next: Vec<usize> = self.roots.iter().copied().filter(|&root| self.runs(root)).collect();
-        while let Some(cell) = next.pop() {
-            if !reached.insert(cell) {
-                continue;
-            }
-            for (port, end) in self.cells[cell].wires.iter().enumerate() {
-                if let Some(End::Cell(other, at)) = *end {
-                    let works = !self.cells[cell].deaf[port] && !self.cells[other].deaf[at];
-                    if works && self.runs(other) {
-                        next.push(other);
-                    }
-                }
-            }
-        }
-        reached
-    }
-
-    /// The way of a cell's sums to a root, by what the cells report; `None` without one, or in a circle.
-    #[must_use]
-    pub fn way(&self, cell: usize) -> Option<Vec<usize>> {
-        let mut way = vec![cell];
-        loop {
-            let at = *way.last()?;
-            let tree = self.cells[at].tree?;
-            match tree.parent? {
-                0 => return Some(way),
-                parent => {
-                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
-                        return None;
-                    };
-                    if self.cells[other].number.map(CellId::get) != Some(parent) || way.contains(&other) {
-                        return None;
-                    }
-                    way.push(other);
-                }
-            }
-        }
-    }
-
-    /// All ways, for people.
-    #[must_use]
-    pub fn ways(&self) -> String {
-        let way = |cell: usize| {
-            let place = &self.cells[cell];
-            let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
-            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.way(cell))
-        };
-        (0..self.cells.len()).map(way).collect::<Vec<_>>().join("; ")
-    }
-
-    /// The bits of some cells.
-    #[must_use]
-    pub fn bits(cells: &BTreeSet<usize>) -> u128 {
-        cells.iter().map(|cell| 1 << cell).sum()
-    }
-}
-
-/// Instead of the cells in a sum: one of them is in it twice.
-const TWICE: u128 = u128::MAX;
-
-fn frame_id(from: CellId) -> protocol::id::Id {
-    protocol::id::Id::new(protocol::id::Kind::Sum, protocol::id::Node::Cell(from))
-}
-
-/// Tries every choice of one sum, or none, of each neighbour.
-fn choose(
-    heard: &[Vec<(Words, u128)>],
-    sum: [i32; WORDS],
-    count: u32,
-    cells: u128,
-    wanted: (&[i32; WORDS], u32),
-    found: &mut Option<u128>,
-) {
-    if count == wanted.1 && sum == *wanted.0 && found.is_none_or(|before| before == TWICE) {
-        *found = Some(cells);
-    }
-    let Some((first, rest)) = heard.split_first() else { return };
-    if count > wanted.1 {
-        return;
-    }
-    for (words, of) in first {
-        let mut with = sum;
-        for (sum, word) in with.iter_mut().zip(words.torque) {
-            *sum += i32::from(word.to_bits());
-        }
-        // Where a cell is in it twice, all the bits are set that nobody has.
-        let both = if cells & of == 0 { cells | of } else { TWICE };
-        choose(rest, with, count + u32::from(words.count), both, wanted, found);
-    }
-    choose(rest, sum, count, cells, wanted, found);
-}
-
-impl Place {
-    fn new(index: usize, dice: &mut Pcg64Mcg) -> Self {
-        let mut normal = [0.0_f64; 3].map(|_| dice.random_range(-1.0..1.0_f64));
-        let length = normal.iter().map(|n| n * n).sum::<f64>().sqrt().max(1e-3);
-        normal.iter_mut().for_each(|n| *n /= length);
-        if (normal.iter().map(|n| n * n).sum::<f64>() - 1.0).abs() > 1e-3 {
-            normal = [0.0, 0.0, 1.0];
-        }
-        let row = |a, alpha, d| Row {
-            a: Q1_14::nearest(a),
-            d: Q1_14::nearest(d),
-            alpha: Q1_14::nearest(alpha),
-            theta_offset: Q1_14::ZERO,
-        };
-        let parameters = Parameters {
-            joint: 6,
-            joints: 6,
-            pose: Pose {
-                position: [0.0; 3].map(|_: f64| Q1_14::nearest(dice.random_range(-0.2..0.2))),
-                normal: normal.map(Q1_14::nearest),
-            },
-            contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
-            period_us: 16_000,
-            rows: [
-                row(0.0, 1.0, 0.09),
-                row(-0.425, 0.0, 0.0),
-                row(-0.392, 0.0, 0.0),
-                row(0.0, 1.0, 0.11),
-                row(0.0, -1.0, 0.095),
-                row(0.0, 0.0, 0.08),
-            ],
-        };
-        let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
-        let jacobian = Wrench::new(&parameters).jacobian(&POSITIONS.map(Q1_14::nearest));
-        let own = Torque::new(&jacobian, force).exact().map(|exact| {
-            let word: Q7_8 = exact.round();
-            i32::from(word.to_bits())
-        });
-        Self {
-            number: None,
-            wires: [None; PORTS + 1],
-            deaf: [false; PORTS + 1],
-            tree: None,
-            ports: None,
-            own,
-            serial: 1_000 + u32::try_from(index).expect("few cells"),
-            parameters,
-            force,
-            life: Life::Off,
-            wake: None,
-            aside: VecDeque::new(),
-            newest: Micros(0),
-            said: HashMap::new(),
-        }
     }
 }

@@ -2,7 +2,9 @@
 
 use std::collections::VecDeque;
 
-use cell_node::node::{Flash, Identity, Node};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
 use protocol::can::{Format, Frame};
 use protocol::packet::Packet;
 use protocol::time::{Micros, Span};

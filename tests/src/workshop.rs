@@ -1,7 +1,9 @@
 //! Where cells are commissioned in virtual time: real [`Node`]s, a bus that loses, repeats and damages by seeded
 //! chance, and a hand that switches cells, and the commissioning, off and on.
 
-use cell_node::node::{Flash, Identity, Node};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
 use model::commission::{Commission, Report, Wish};
 use model::decode::{Decoded, Decoder};
 use protocol::can::{Format, Frame};

@@ -2,7 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use cell_node::node::{CLAIM, Flash, HEARTBEAT, Identity, PENDING};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::{CLAIM, HEARTBEAT, PENDING};
 use model::table::{DEAD_AFTER, Event, Notice, Replies, Status};
 use protocol::can::Format;
 use protocol::id::Kind;

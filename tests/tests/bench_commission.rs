@@ -2,7 +2,8 @@
 //! who has not what the skin says, and no cell ever has anything but its old parameters or its new ones.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
-use cell_node::node::{Flash, Identity};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
 use model::commission::{Outcome, Reason, Report, Trouble, Wish};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};

@@ -9,7 +9,9 @@
 )]
 
 use bench::replay::state::State;
-use cell_node::node::{Flash, Identity, Node};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
 use model::generate::{Wanted, generate};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};

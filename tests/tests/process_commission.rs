@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use cell_node::flash;
-use cell_node::node::Identity;
+use cell_node::identity::Identity;
 use model::generate::{Format, Reply, Wanted, generate};
 use process::{Ended, Place, Running, skin, skin_of, until};
 use protocol::id::CellId;

@@ -14,7 +14,7 @@ use std::fs;
 use std::time::{Duration, Instant};
 
 use cell_node::flash;
-use cell_node::node::Identity;
+use cell_node::identity::Identity;
 use model::decode::Decoded;
 use model::generate::{Format as Wanted, Reply, generate};
 use model::network::Uplinks;

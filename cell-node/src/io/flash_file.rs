@@ -5,11 +5,10 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use protocol::id::CellId;
 use rustix::fs::OFlags;
 
 use crate::flash::{self, FlashError, Kept};
-use crate::node::{Flash, Identity};
+use crate::identity::Identity;
 
 /// Bytes that are read of a file; what flash holds is far less.
 const LONGEST: u64 = 64 << 10;
@@ -41,21 +40,17 @@ impl FlashFile {
         )
     }
 
-    /// What it holds: a number, and parameters. What is there but not sound is damaged; why is the last value.
+    /// What it holds, which is nothing where there is no file; or why that is not used.
     ///
     /// # Errors
     /// When the file is there and cannot be read.
-    pub fn load(&self) -> io::Result<(Option<CellId>, Flash, Option<FlashError>)> {
-        let Some(path) = &self.path else { return Ok((None, Flash::Empty, None)) };
-        let bytes = match read(path) {
-            Ok(bytes) => bytes,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((None, Flash::Empty, None)),
-            Err(error) => return Err(error),
-        };
-        Ok(match flash::decode(self.identity, &bytes) {
-            Ok(kept) => (kept.number, kept.parameters.map_or(Flash::Empty, Flash::Sound), None),
-            Err(error) => (None, Flash::Damaged, Some(error)),
-        })
+    pub fn load(&self) -> io::Result<Result<Kept, FlashError>> {
+        let Some(path) = &self.path else { return Ok(Ok(Kept::default())) };
+        match read(path) {
+            Ok(bytes) => Ok(flash::decode(self.identity, &bytes)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Ok(Kept::default())),
+            Err(error) => Err(error),
+        }
     }
 
     /// Keeps a number and parameters: a whole new file takes the old one's place, or nothing changes.

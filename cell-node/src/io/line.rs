@@ -1,6 +1,6 @@
 //! Where the bus of a process comes from.
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Options};
+use protocol::bus::{Bus, BusKind, Choice, Options};
 
 use super::Stopped;
 
@@ -28,10 +28,5 @@ impl Line {
             return Err(Stopped::Real { bus: self.name.clone() });
         }
         Ok(bus)
-    }
-
-    /// Whether this is a reason to open it again.
-    pub(super) const fn is_gone(&self, error: &BusError) -> bool {
-        self.reconnect && error.is_closed()
     }
 }

@@ -39,11 +39,13 @@ pub mod witness;
 mod wrench;
 
 pub use projection::Projection;
-pub use scalar::{PaperWord, Scalar};
+pub use scalar::{Operations, PaperWord, Scalar, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters};
+
+use crate::sine::FINE;
 
 /// A way to compute the Jacobian of a cell's normal force.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
@@ -58,37 +60,42 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];
 }
 
+/// A length of the robot's table; none where it is zero, for then it costs nothing.
+fn length<S: Scalar>(word: Q1_14) -> Option<S> {
+    (word != Q1_14::ZERO).then(|| S::word(word))
+}
+
+/// A joint's angle from its position and its offset, an addition that a zero does not cost.
+#[inline]
+fn angle<S: Scalar>(position: Q1_14, offset: Q1_14) -> Q1_14 {
+    if offset == Q1_14::ZERO { position } else { S::plus_angle(position, offset) }
+}
+
 /// How a link's twist alpha turns y and z into each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Twist<S> {
-    /// By no turn, one, two or three quarter turns.
-    Quarters(Quarters),
+    /// Not at all.
+    None,
+    /// By a quarter turn.
+    Ahead,
+    /// By half a turn.
+    Half,
+    /// By a quarter turn the other way.
+    Back,
     /// By any other angle.
     Other { sine: S, cosine: S },
-}
-
-/// Whole quarter turns.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Quarters {
-    None,
-    Ahead,
-    Half,
-    Back,
 }
 
 impl<S: Scalar> Twist<S> {
     fn new(alpha: Q1_14) -> Self {
         match alpha.to_bits() {
-            0 => Self::Quarters(Quarters::None),
-            0x4000 => Self::Quarters(Quarters::Ahead),
-            i16::MIN => Self::Quarters(Quarters::Half),
-            -0x4000 => Self::Quarters(Quarters::Back),
+            0 => Self::None,
+            0x4000 => Self::Ahead,
+            i16::MIN => Self::Half,
+            -0x4000 => Self::Back,
             _ => {
                 let [sine, cosine, _] = S::fine_turn(alpha);
-                Self::Other {
-                    sine: S::settle::<{ crate::sine::FINE }>(sine),
-                    cosine: S::settle::<{ crate::sine::FINE }>(cosine),
-                }
+                Self::Other { sine: S::settle::<FINE>(sine), cosine: S::settle::<FINE>(cosine) }
             }
         }
     }

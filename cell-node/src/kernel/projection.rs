@@ -20,7 +20,7 @@
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-use super::{Kernel, Quarters, Scalar, Twist};
+use super::{Kernel, Scalar, Twist, angle, length};
 
 /// The projection kernel, of one cell.
 ///
@@ -80,10 +80,10 @@ struct Step<S> {
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
-        let mut links = [Link::IDLE; MAX_JOINTS];
-        for (index, (link, row)) in links.iter_mut().zip(chain).enumerate() {
-            *link = Link::new(row, index == 0, index + 1 == chain.len());
-        }
+        let links = core::array::from_fn(|index| {
+            let row = parameters.rows.get(index).copied().unwrap_or_default();
+            Link::new(&row, index == 0, index + 1 == chain.len())
+        });
         let (_, below) = chain.split_last().unzip();
         let upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
         Self {
@@ -96,7 +96,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::ZERO; MAX_JOINTS];
+        let mut jacobian = [S::zero(); MAX_JOINTS];
         let links = self.links.get(..self.joint).unwrap_or_default();
 
         let [mut x, mut y, mut z] = Component::BASE;
@@ -121,7 +121,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (x, y, z);
         let to_base = |[a, b, c]: [S; 3]| {
             let row = |x, y, z| Sum::Nothing.plus(a, x).plus(b, y).plus(c, z).component().number();
-            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::ZERO } else { row(x2, y2, z2) }]
+            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::zero() } else { row(x2, y2, z2) }]
         };
         let force = to_base(self.force);
         let mut position = to_base(self.position);
@@ -134,17 +134,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 }
 
 impl<S: Scalar> Link<S> {
-    const IDLE: Self = Self {
-        offset: Q1_14::ZERO,
-        twist: Twist::Quarters(Quarters::None),
-        a: None,
-        d: None,
-        x: false,
-        ends: false,
-    };
-
     fn new(row: &Row, first: bool, last: bool) -> Self {
-        let length = |word: Q1_14| (word != Q1_14::ZERO).then(|| S::word(word));
         let ends = last || row.alpha != Q1_14::ZERO;
         let a = length(row.a);
         Self {
@@ -159,7 +149,7 @@ impl<S: Scalar> Link<S> {
 
     /// The angle from the axes before the group of parallel joints to this joint's.
     fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
-        let own = if self.offset == Q1_14::ZERO { position } else { S::plus_angle(position, self.offset) };
+        let own = angle::<S>(position, self.offset);
         group.map_or(own, |group| S::plus_angle(group, own))
     }
 
@@ -178,10 +168,10 @@ impl<S: Scalar> Twist<S> {
     /// The second and the third axis after the twist, from those before it.
     fn turn_axes(self, v: Axis<S>, z: Axis<S>) -> [Axis<S>; 2] {
         match self {
-            Self::Quarters(Quarters::None) => [v, z],
-            Self::Quarters(Quarters::Ahead) => [z, v.map(Component::negative)],
-            Self::Quarters(Quarters::Half) => [v.map(Component::negative), z.map(Component::negative)],
-            Self::Quarters(Quarters::Back) => [z.map(Component::negative), v],
+            Self::None => [v, z],
+            Self::Ahead => [z, v.map(Component::negative)],
+            Self::Half => [v.map(Component::negative), z.map(Component::negative)],
+            Self::Back => [z.map(Component::negative), v],
             Self::Other { sine, cosine } => [
                 combine(v, z, |v, z| Sum::Nothing.plus(cosine, v).plus(sine, z)),
                 combine(v, z, |v, z| Sum::Nothing.plus(cosine, z).minus(sine, v)),
@@ -226,9 +216,9 @@ impl<S: Scalar> Component<S> {
 
     fn number(self) -> S {
         match self {
-            Self::Zero => S::ZERO,
-            Self::One => S::ONE,
-            Self::MinusOne => S::ONE.negative(),
+            Self::Zero => S::zero(),
+            Self::One => S::one(),
+            Self::MinusOne => S::one().negative(),
             Self::Varies(number) => number,
         }
     }
@@ -247,8 +237,14 @@ impl<S: Scalar> Sum<S> {
     fn plus(self, factor: S, component: Component<S>) -> Self {
         match component {
             Component::Zero => self,
-            Component::One => self.plus_word(factor),
-            Component::MinusOne => self.minus_word(factor),
+            Component::One => match self.wide() {
+                None => Self::Word(factor),
+                Some(sum) => Self::Wide(S::plus(sum, factor.widen())),
+            },
+            Component::MinusOne => match self.wide() {
+                None => Self::Word(factor.negative()),
+                Some(sum) => Self::Wide(S::minus(sum, factor.widen())),
+            },
             Component::Varies(number) => Self::Wide(match self.wide() {
                 None => factor.times(number),
                 Some(sum) => S::plus(sum, factor.times(number)),
@@ -258,23 +254,11 @@ impl<S: Scalar> Sum<S> {
 
     /// Without the product of a number and a component.
     fn minus(self, factor: S, component: Component<S>) -> Self {
-        match component {
-            Component::Zero => self,
-            Component::One => self.minus_word(factor),
-            Component::MinusOne => self.plus_word(factor),
-            Component::Varies(number) => Self::Wide(match self.wide() {
-                None => factor.negative().times(number),
-                Some(sum) => S::minus(sum, factor.times(number)),
-            }),
-        }
-    }
-
-    fn plus_word(self, word: S) -> Self {
-        self.wide().map_or(Self::Word(word), |sum| Self::Wide(S::plus(sum, word.widen())))
-    }
-
-    fn minus_word(self, word: S) -> Self {
-        self.wide().map_or_else(|| Self::Word(word.negative()), |sum| Self::Wide(S::minus(sum, word.widen())))
+        let Component::Varies(number) = component else { return self.plus(factor, component.negative()) };
+        Self::Wide(match self.wide() {
+            None => factor.negative().times(number),
+            Some(sum) => S::minus(sum, factor.times(number)),
+        })
     }
 
     fn wide(self) -> Option<S::Wide> {

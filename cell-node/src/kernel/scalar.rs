@@ -4,7 +4,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Acc, Q1_14};
 
-use crate::sine::{FINE, cosine, fine_sine_cosine, paper_cosine, paper_sine, sine};
+use crate::sine::{FINE, QUARTER, fine_sine_cosine, paper_sine, sine};
 
 /// A number that the kernels can compute with, and the wider sums of products in which they do it.
 ///
@@ -20,13 +20,18 @@ pub trait Scalar: Copy {
         + Mul<Output = Self::Fine>
         + Neg<Output = Self::Fine>;
 
-    /// Nothing.
-    const ZERO: Self;
-    /// One.
-    const ONE: Self;
-
     /// The number that a parameter's word means.
     fn word(word: Q1_14) -> Self;
+    /// Nothing.
+    #[must_use]
+    fn zero() -> Self {
+        Self::word(Q1_14::ZERO)
+    }
+    /// One.
+    #[must_use]
+    fn one() -> Self {
+        Self::word(QUARTER)
+    }
     /// The product.
     fn times(self, rhs: Self) -> Self::Wide;
     /// The number as a sum.
@@ -57,58 +62,121 @@ pub trait Scalar: Copy {
     fn settle<const F: u32>(constant: Self::Fine) -> Self;
 }
 
-/// What the cell computes with: words of 16 bits, products and sums of 32, the seventh-order sine.
-impl Scalar for Q1_14 {
-    type Wide = i32;
-    type Fine = i64;
+/// A number of 16 bits in the format Q1.14; as a [`Scalar`] its products and sums take 32 bits.
+pub trait Word: Copy {
+    /// The number that a word means.
+    fn from_word(word: Q1_14) -> Self;
+    /// The word.
+    fn to_word(self) -> Q1_14;
+    /// The sine of an angle in quarter turns, of seventh order unless it says otherwise.
+    #[must_use]
+    fn sine_word(angle: Q1_14) -> Q1_14 {
+        sine(angle)
+    }
+    /// Takes note of an operation, if it counts them.
+    fn note(_operation: impl FnOnce(&mut Operations)) {}
+}
 
-    const ZERO: Self = Self::ZERO;
-    const ONE: Self = Self::from_bits(1 << 14);
+/// How often a computation did what.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Operations {
+    /// Multiplications of two words.
+    pub multiplications: u32,
+    /// Additions and subtractions of sums.
+    pub additions: u32,
+    /// Sines.
+    pub sines: u32,
+    /// Cosines.
+    pub cosines: u32,
+    /// Negations of a word.
+    pub negations: u32,
+    /// Additions of angles, which wrap.
+    pub angle_additions: u32,
+    /// Sums rounded to a word.
+    pub roundings: u32,
+}
 
-    #[inline]
-    fn word(word: Q1_14) -> Self {
+/// What the cell computes with.
+impl Word for Q1_14 {
+    fn from_word(word: Q1_14) -> Self {
         word
     }
 
-    #[inline]
+    fn to_word(self) -> Q1_14 {
+        self
+    }
+}
+
+/// The same words with the paper's fifth-order sine (Eq. 17 to 19).
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct PaperWord(pub Q1_14);
+
+impl Word for PaperWord {
+    fn from_word(word: Q1_14) -> Self {
+        Self(word)
+    }
+
+    fn to_word(self) -> Q1_14 {
+        self.0
+    }
+
+    fn sine_word(angle: Q1_14) -> Q1_14 {
+        paper_sine(angle)
+    }
+}
+
+impl<W: Word> Scalar for W {
+    type Wide = i32;
+    type Fine = i64;
+
+    fn word(word: Q1_14) -> Self {
+        Self::from_word(word)
+    }
+
     fn times(self, rhs: Self) -> i32 {
-        i32::from(self.to_bits()) * i32::from(rhs.to_bits()) // at most 2^30
+        Self::note(|done| done.multiplications += 1);
+        i32::from(self.to_word().to_bits()) * i32::from(rhs.to_word().to_bits()) // at most 2^30
     }
 
-    #[inline]
     fn widen(self) -> i32 {
-        i32::from(self.to_bits()) << 14
+        i32::from(self.to_word().to_bits()) << 14
     }
 
-    #[inline]
     fn plus(lhs: i32, rhs: i32) -> i32 {
+        Self::note(|done| done.additions += 1);
         lhs.saturating_add(rhs)
     }
 
-    #[inline]
     fn minus(lhs: i32, rhs: i32) -> i32 {
+        Self::note(|done| done.additions += 1);
         lhs.saturating_sub(rhs)
     }
 
-    #[inline]
     fn round(sum: i32) -> Self {
+        Self::note(|done| done.roundings += 1);
         let steps = sum.saturating_add(1 << 13) >> 14;
-        Self::from_bits(i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX }))
+        let bits = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
+        Self::from_word(Q1_14::from_bits(bits))
     }
 
-    #[inline]
     fn negative(self) -> Self {
-        self.saturating_neg()
+        Self::note(|done| done.negations += 1);
+        Self::from_word(self.to_word().saturating_neg())
     }
 
-    #[inline]
     fn sine(angle: Q1_14) -> Self {
-        sine(angle)
+        Self::note(|done| done.sines += 1);
+        Self::from_word(Self::sine_word(angle))
     }
 
-    #[inline]
     fn cosine(angle: Q1_14) -> Self {
-        cosine(angle)
+        Self::note(|done| done.cosines += 1);
+        Self::from_word(Self::sine_word(angle.wrapping_add(QUARTER)))
+    }
+
+    fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
+        Self::note(|done| done.angle_additions += 1);
+        lhs.wrapping_add(rhs)
     }
 
     fn fine(word: Q1_14) -> i64 {
@@ -121,66 +189,6 @@ impl Scalar for Q1_14 {
     }
 
     fn settle<const F: u32>(constant: i64) -> Self {
-        Acc::<F>::from_steps(constant).round()
-    }
-}
-
-/// The same words with the paper's fifth-order sine (Eq. 17 to 19).
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct PaperWord(pub Q1_14);
-
-impl Scalar for PaperWord {
-    type Wide = i32;
-    type Fine = i64;
-
-    const ZERO: Self = Self(Q1_14::ZERO);
-    const ONE: Self = Self(<Q1_14 as Scalar>::ONE);
-
-    fn word(word: Q1_14) -> Self {
-        Self(word)
-    }
-
-    fn times(self, rhs: Self) -> i32 {
-        self.0.times(rhs.0)
-    }
-
-    fn widen(self) -> i32 {
-        Scalar::widen(self.0)
-    }
-
-    fn plus(lhs: i32, rhs: i32) -> i32 {
-        <Q1_14 as Scalar>::plus(lhs, rhs)
-    }
-
-    fn minus(lhs: i32, rhs: i32) -> i32 {
-        <Q1_14 as Scalar>::minus(lhs, rhs)
-    }
-
-    fn round(sum: i32) -> Self {
-        Self(<Q1_14 as Scalar>::round(sum))
-    }
-
-    fn negative(self) -> Self {
-        Self(self.0.negative())
-    }
-
-    fn sine(angle: Q1_14) -> Self {
-        Self(paper_sine(angle))
-    }
-
-    fn cosine(angle: Q1_14) -> Self {
-        Self(paper_cosine(angle))
-    }
-
-    fn fine(word: Q1_14) -> i64 {
-        <Q1_14 as Scalar>::fine(word)
-    }
-
-    fn fine_turn(angle: Q1_14) -> [i64; 3] {
-        <Q1_14 as Scalar>::fine_turn(angle)
-    }
-
-    fn settle<const F: u32>(constant: i64) -> Self {
-        Self(<Q1_14 as Scalar>::settle::<F>(constant))
+        Self::from_word(Acc::<F>::from_steps(constant).round())
     }
 }

@@ -20,7 +20,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
 
-use super::{Kernel, Quarters, Scalar, Twist};
+use super::{Kernel, Scalar, Twist, angle, length};
 
 /// The wrench kernel, of one cell.
 ///
@@ -36,11 +36,24 @@ pub struct Wrench<S = Q1_14> {
     links: [Link<S>; MAX_JOINTS - 1],
 }
 
-/// A force of one newton and its moment in m (that is, Nm per N).
+/// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
+/// components.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Wrenched<S> {
-    force: [S; 3],
-    moment: [S; 3],
+struct Wrenched<T> {
+    force: [T; 3],
+    moment: [T; 3],
+}
+
+/// Which components of a wrench somebody reads.
+type Live = Wrenched<bool>;
+
+impl Live {
+    const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
+
+    /// The same of both.
+    fn each(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
+        Self { force: before(self.force), moment: before(self.moment) }
+    }
 }
 
 /// The steps from the frame of joint l to that of joint l-1, beginning with the turn by theta_(l+1).
@@ -57,29 +70,23 @@ struct Link<S> {
     d: Option<S>,
 }
 
-/// Which components of a wrench somebody reads.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Live {
-    force: [bool; 3],
-    moment: [bool; 3],
-}
-
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
-        let nothing = Wrenched { force: [S::ZERO; 3], moment: [S::ZERO; 3] };
-        let mut kernel = Self { joint: chain.len(), contact: nothing, links: [Link::IDLE; MAX_JOINTS - 1] };
-        let Some((last, rest)) = chain.split_last() else { return kernel };
-        kernel.contact = fold(&parameters.pose, last);
-        let mut read = Live::default(); // by the links further down: nothing below joint 1
-        for ((link, row), above) in kernel.links.iter_mut().zip(rest).zip(chain.iter().skip(1)) {
-            (*link, read) = Link::new(row, above.theta_offset, read);
-        }
-        kernel
+        let nothing = Wrenched { force: [S::zero(); 3], moment: [S::zero(); 3] };
+        let contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
+        let mut read = Live::NOTHING; // by the links further down: nothing below joint 1
+        let links = core::array::from_fn(|index| {
+            let [row, above] = [index, index + 1].map(|row| parameters.rows.get(row).copied());
+            let link;
+            (link, read) = Link::new(&row.unwrap_or_default(), above.unwrap_or_default().theta_offset, read);
+            link
+        });
+        Self { joint: chain.len(), contact, links }
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::ZERO; MAX_JOINTS];
+        let mut jacobian = [S::zero(); MAX_JOINTS];
         let mut wrench = self.contact;
         let Some((last, rest)) = jacobian.get_mut(..self.joint).and_then(<[S]>::split_last_mut) else {
             return jacobian;
@@ -95,19 +102,9 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 }
 
 impl<S: Scalar> Link<S> {
-    const IDLE: Self = Self {
-        turned: Live { force: [false; 3], moment: [false; 3] },
-        offset: Q1_14::ZERO,
-        twisted: Live { force: [false; 3], moment: [false; 3] },
-        twist: Twist::Quarters(Quarters::None),
-        a: None,
-        d: None,
-    };
-
     /// The link below the turn of the joint `above`, when the turn after it reads `read`; and what it
     /// reads itself.
     fn new(row: &Row, offset: Q1_14, read: Live) -> (Self, Live) {
-        let length = |word: Q1_14| (word != Q1_14::ZERO).then(|| S::word(word));
         let twist = Twist::new(row.alpha);
         let (a, d) = (length(row.a), length(row.d));
 
@@ -121,10 +118,8 @@ impl<S: Scalar> Link<S> {
             ],
             moment: [mx, my, true],
         };
-        let turned =
-            Live { force: before_twist(twist, twisted.force), moment: before_twist(twist, twisted.moment) };
-        let read = Live { force: before_turn(turned.force), moment: before_turn(turned.moment) };
-        (Self { turned, offset, twisted, twist, a, d }, read)
+        let turned = twisted.each(|live| before_twist(twist, live));
+        (Self { turned, offset, twisted, twist, a, d }, turned.each(before_turn))
     }
 
     #[inline]
@@ -142,7 +137,7 @@ impl<S: Scalar> Link<S> {
         if !(fx || fy || mx || my) {
             return wrench;
         }
-        let angle = if self.offset == Q1_14::ZERO { position } else { S::plus_angle(position, self.offset) };
+        let angle = angle::<S>(position, self.offset);
         let (sine, cosine) = (S::sine(angle), S::cosine(angle));
         let turn = |[x, y, z]: [S; 3], [live_x, live_y, _]: [bool; 3]| {
             [
@@ -187,10 +182,10 @@ impl<S: Scalar> Twist<S> {
     fn apply(self, [x, y, z]: [S; 3], [_, live_y, live_z]: [bool; 3]) -> [S; 3] {
         let negative = |number: S, live: bool| if live { number.negative() } else { number };
         match self {
-            Self::Quarters(Quarters::None) => [x, y, z],
-            Self::Quarters(Quarters::Ahead) => [x, negative(z, live_y), y],
-            Self::Quarters(Quarters::Half) => [x, negative(y, live_y), negative(z, live_z)],
-            Self::Quarters(Quarters::Back) => [x, z, negative(y, live_z)],
+            Self::None => [x, y, z],
+            Self::Ahead => [x, negative(z, live_y), y],
+            Self::Half => [x, negative(y, live_y), negative(z, live_z)],
+            Self::Back => [x, z, negative(y, live_z)],
             Self::Other { sine, cosine } => [
                 x,
                 if live_y { S::round(S::minus(cosine.times(y), sine.times(z))) } else { y },
@@ -203,8 +198,8 @@ impl<S: Scalar> Twist<S> {
 /// What must be there before a twist, for these to be there after it.
 fn before_twist<S>(twist: Twist<S>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
-        Twist::Quarters(Quarters::None | Quarters::Half) => [x, y, z],
-        Twist::Quarters(Quarters::Ahead | Quarters::Back) => [x, z, y],
+        Twist::None | Twist::Half => [x, y, z],
+        Twist::Ahead | Twist::Back => [x, z, y],
         Twist::Other { .. } => [x, y || z, y || z],
     }
 }

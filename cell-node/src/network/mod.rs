@@ -18,12 +18,13 @@ mod port;
 mod way;
 
 use heapless::Deque;
+use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK};
 
-use numbers::Walking;
+use numbers::Numbers;
 use port::Port;
 
 /// From one hello to the next.
@@ -41,7 +42,7 @@ const OUTBOX: usize = 32;
 
 /// How a parent was lost, and so whether it may still take a sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Lost {
+pub(crate) enum Lost {
     /// It did not take the last sums, or will not have this child: it takes no more.
     Done,
     /// It is not heard, does not hear, or has no way itself: it may take sums until it says that it let this child
@@ -78,11 +79,12 @@ impl LeftBehind {
 }
 
 /// A cell's part of the network.
-#[derive(Debug)]
-pub struct Network {
+#[derive(Debug, Default)]
+pub(crate) struct Network {
     wired: u8,
-    deaf: u8,
-    number: u8,
+    /// Ports that hear nothing.
+    pub(crate) deaf: u8,
+    numbers: Numbers,
     ports: [Port; ALL],
     parent: Option<Parent>,
     /// The best label that this cell ever had: only better ones are followed.
@@ -91,7 +93,7 @@ pub struct Network {
     offered: Option<Label>,
     joining: Option<(usize, Micros)>,
     /// Sums go up: a parent is not left without need.
-    busy: bool,
+    pub(crate) busy: bool,
     /// The parent has no way itself.
     deserted: bool,
     /// When a new round is asked for again, and how long after the last time that is.
@@ -100,12 +102,9 @@ pub struct Network {
     passed_on: Option<(u8, bool, Micros)>,
     /// The parent that was left last.
     left: Option<LeftBehind>,
-    walking: Option<Walking>,
-    last_walk: Option<u8>,
-    given: Option<u8>,
-    was_unnumbered: bool,
     reported: Option<[PortState; PORTS]>,
-    changes: u16,
+    /// How often the parent changed.
+    pub(crate) changes: u16,
     tree_changed: bool,
     next_hello: Micros,
     outbox: Deque<(usize, PortMessage), OUTBOX>,
@@ -113,143 +112,95 @@ pub struct Network {
 
 impl Network {
     /// A cell that is not wired.
-    #[must_use]
-    pub fn new(now: Micros) -> Self {
-        Self {
-            wired: 0,
-            deaf: 0,
-            number: 0,
-            ports: [Port::default(); ALL],
-            parent: None,
-            best: None,
-            offered: None,
-            joining: None,
-            busy: false,
-            deserted: false,
-            seek: None,
-            passed_on: None,
-            left: None,
-            walking: None,
-            last_walk: None,
-            given: None,
-            was_unnumbered: false,
-            reported: None,
-            changes: 0,
-            tree_changed: false,
-            next_hello: now,
-            outbox: Deque::new(),
-        }
+    pub(crate) fn new(now: Micros) -> Self {
+        Self { next_hello: now, ..Self::default() }
     }
 
     /// The same cell with wires at the ports `wired`; hellos of many cells are spread by `phase`.
-    #[must_use]
-    pub fn wired(mut self, wired: u8, number: u8, phase: Span) -> Self {
-        (self.wired, self.number) = (wired, number);
+    pub(crate) fn wired(mut self, wired: u8, number: Option<CellId>, phase: Span) -> Self {
+        (self.wired, self.numbers.own) = (wired, number);
         self.next_hello = self.next_hello + phase;
         self
     }
 
     /// Whether it is wired at all.
-    #[must_use]
-    pub const fn exists(&self) -> bool {
+    pub(crate) const fn exists(&self) -> bool {
         self.wired != 0
     }
 
-    /// Ports that hear nothing.
-    pub const fn set_deaf(&mut self, deaf: u8) {
-        self.deaf = deaf;
-    }
-
-    /// Whether sums go up.
-    pub const fn set_busy(&mut self, busy: bool) {
-        self.busy = busy;
-    }
-
     /// Whether something can come in through a port: it is wired, and not deaf.
-    #[must_use]
-    pub const fn hears(&self, port: usize) -> bool {
+    pub(crate) const fn hears(&self, port: usize) -> bool {
         self.wired & !self.deaf & 1 << port != 0
     }
 
     /// The port whose other end hears this cell's sums.
-    #[must_use]
-    pub fn up(&self) -> Option<usize> {
+    pub(crate) fn up(&self) -> Option<usize> {
         self.parent.map(|parent| parent.port)
     }
 
     /// Wires to the root of the tree; 0 is a root.
-    #[must_use]
-    pub fn depth(&self) -> Option<u8> {
+    pub(crate) fn depth(&self) -> Option<u8> {
         self.parent.map(|parent| parent.label.depth)
     }
 
+    /// What those below it are told.
+    fn label(&self) -> Option<Label> {
+        self.parent.map(|parent| parent.label.below())
+    }
+
     /// The round of the label.
-    #[must_use]
-    pub fn round(&self) -> u8 {
+    pub(crate) fn round(&self) -> u8 {
         self.best.map_or(0, |label| label.round)
     }
 
     /// The parent's number: 0 for the gateway's side.
-    #[must_use]
-    pub fn parent_number(&self) -> Option<u8> {
+    pub(crate) fn parent_number(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
-            port => self.number_at(port),
+            port => self.number_at(port).map(CellId::get),
         }
     }
 
     /// The number of the cell at a port.
-    #[must_use]
-    pub fn number_at(&self, port: usize) -> Option<u8> {
+    pub(crate) fn number_at(&self, port: usize) -> Option<CellId> {
         self.ports.get(port)?.number()
     }
 
     /// Whether the cell at a port is a child.
-    #[must_use]
-    pub fn is_child(&self, port: usize) -> bool {
+    pub(crate) fn is_child(&self, port: usize) -> bool {
         self.ports.get(port).is_some_and(Port::is_child)
     }
 
     /// The port where the child with this number is.
-    #[must_use]
-    pub fn child_with(&self, number: u8) -> Option<usize> {
+    pub(crate) fn child_with(&self, number: CellId) -> Option<usize> {
         (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
     }
 
     /// Whether the parent that was left last has heard so, or there was none: then it takes no sum any more.
-    #[must_use]
-    pub fn is_let_go(&self) -> bool {
+    pub(crate) fn is_let_go(&self) -> bool {
         self.left.is_none_or(|left| left.heard)
     }
 
     /// The cell was silent for an epoch: a parent that was left takes no sum any more. The gateway's side needs longer:
     /// it goes by what it hears over the wire.
-    pub fn forget_left(&mut self, now: Micros) {
+    pub(crate) fn forget_left(&mut self, now: Micros) {
         self.left.take_if(|left| left.port != UPLINK || now.since(left.since) >= HELLO);
     }
 
     /// Asks the parent whether it is there.
-    pub fn ask_parent(&mut self) {
+    pub(crate) fn ask_parent(&mut self) {
         if let Some(up) = self.up() {
             self.say(up, PortMessage::Ask);
         }
     }
 
-    /// How often the parent changed.
-    #[must_use]
-    pub const fn changes(&self) -> u16 {
-        self.changes
-    }
-
     /// Bit p: the cell at port p is a child.
-    #[must_use]
-    pub fn children(&self) -> u8 {
+    pub(crate) fn children(&self) -> u8 {
         self.bits(Port::is_child)
     }
 
     /// Bit p: port p works in both directions.
-    #[must_use]
-    pub fn working(&self, now: Micros) -> u8 {
+    pub(crate) fn working(&self, now: Micros) -> u8 {
         self.bits(|port| port.works(now))
     }
 
@@ -259,39 +210,33 @@ impl Network {
     }
 
     /// What the ports lead to.
-    #[must_use]
-    pub fn port_states(&self, now: Micros) -> [PortState; PORTS] {
-        let mut states = [PortState::default(); PORTS];
-        for (state, port) in states.iter_mut().zip(&self.ports) {
-            *state = port.state(now);
-        }
-        states
+    pub(crate) fn port_states(&self, now: Micros) -> [PortState; PORTS] {
+        core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
     /// Whether the ports lead to something else than when this was asked last.
-    pub fn ports_changed(&mut self, now: Micros) -> bool {
+    pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
     }
 
     /// Whether the place in the tree is another than when this was asked last.
-    pub const fn tree_changed(&mut self) -> bool {
+    pub(crate) const fn tree_changed(&mut self) -> bool {
         core::mem::replace(&mut self.tree_changed, false)
     }
 
     /// A number that a walk gave this cell, once.
-    pub const fn given(&mut self) -> Option<u8> {
-        self.given.take()
+    pub(crate) const fn given(&mut self) -> Option<CellId> {
+        self.numbers.given.take()
     }
 
     /// The next message for a port.
-    pub fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
+    pub(crate) fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.outbox.pop_front()
     }
 
     /// When [`Network::handle_time`] has something to do.
-    #[must_use]
-    pub fn poll_timeout(&self) -> Micros {
+    pub(crate) fn poll_timeout(&self) -> Micros {
         if !self.exists() {
             return Micros(u64::MAX);
         }
@@ -303,7 +248,7 @@ impl Network {
     }
 
     /// Says something to the cell at a port.
-    pub fn say(&mut self, port: usize, message: PortMessage) {
+    pub(crate) fn say(&mut self, port: usize, message: PortMessage) {
         if self.wired >> port & 1 != 0 {
             // A shell takes messages after every call; what does not fit is said again by the next hello.
             let _ = self.outbox.push_back((port, message));
@@ -314,12 +259,12 @@ impl Network {
         let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
         let hello = Hello {
             version: VERSION,
-            number: self.number,
+            number: self.numbers.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
             hears,
             up: self.up() == Some(port),
             unnumbered: self.is_unnumbered(),
-            label: self.parent.map(|parent| parent.label.below()),
+            label: self.label(),
         };
         if hello.label.is_some() {
             self.ports.get_mut(port).into_iter().for_each(Port::told);
@@ -328,14 +273,14 @@ impl Network {
     }
 
     fn hello_to_all(&mut self, now: Micros) {
-        self.offered = self.parent.map(|parent| parent.label.below());
+        self.offered = self.label();
         for port in 0..ALL {
             self.hello(now, port);
         }
     }
 
     /// Takes what came in through a port that hears, except what is about sums: `State` and `Missed`.
-    pub fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
+    pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
             PortMessage::Join => self.let_in(now, port),
@@ -398,7 +343,7 @@ impl Network {
     }
 
     /// Says the hellos that are due until then: while the cell is awake anyway, it need not wake for them.
-    pub fn hello_by(&mut self, now: Micros, until: Micros) {
+    pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
             // After a hang the missed ones are skipped.
             let missed = now.since(self.next_hello).0 / HELLO.0;
@@ -416,7 +361,7 @@ impl Network {
     }
 
     /// Takes in that time has passed. Harmless when called early.
-    pub fn handle_time(&mut self, now: Micros) {
+    pub(crate) fn handle_time(&mut self, now: Micros) {
         if !self.exists() {
             return;
         }
@@ -442,7 +387,7 @@ impl Network {
     }
 
     /// Says that the sums from this epoch on are for the parent.
-    pub fn state(&mut self, epoch: Epoch) {
+    pub(crate) fn state(&mut self, epoch: Epoch) {
         if let Some(up) = self.up().filter(|up| *up != UPLINK) {
             self.say(up, PortMessage::State(epoch));
         }

@@ -1,32 +1,41 @@
 //! Numbers for cells that have none: a walk over the tree gives them away, depth first.
 
+use protocol::id::CellId;
 use protocol::time::Micros;
 use protocol::wire::{PORTS, PortMessage, Walk};
 
 use super::Network;
 use super::port::Port;
 
-/// A walk that gives numbers, while it is with this cell and those below it.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Walking {
-    walk: Walk,
-    /// The port that has it now.
-    at: usize,
+/// The cell's number, and what it knows of the numbers of those below it.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Numbers {
+    /// Its own, if it has one.
+    pub(super) own: Option<CellId>,
+    /// A number that a walk gave it, until that is asked.
+    pub(super) given: Option<CellId>,
+    /// The walk that is with this cell and those below it, and the port that has it now.
+    walking: Option<(Walk, usize)>,
+    last_walk: Option<u8>,
+    was_unnumbered: bool,
 }
 
 impl Network {
     pub(super) fn is_unnumbered(&self) -> bool {
-        self.number == 0 || self.ports.iter().any(Port::is_unnumbered)
+        self.numbers.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
     }
 
     /// Numbers are given away: this cell takes the first if it has none, and then each child's turn comes.
     pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
-        if self.last_walk.replace(walk.walk) == Some(walk.walk) {
+        if self.numbers.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;
         }
-        if self.number == 0 && walk.first <= walk.last {
-            self.number = walk.first;
-            self.given = Some(walk.first);
+        if self.numbers.own.is_none()
+            && walk.first <= walk.last
+            && let Ok(number) = CellId::new(walk.first.into())
+        {
+            self.numbers.own = Some(number);
+            self.numbers.given = Some(number);
             walk.first += 1;
             self.hello_to_all(now);
         }
@@ -34,7 +43,7 @@ impl Network {
     }
 
     pub(super) fn go_on_walking(&mut self, port: usize, walk: Walk) {
-        if self.walking.is_some_and(|walking| walking.at == port && walking.walk.walk == walk.walk) {
+        if self.numbers.walking.is_some_and(|(of, at)| at == port && of.walk == walk.walk) {
             self.walk_from(port + 1, walk);
         }
     }
@@ -42,7 +51,7 @@ impl Network {
     fn walk_from(&mut self, first: usize, walk: Walk) {
         let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
-        self.walking = next.map(|at| Walking { walk, at });
+        self.numbers.walking = next.map(|at| (walk, at));
         match (next, self.up()) {
             (Some(port), _) => self.say(port, PortMessage::Number(walk)),
             (None, Some(up)) => self.say(up, PortMessage::Return(walk)),
@@ -52,7 +61,7 @@ impl Network {
 
     pub(super) fn tell_unnumbered(&mut self, now: Micros) {
         let unnumbered = self.is_unnumbered();
-        if core::mem::replace(&mut self.was_unnumbered, unnumbered) != unnumbered
+        if core::mem::replace(&mut self.numbers.was_unnumbered, unnumbered) != unnumbered
             && let Some(up) = self.up()
         {
             self.hello(now, up);

@@ -1,5 +1,6 @@
 //! What is known of one port.
 
+use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::time::{Micros, Span};
 use protocol::wire::{Hello, Label};
@@ -53,8 +54,8 @@ impl Port {
     }
 
     /// The number of the cell at the other end, if it has one.
-    pub(super) fn number(&self) -> Option<u8> {
-        self.heard.map(|(hello, _)| hello.number).filter(|number| *number != 0)
+    pub(super) fn number(&self) -> Option<CellId> {
+        CellId::new(self.heard?.0.number.into()).ok()
     }
 
     /// Whether a cell without a number is there or below.

@@ -47,23 +47,20 @@ impl Network {
 
     /// A cell asks to send its sums here.
     pub(super) fn let_in(&mut self, now: Micros, port: usize) {
-        let label = self.parent.filter(|parent| parent.port != port).map(|parent| parent.label.below());
+        let Some(label) = self.label().filter(|_| self.up() != Some(port)) else {
+            return self.say(port, PortMessage::Refuse);
+        };
         let number = self.number_at(port);
-        match label {
-            Some(label) => {
-                // Two wires may lead to the same cell, whose sums come by one of them.
-                for (other, there) in self.ports.iter_mut().enumerate() {
-                    if other == port {
-                        there.adopt(now);
-                    } else if number.is_some() && there.number() == number {
-                        there.disown();
-                    }
-                }
-                self.tree_changed = true;
-                self.say(port, PortMessage::Grant(label));
+        // Two wires may lead to the same cell, whose sums come by one of them.
+        for (other, there) in self.ports.iter_mut().enumerate() {
+            if other == port {
+                there.adopt(now);
+            } else if number.is_some() && there.number() == number {
+                there.disown();
             }
-            None => self.say(port, PortMessage::Refuse),
         }
+        self.tree_changed = true;
+        self.say(port, PortMessage::Grant(label));
     }
 
     fn is_good(&self, label: Label) -> bool {
@@ -94,7 +91,7 @@ impl Network {
     }
 
     /// The parent does not take this cell's sums any more: another way has to be found.
-    pub fn lose_parent(&mut self, now: Micros, how: Lost) {
+    pub(crate) fn lose_parent(&mut self, now: Micros, how: Lost) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
         self.deserted = false;

@@ -10,21 +10,22 @@
 //! seen. Touch and release have two thresholds, so that noise at one of them is no stream of events. What is
 //! said follows from what is felt and from the times alone: the same inputs, the same frames.
 
-use protocol::fixed::Q3_12;
+use protocol::fixed::Q;
 use protocol::id::CellId;
-use protocol::message::{SensorPage, SkinSensors};
+use protocol::message::{Message, SensorPage, SkinSensors};
 use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact};
 
-use super::{Claim, Node, spread};
+use super::stimuli::Felt;
+use super::{Node, Switches, spread};
 
 /// Every so many heartbeats bring the acceleration too: it tells no touch, and is seldom wanted.
 const BEATS_PER_ACCELERATION: u8 = 4;
 
 /// Which pages are to be said.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-struct Pages {
+pub(super) struct Pages {
     skin: bool,
     acceleration: bool,
 }
@@ -32,14 +33,7 @@ struct Pages {
 impl Pages {
     const NONE: Self = Self { skin: false, acceleration: false };
     const SKIN: Self = Self { skin: true, acceleration: false };
-    const BOTH: Self = Self { skin: true, acceleration: true };
-}
-
-/// All that a cell feels.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Felt {
-    skin: SkinSensors,
-    acceleration: [Q3_12; 3],
+    pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
 /// What was said, and when the next is due.
@@ -59,50 +53,36 @@ pub(super) struct Sensing {
 }
 
 impl Sensing {
-    /// A page goes out.
-    pub(super) const fn sends(&mut self, page: &SensorPage) {
-        match *page {
-            SensorPage::Skin(skin) => self.sent.skin = skin,
-            SensorPage::Acceleration(acceleration) => self.sent.acceleration = acceleration,
-        }
-    }
-
     /// Something may have been latched, measured or switched.
-    fn look(&mut self, now: Micros, mode: Mode, events: &Events, cell: Option<CellId>, felt: &Felt) -> Pages {
-        if mode != self.mode {
-            return self.switch(now, mode, events, cell, felt);
+    fn look(&mut self, now: Micros, switches: &Switches, cell: CellId, felt: &Felt) -> Pages {
+        let Switches { sensing, events, .. } = switches;
+        if *sensing != self.mode {
+            return self.switch(now, switches, cell, felt);
         }
-        if mode != Mode::Event {
+        if *sensing != Mode::Event {
             return Pages::NONE;
         }
         let Felt { skin, acceleration } = felt;
         let turned = self.follow(skin, events);
         let pages = Pages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
-            acceleration: (acceleration.iter().zip(self.sent.acceleration))
-                .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.acceleration.to_bits())),
+            acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
         };
         self.says(now, pages)
     }
 
     /// Another mode, which begins with what is felt now.
-    fn switch(
-        &mut self,
-        now: Micros,
-        mode: Mode,
-        events: &Events,
-        cell: Option<CellId>,
-        felt: &Felt,
-    ) -> Pages {
+    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, felt: &Felt) -> Pages {
+        let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
         match mode {
             Mode::Off => return Pages::NONE,
             Mode::Continuous { period_ms } => {
                 let period = Span::from_millis(period_ms.into());
-                self.due = Some(now + period + cell.map_or(Span(0), |cell| spread(period, cell)));
+                self.due = Some(now + period + spread(period, cell));
             }
             Mode::Event => {
-                self.follow(&felt.skin, events);
+                self.follow(&felt.skin, &switches.events);
             }
         }
         self.says(now, Pages::BOTH)
@@ -149,18 +129,16 @@ impl Sensing {
 }
 
 fn has_moved(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
-    let contact = (now.contact.iter().zip(sent.contact))
-        .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.contact.to_bits()));
-    let temperature = (now.temperature.iter().zip(sent.temperature))
-        .any(|(now, sent)| is_far(now.to_bits(), sent.to_bits(), events.temperature.to_bits()));
-    contact
-        || temperature
-        || is_far(now.proximity.to_bits(), sent.proximity.to_bits(), events.proximity.to_bits())
+    is_far(&now.contact, &sent.contact, events.contact)
+        || is_far(&now.temperature, &sent.temperature, events.temperature)
+        || is_far(&[now.proximity], &[sent.proximity], events.proximity)
 }
 
-/// By a threshold or more; a threshold of 0 means every change.
-fn is_far(now: i16, sent: i16, threshold: i16) -> bool {
-    i32::from(now).abs_diff(sent.into()) >= u32::from(threshold.unsigned_abs().max(1))
+/// Whether one of them is by a threshold or more; a threshold of 0 means every change.
+fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
+    let threshold = u32::from(threshold.to_bits().unsigned_abs().max(1));
+    let far = |(now, sent): (&Q<F>, &Q<F>)| i32::from(now.to_bits()).abs_diff(sent.to_bits().into());
+    now.iter().zip(sent).any(|pair| far(pair) >= threshold)
 }
 
 impl Node {
@@ -168,24 +146,20 @@ impl Node {
     pub(super) fn sense(&mut self, now: Micros) {
         // Whose number is in doubt says nothing; what is felt is compared with what was sent, so that
         // nothing is forgotten.
-        if self.claim != Claim::Settled {
-            return;
-        }
-        let felt = Felt { skin: *self.stimuli.skin(), acceleration: self.stimuli.acceleration() };
-        let (mode, events, cell) = (self.switches.sensing, self.switches.events, self.identity.cell);
-        let pages = self.sensing.look(now, mode, &events, cell, &felt);
-        self.say_felt(pages);
+        let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
+        let pages = self.sensing.look(now, &self.switches, cell, &self.stimuli.felt);
+        self.push_sensors(pages);
     }
 
     /// Says what goes with a regular heartbeat.
     pub(super) fn sense_with_heartbeat(&mut self, now: Micros) {
         let pages = self.sensing.beat(now);
-        self.say_felt(pages);
+        self.push_sensors(pages);
     }
 
     /// When it has something to say by itself; not while its number is in doubt.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
-        self.sensing.due.filter(|_| self.claim == Claim::Settled)
+        self.sensing.due.filter(|_| self.claim.is_settled())
     }
 
     /// Says what is due.
@@ -194,28 +168,30 @@ impl Node {
             return;
         }
         let pages = self.sensing.pass(now, now + Span(1));
-        self.say_felt(pages);
+        self.push_sensors(pages);
     }
 
     /// What is due before the next joints is said now, while the cell is awake. Not where it would be said
     /// once for each joints or more often: all cells would say it at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
-        let joints = Span(in_use.parameters.period_us.into());
+        let joints = in_use.period();
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints
         {
             let pages = self.sensing.pass(now, now + joints);
-            self.say_felt(pages);
+            self.push_sensors(pages);
         }
     }
 
-    fn say_felt(&mut self, pages: Pages) {
-        if pages.skin {
-            self.push_sensors(SensorPage::Skin(*self.stimuli.skin()));
-        }
-        if pages.acceleration {
-            self.push_sensors(SensorPage::Acceleration(self.stimuli.acceleration()));
+    /// Says what is felt.
+    pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
+        let Some(from) = self.identity.cell else { return };
+        let skin = skin.then_some(SensorPage::Skin(self.stimuli.felt.skin));
+        let acceleration = acceleration.then_some(SensorPage::Acceleration(self.stimuli.felt.acceleration));
+        for page in skin.into_iter().chain(acceleration) {
+            self.sensing.sent.set(&page);
+            self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
         }
     }
 }

@@ -3,7 +3,7 @@
 //! A stimulus is not felt when it arrives but when the joints of its epoch do, so that a torque is a
 //! function of one joints frame and not of who was quicker on the bus.
 
-use heapless::Deque;
+use heapless::Vec;
 use protocol::fixed::Q3_12;
 use protocol::message::{From, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
@@ -22,54 +22,51 @@ pub(super) enum Arrival {
     Refused,
 }
 
+/// All that a cell feels.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Felt {
+    pub(super) skin: SkinSensors,
+    /// In g.
+    pub(super) acceleration: [Q3_12; 3],
+}
+
+impl Felt {
+    /// One page of it is this.
+    pub(super) const fn set(&mut self, page: &SensorPage) {
+        match *page {
+            SensorPage::Skin(skin) => self.skin = skin,
+            SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
+        }
+    }
+}
+
 /// The sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
-    pending: Deque<(From, SensorPage), PENDING>,
-    skin: SkinSensors,
-    acceleration: [Q3_12; 3],
+    pending: Vec<(From, SensorPage), PENDING>,
+    /// What is felt now.
+    pub(super) felt: Felt,
 }
 
 impl Stimuli {
-    /// What is felt now.
-    #[must_use]
-    pub(super) const fn skin(&self) -> &SkinSensors {
-        &self.skin
-    }
-
-    /// The acceleration felt now, in g.
-    #[must_use]
-    pub(super) const fn acceleration(&self) -> [Q3_12; 3] {
-        self.acceleration
-    }
-
     /// Takes a stimulus that shall hold from some joints on; `last` are the last joints taken.
     pub(super) fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
             (From::Epoch(first), Some(last)) if last.since(first) >= 0 => (From::Next, Arrival::Late),
             (from @ (From::Epoch(_) | From::Next), _) => (from, Arrival::InTime),
         };
-        if self.pending.push_back((from, page)).is_ok() { arrival } else { Arrival::Refused }
+        if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
 
     /// Feels, in the order of their arrival, all stimuli that hold from `epoch` on or earlier.
     pub(super) fn latch(&mut self, epoch: Epoch) {
-        for _ in 0..self.pending.len() {
-            let Some((from, page)) = self.pending.pop_front() else { break };
-            let due = match from {
-                From::Next => true,
-                From::Epoch(first) => epoch.since(first) >= 0,
-            };
-            if !due {
-                // There is room: it was there a moment ago.
-                let _ = self.pending.push_back((from, page));
-                continue;
+        self.pending.retain(|(from, page)| {
+            let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);
+            if !waits {
+                self.felt.set(page);
             }
-            match page {
-                SensorPage::Skin(skin) => self.skin = skin,
-                SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
-            }
-        }
+            waits
+        });
     }
 
     /// Forgets everything: nothing touches the cell.
@@ -88,7 +85,7 @@ mod tests {
     }
 
     fn felt(stimuli: &Stimuli) -> f64 {
-        stimuli.skin().contact[0].to_f64()
+        stimuli.felt.skin.contact[0].to_f64()
     }
 
     #[test]

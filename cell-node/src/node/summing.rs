@@ -1,15 +1,15 @@
 //! The cell in a network: whose sums are whose, and when they are said.
 
 use protocol::id::CellId;
-use protocol::message::{Message, NetworkPage, Ports, State, Tree};
+use protocol::message::{Message, NetworkPage, Ports, Tree};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
 
-use super::{Claim, Node, Storing, TREE, first_word};
+use super::{AddressClaim, Node, Storing};
 use crate::contact::Torque;
-use crate::network::Lost;
-use crate::sum::{Begin, Check, Words};
+use crate::network::{Lost, Network};
+use crate::sum::{Begin, Check, Sum, Words};
 
 /// So many more epochs in a row without an answer are borne each time that a parent that was lost that way says that it
 /// was there and heard.
@@ -19,216 +19,247 @@ const PATIENCE: u16 = 12 * FORGETS;
 /// One less after so many epochs with a sum of the parent.
 const FORGETS: u16 = 16;
 /// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
-pub(super) const STEADY: u8 = 8;
+const STEADY: u8 = 8;
+/// The shortest time between two words about its place in the tree.
+const TREE: Span = Span::from_millis(50);
 
-impl Node {
-    /// Takes what came in through a port `age` ago.
-    pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
-        if !self.network.hears(port) {
+/// The parent that an epoch's sum is for.
+#[derive(Clone, Copy, Debug, Default)]
+enum Parent {
+    /// There is none.
+    #[default]
+    None,
+    /// The gateway's side, which sends no sums.
+    Gateway,
+    /// The cell at a port, if its number is known, and whether a sum of it was heard in this epoch.
+    Cell { port: usize, number: Option<CellId>, heard: bool },
+}
+
+/// When a cell says where it is in the tree.
+#[derive(Debug, Default)]
+struct TreeReport {
+    /// There is news.
+    due: bool,
+    /// Not before this.
+    next: Micros,
+    /// The round that was told last.
+    round: u8,
+}
+
+/// A cell's network, its sums, and what one is to the other.
+#[derive(Debug, Default)]
+pub(super) struct Summing {
+    pub(super) network: Network,
+    pub(super) sum: Sum,
+    /// By port, whose sums are heard.
+    pub(super) heard: [Option<CellId>; PORTS],
+    hears_changed: bool,
+    parent: Parent,
+    /// Whether a sum was said in the epoch before the present one.
+    said_before: bool,
+    /// The parent may not have taken a sum: it is asked whether it hears this cell, until it answers. Epochs in a row in
+    /// which it did not.
+    unanswered: Option<u16>,
+    /// How many of them are borne, in sixteenths: who lost parents that were there all the time is on a machine that is
+    /// late, and would only lose the next one too.
+    patience: u16,
+    /// The port of a parent that was lost and may have been there all the time.
+    suspected: Option<usize>,
+    /// Epochs in a row in which a child was waited for and nothing was amiss.
+    steady: u8,
+    /// Joints are heard aside: what wakes this cell is its children.
+    pub(super) waits_for_children: bool,
+    /// How often the parent had changed when that was looked at last.
+    changes: u16,
+    report: TreeReport,
+}
+
+impl Summing {
+    /// A cell that is not wired.
+    pub(super) fn new(now: Micros) -> Self {
+        let report = TreeReport { due: true, next: now, round: 0 };
+        Self { network: Network::new(now), report, ..Self::default() }
+    }
+
+    /// The parent whose sums are heard.
+    pub(super) fn heard_parent(&self) -> Option<CellId> {
+        self.heard.get(self.network.up()?).copied().flatten()
+    }
+
+    /// Whether what is heard, or what wakes the cell, has changed since the last call.
+    pub(super) fn poll_hears(&mut self) -> bool {
+        let waits = self.steady == STEADY && self.unanswered.is_none() && self.sum.awaits_children();
+        self.hears_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
+        core::mem::take(&mut self.hears_changed)
+    }
+
+    pub(super) fn poll_timeout(&self) -> Micros {
+        let look = self.waits_for_children.then(|| self.sum.late_at_next());
+        [self.sum.poll_timeout(), look].into_iter().flatten().fold(self.network.poll_timeout(), Micros::min)
+    }
+
+    pub(super) fn handle_time(&mut self, now: Micros) {
+        if self.waits_for_children && now >= self.sum.late_at_next() {
+            // No joints came: from now on they wake it again.
+            self.steady = 0;
+        }
+        self.network.handle_time(now);
+    }
+
+    /// Takes what came in through a port that hears.
+    fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
+        let is_parent = self.network.up() == Some(port);
+        self.sum.heard_after(age);
+        self.network.busy = self.sum.is_busy();
+        if let PortMessage::State(epoch) = message {
+            if self.network.is_child(port) {
+                self.sum.state(now, port, epoch);
+            }
             return;
         }
-        self.sums.heard_after(age);
-        self.network.set_busy(self.sums.is_busy());
-        if self.network.up() == Some(port) && matches!(message, PortMessage::Hello(_)) {
-            (self.asks_parent, self.unanswered) = (false, 0);
-            self.sums.release();
-        }
-        match message {
-            PortMessage::State(epoch) if self.network.is_child(port) => {
-                self.sums.state(now, port, epoch);
+        if let PortMessage::Missed(epoch) = message {
+            if is_parent {
+                self.was_missed(epoch);
             }
-            PortMessage::Missed(epoch) if self.network.up() == Some(port) => self.was_missed(epoch),
-            PortMessage::State(_) | PortMessage::Missed(_) => {}
-            PortMessage::Left => {
-                if self.suspected.take_if(|suspected| *suspected == port).is_some() {
-                    self.patience = (self.patience + PATIENT).min(PATIENCE);
-                }
-                self.network.handle(now, port, message);
-            }
-            PortMessage::Hello(_)
-            | PortMessage::Join
-            | PortMessage::Grant(_)
-            | PortMessage::Refuse
-            | PortMessage::Leave
-            | PortMessage::Seek(_)
-            | PortMessage::Number(_)
-            | PortMessage::Return(_)
-            | PortMessage::Ask => self.network.handle(now, port, message),
+            return;
         }
-        self.after_network(now);
+        if is_parent && matches!(message, PortMessage::Hello(_)) {
+            self.unanswered = None;
+            self.sum.release();
+        }
+        if message == PortMessage::Left && self.suspected.take_if(|suspected| *suspected == port).is_some() {
+            self.patience = (self.patience + PATIENT).min(PATIENCE);
+        }
+        self.network.handle(now, port, message);
     }
 
     /// Takes in what the network has come to.
-    pub(super) fn after_network(&mut self, now: Micros) {
-        if !self.network.exists() {
-            return;
-        }
-        if let Some(cell) = self.network.given().and_then(|number| CellId::new(number.into()).ok()) {
-            self.identity.cell = Some(cell);
-            self.claim = Claim::Unsaid;
-            self.next_heartbeat = first_word(self.identity, now);
-            self.storing = Some(Storing::Number);
-            self.hears_changed = true;
-        }
+    fn follow_network(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
-            self.sums.disown(port);
+            self.sum.disown(port);
         }
-        if core::mem::replace(&mut self.changes, self.network.changes()) != self.network.changes() {
-            (self.asks_parent, self.unanswered) = (false, 0);
-            self.sums.break_off();
+        if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
+            self.unanswered = None;
+            self.sum.break_off();
             // What was said in this epoch may have been taken by the parent before.
-            self.sums.fall_silent();
+            self.sum.fall_silent();
         }
         if self.network.up().is_none() {
-            self.sums.fall_silent();
+            self.sum.fall_silent();
         }
-        self.tell_tree |= self.network.tree_changed();
-        self.tell_tree(now);
-        self.listen();
-    }
-
-    /// Says where it is in the tree, if that is news; while everything changes, not every change.
-    pub(super) fn tell_tree(&mut self, now: Micros) {
-        let may = self.network.exists() && self.claim == Claim::Settled;
-        if may && self.tell_tree && now >= self.next_tree {
-            self.tell_tree = false;
-            self.next_tree = now + TREE;
-            self.push_tree(now);
-        }
-    }
-
-    /// Hears the sums of the parent and of the children.
-    fn listen(&mut self) {
-        let mut wanted = [None; PORTS];
-        for (port, wanted) in wanted.iter_mut().enumerate() {
+        self.report.due |= self.network.tree_changed();
+        // The sums of the parent and of the children.
+        let heard = core::array::from_fn(|port| {
             let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
-            let number = self.network.number_at(port).filter(|_| is_ours && self.sums.is_on());
-            *wanted = number.and_then(|number| CellId::new(number.into()).ok());
-        }
-        if core::mem::replace(&mut self.heard_sums, wanted) != wanted {
-            self.hears_changed = true;
-        }
+            self.network.number_at(port).filter(|_| is_ours && self.sum.is_on())
+        });
+        self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
     }
 
-    /// The tree as it is for the sums of an epoch whose joints stood on the bus at a time.
-    fn freeze(&mut self, epoch: Epoch, at: Micros, period: Span) -> Begin {
-        self.said_before = self.sums.said().is_some_and(|(of, _)| of.next() == epoch);
-        let up = self.network.up();
-        // A parent that was left and may not know it takes no sum from who was silent for an epoch.
-        if !self.said_before {
-            self.network.forget_left(at);
-        }
-        let number = up.and_then(|up| CellId::new(self.network.number_at(up)?.into()).ok());
-        self.parent = up.map(|up| (up, number));
-        self.heard_parent = false;
-        Begin {
-            epoch,
-            at,
-            period,
-            depth: self.network.depth(),
-            speaks: up.is_some() && self.network.is_let_go(),
-            children: self.network.children(),
-        }
+    /// Another round alone is no news for anybody else, and is told with a heartbeat.
+    pub(super) fn notice_round(&mut self) {
+        self.report.due |= self.report.round != self.network.round();
     }
 
-    /// New joints, which stood on the bus `age` ago.
-    pub(super) fn begin_sum(
+    /// New joints, which stood on the bus `age` ago; the tree is for their sums as it is now.
+    pub(super) fn begin(
         &mut self,
         now: Micros,
         age: Span,
         (epoch, period): (Epoch, Span),
         own: Option<Torque>,
     ) {
-        let begin = self.freeze(epoch, now - age, period);
-        self.sums.begin(&begin, own.map(|torque| torque.exact()).as_ref());
+        let (at, up) = (now - age, self.network.up());
+        self.said_before = self.sum.said_in(epoch.before());
+        // A parent that was left and may not know it takes no sum from who was silent for an epoch.
+        if !self.said_before {
+            self.network.forget_left(at);
+        }
+        self.parent = match up {
+            None => Parent::None,
+            Some(UPLINK) => Parent::Gateway,
+            Some(port) => Parent::Cell { port, number: self.network.number_at(port), heard: false },
+        };
+        let begin = Begin {
+            epoch,
+            at,
+            period,
+            depth: self.network.depth(),
+            speaks: up.is_some() && self.network.is_let_go(),
+            children: self.network.children(),
+        };
+        self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
         // What waited aside is no sign of a late machine.
         if !self.waits_for_children {
-            self.sums.heard_after(age);
+            self.sum.heard_after(age);
         }
-        if self.asks_parent {
+        if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and what was not said is free for another.
-            if self.unanswered >= self.borne() {
-                self.sums.hold();
+            if unanswered >= self.borne() {
+                self.sum.hold();
             }
             self.ask_parent();
         }
-        self.handle_sums(now);
     }
 
-    /// A neighbour's sum.
-    pub(super) fn take_sum(&mut self, now: Micros, age: Span, from: CellId, (epoch, words): (Epoch, Words)) {
-        if let Some((port, Some(parent))) = self.parent
-            && parent == from
+    /// A neighbour's sum; whether it is a child's.
+    pub(super) fn take(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: Words) -> bool {
+        if let Parent::Cell { port, number, heard } = &mut self.parent
+            && *number == Some(from)
         {
             // A late sum of an earlier epoch is a sign of life too.
-            self.heard_parent |= self.network.hears(port);
-        } else if let Some(port) = self.network.child_with(from.get())
-            && self.network.hears(port)
-        {
-            // Unlike a parent's, a child's is heard as it comes.
-            self.sums.heard_after(age);
-            self.sums.take(now, port, epoch, words);
-            self.handle_sums(now);
+            *heard |= self.network.hears(*port);
+            return false;
         }
+        let Some(port) = self.network.child_with(from).filter(|&port| self.network.hears(port)) else {
+            return false;
+        };
+        // Unlike a parent's, a child's is heard as it comes.
+        self.sum.heard_after(age);
+        self.sum.take(now, port, epoch, words);
+        true
     }
 
-    /// Says what is due, and looks who is missing.
-    pub(super) fn handle_sums(&mut self, now: Micros) {
-        let Some(from) = self.identity.cell else { return };
-        if let Some((epoch, words, anew)) = self.sums.say(now) {
-            if anew {
-                self.network.state(epoch);
-            }
-            let saturated = words.torque.iter().any(|word| word.is_saturated());
-            self.flags = self.flags.with(State::SATURATED, self.flags.has(State::SATURATED) || saturated);
-            self.push(Message::Sum { from, epoch, torque: words.torque, count: words.count });
-        }
-        match self.sums.check(now) {
-            Check::NotYet => return,
-            Check::Now => {
-                self.judge(now);
-                if self.asks_parent {
-                    self.ask_parent();
-                }
-            }
-            Check::Late => {}
-        }
-        if core::mem::replace(&mut self.asked, false) {
-            self.push_heartbeat();
-        }
-    }
-
-    /// Looks whose sums did not come in this epoch, once.
-    pub(super) fn judge(&mut self, now: Micros) {
-        let Some((epoch, missed)) = self.sums.judge() else { return };
+    /// Looks whose sums did not come in this epoch, once; whether the parent is lost.
+    fn judge(&mut self, now: Micros) -> bool {
+        let Some((epoch, missed)) = self.sum.judge() else { return false };
         for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
             self.network.say(port, PortMessage::Missed(epoch));
         }
-        let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
-        if self.asks_parent {
-            self.unanswered += 1;
-            if self.unanswered > self.borne() {
+        let said = self.sum.said_in(epoch);
+        let borne = self.borne();
+        let mut lost = None;
+        match (&mut self.unanswered, self.parent) {
+            (Some(unanswered), _) => {
+                *unanswered += 1;
                 // Of who was silent all this epoch it takes no more.
-                self.lose_parent(now, if said { Lost::Unsure } else { Lost::Done });
+                lost = (*unanswered > borne).then_some(if said { Lost::Unsure } else { Lost::Done });
             }
-        } else if self.heard_parent {
-            self.patience = self.patience.saturating_sub(1);
-        } else {
-            self.asks_parent = said && self.parent.is_some_and(|(port, _)| port != UPLINK);
+            (None, Parent::Cell { heard: true, .. }) => self.patience = self.patience.saturating_sub(1),
+            (None, Parent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
+            (None, Parent::Gateway | Parent::None) => {}
         }
-        let well = said && missed == 0 && !self.asks_parent && self.sums.awaits_children();
+        if let Some(how) = lost {
+            // The parent did not answer.
+            self.unanswered = None;
+            self.suspected = self.network.up();
+            self.sum.fall_silent();
+            self.network.lose_parent(now, how);
+            self.follow_network();
+        }
+        let well = said && missed == 0 && self.unanswered.is_none() && self.sum.awaits_children();
         self.steady = if well { (self.steady + 1).min(STEADY) } else { 0 };
+        lost.is_some()
     }
 
     /// The parent says that it did not take a sum: it has to be told anew whom they are for, and asked whether it hears
     /// this cell at all.
     fn was_missed(&mut self, epoch: Epoch) {
-        self.sums.break_off();
-        let said = self.sums.said().is_some_and(|(of, _)| of == epoch);
-        let before = self.sums.epoch().is_some_and(|present| epoch.next() == present);
-        if (self.sums.epoch() == Some(epoch) && said) || (before && self.said_before) {
+        self.sum.break_off();
+        let before = self.sum.epoch().is_some_and(|present| epoch.next() == present);
+        if (self.sum.epoch() == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
             // It was thought to be taken.
-            self.asks_parent = true;
+            self.unanswered = self.unanswered.or(Some(0));
             self.ask_parent();
         }
     }
@@ -241,35 +272,97 @@ impl Node {
     /// Asks the parent whether it is there; it is looked for the answer before the next joints.
     fn ask_parent(&mut self) {
         self.network.ask_parent();
-        self.sums.watch();
+        self.sum.watch();
+    }
+}
+
+impl Node {
+    /// Takes what came in through a port `age` ago.
+    pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
+        if self.summing.network.hears(port) {
+            self.summing.handle_port(now, age, port, message);
+            self.after_network(now);
+        }
     }
 
-    /// The parent is lost that did not answer.
-    fn lose_parent(&mut self, now: Micros, how: Lost) {
-        (self.asks_parent, self.unanswered) = (false, 0);
-        self.suspected = self.network.up();
-        self.sums.fall_silent();
-        self.network.lose_parent(now, how);
-        self.after_network(now);
+    /// Takes in what the network has come to.
+    pub(super) fn after_network(&mut self, now: Micros) {
+        if !self.summing.network.exists() {
+            return;
+        }
+        if let Some(cell) = self.summing.network.given() {
+            self.identity.cell = Some(cell);
+            self.claim = AddressClaim::new(self.identity, now);
+            self.storing = Some(Storing::Number);
+            self.summing.hears_changed = true;
+        }
+        self.summing.follow_network();
+        self.tell_tree(now);
+    }
+
+    /// Says what is due, and looks who is missing.
+    pub(super) fn handle_sums(&mut self, now: Micros) {
+        let Some(from) = self.identity.cell else { return };
+        let summing = &mut self.summing;
+        if let Some((epoch, Words { torque, count }, anew)) = summing.sum.say(now) {
+            if anew {
+                summing.network.state(epoch);
+            }
+            self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
+            self.push(Message::Sum { from, epoch, torque, count });
+        }
+        match self.summing.sum.check(now) {
+            Check::NotYet => return,
+            Check::Now => {
+                self.judge(now);
+                if self.summing.unanswered.is_some() {
+                    self.summing.ask_parent();
+                }
+            }
+            Check::Late => {}
+        }
+        if core::mem::take(&mut self.claim.sync_waits) {
+            self.push_heartbeat();
+        }
+    }
+
+    /// Looks whose sums did not come in this epoch, once.
+    pub(super) fn judge(&mut self, now: Micros) {
+        if self.summing.judge(now) {
+            self.after_network(now);
+        }
+    }
+
+    /// Says where it is in the tree, if that is news; while everything changes, not every change.
+    pub(super) fn tell_tree(&mut self, now: Micros) {
+        let report = &mut self.summing.report;
+        let may = self.summing.network.exists() && self.claim.is_settled();
+        if may && report.due && now >= report.next {
+            (report.due, report.next) = (false, now + TREE);
+            self.push_tree(now);
+        }
     }
 
     pub(super) fn push_tree(&mut self, now: Micros) {
-        self.told_round = self.network.round();
-        self.push_network(NetworkPage::Tree(Tree {
-            parent: self.network.parent_number(),
-            up: self.network.up().map_or(0, |up| up.to_le_bytes()[0]),
-            depth: self.network.depth().unwrap_or(0),
-            round: self.told_round,
-            children: self.network.children(),
-            works: self.network.working(now),
-            sent: self.sums.sent,
-            taken: self.sums.taken,
-            dropped: self.sums.dropped,
-        }));
+        let Summing { network, sum, report, .. } = &mut self.summing;
+        report.round = network.round();
+        let tree = Tree {
+            parent: network.parent_number(),
+            up: network.up().map_or(0, |up| up.to_le_bytes()[0]),
+            depth: network.depth().unwrap_or(0),
+            round: report.round,
+            children: network.children(),
+            works: network.working(now),
+            sent: sum.sent,
+            taken: sum.taken,
+            dropped: sum.dropped,
+        };
+        self.push_network(NetworkPage::Tree(tree));
     }
 
     pub(super) fn push_ports(&mut self, now: Micros) {
-        let ports = self.network.port_states(now);
-        self.push_network(NetworkPage::Ports(Ports { ports, changes: self.network.changes() }));
+        let Summing { network, .. } = &self.summing;
+        let ports = Ports { ports: network.port_states(now), changes: network.changes };
+        self.push_network(NetworkPage::Ports(ports));
     }
 }

@@ -1,7 +1,8 @@
 use super::*;
-use protocol::fixed::{Q1_14, Q3_12, Q5_10};
-use protocol::message::SkinSensors;
-use protocol::parameters::{Contact, Pose, Row};
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
+use protocol::packet::Half;
+use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};
 
 /// A wheel: one joint about z, a cell on its rim that looks along the direction of motion.
 fn wheel() -> Parameters {

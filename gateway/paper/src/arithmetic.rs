@@ -1,7 +1,7 @@
 //! The cells' arithmetic: the sine's error over the whole circle, and what one Jacobian costs.
 
-use cell_node::kernel::witness::{Counted, Operations};
-use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::kernel::witness::Counted;
+use cell_node::kernel::{Kernel, Operations, Projection, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters};

@@ -13,7 +13,11 @@ use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use serde_json::Value;
 
-use super::{Ended, Guest, Place, Running};
+use super::guest::Guest;
+use super::{Ended, Place, Running};
+
+/// Fresh cells of the skin of the recording.
+pub(crate) const FRESH: &str = "--expect --spawn --skin skin.toml";
 
 /// The arm swings, and touches come and go on several cells at once.
 pub(crate) const TOUCHED: &str = r#"version = 1
@@ -210,4 +214,12 @@ pub(crate) fn without(log: &str, mut unwanted: impl FnMut(&Message) -> bool) -> 
 /// Whether a message is a torque of a cell that is pressed.
 pub(crate) fn is_torque(message: &Message, cell: u8) -> bool {
     matches!(message, Message::Torque { from, torque, .. } if from.get() == cell && *torque != [Q3_12::ZERO; WORDS])
+}
+
+/// The embedded bus and the cells of `skin.toml`, started by hand.
+pub(crate) fn by_hand(place: &Place, nodes: &str) -> [Running; 2] {
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let words = format!("--bus vcan0 --bus-kind embedded --nodes {nodes} --skin skin.toml");
+    [place.start("cell-node", &words), server]
 }

@@ -6,7 +6,10 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Contact, Events, Parameter, Parameters, Pose, Sensing as Mode};
 use protocol::time::{Micros, Span};
 
-use crate::node::{Claim, Flash, HEARTBEAT, Identity, Node};
+use crate::flash::Flash;
+use crate::identity::Identity;
+use crate::node::claim::Claim;
+use crate::node::{HEARTBEAT, Node};
 
 const NODE: u8 = 51;
 /// Node 51 speaks a fifth into a period.
@@ -340,14 +343,14 @@ fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
 #[test]
 fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
     let mut cell = eventful();
-    cell.node.claim = Claim::Said;
+    cell.node.claim.stage = Claim::Said;
     assert!(!cell.says(500));
-    cell.node.claim = Claim::Settled;
+    cell.node.claim.stage = Claim::Settled;
     assert_eq!(cell.joints(), [pressed(500)]);
 
     let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
-    cell.node.claim = Claim::Said;
-    let heartbeat = cell.node.next_heartbeat;
+    cell.node.claim.stage = Claim::Said;
+    let heartbeat = cell.node.claim.next_heartbeat;
     assert_eq!(cell.node.poll_timeout(), heartbeat, "it is not woken for it");
     cell.now = heartbeat - Span(1);
     cell.node.handle_timeout(cell.now);

@@ -1,0 +1,144 @@
+//! Parameters as they are read and written over the bus.
+
+use protocol::message::{Answer, Message, Request, State, VERSION};
+use protocol::packet::WORDS;
+use protocol::parameters::{Cuts, Events, Parameter, Parameters, Reply, Sensing};
+use protocol::time::Micros;
+
+use super::Node;
+
+/// What is switched at run time and not kept: parameters 6 to 9.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Switches {
+    /// What it answers joints with.
+    reply: Reply,
+    /// When it sends what it measures.
+    pub(super) sensing: Sensing,
+    /// Which changes are events.
+    pub(super) events: Events,
+    /// Which ports hear nothing.
+    cuts: Cuts,
+}
+
+/// What is being written into flash.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Storing {
+    /// Parameters that somebody committed, with the request's tag.
+    Parameters(Parameters, u8),
+    /// The number that the network gave.
+    Number,
+}
+
+impl Node {
+    /// Reads or writes a parameter, and answers; a commit is answered when flash is written.
+    pub(super) fn configure(&mut self, now: Micros, tag: u8, request: Request) {
+        let (written, number) = match request {
+            Request::Read { number } => (false, number),
+            Request::Write { number, .. } => (true, number),
+        };
+        let words = match (Parameter::from_number(number), request) {
+            (None, _) => Err(Answer::UNKNOWN),
+            (Some(parameter), Request::Read { .. }) => Ok(self.read(parameter)),
+            (Some(Parameter::Commit), Request::Write { words, .. }) => {
+                match self.configuration.staged_with(words) {
+                    Ok(parameters) => {
+                        self.storing = Some(Storing::Parameters(parameters, tag));
+                        return;
+                    }
+                    Err(reason) => Err(reason),
+                }
+            }
+            (Some(parameter), Request::Write { words, .. }) => {
+                self.write(now, parameter, words).map(|()| words)
+            }
+        };
+        self.answer(tag, number, written, words);
+    }
+
+    /// Flash was written, or could not be.
+    pub fn handle_stored(&mut self, written: bool) {
+        // A number that could not be kept is given anew after the next start.
+        let Some(Storing::Parameters(parameters, tag)) = self.storing.take() else { return };
+        if written {
+            self.configuration.activate(parameters);
+            self.flags = self.flags.with(State::FLASH_DAMAGED, false);
+        }
+        let hash = || padded([parameters.hash().cast_signed()]);
+        let words = written.then(hash).ok_or(Answer::FLASH_FAILED);
+        self.answer(tag, Parameter::Commit.number(), true, words);
+    }
+
+    /// The value, or the reason why there is none.
+    fn answer(&mut self, tag: u8, number: u8, written: bool, words: Result<[i16; WORDS], i16>) {
+        let Some(from) = self.identity.cell else { return };
+        let answer = match words {
+            Ok(words) => Answer::Value { number, written, words },
+            Err(reason) => Answer::Refused { number, reason },
+        };
+        self.push(Message::Configured { from, tag, answer });
+    }
+
+    fn read(&self, parameter: Parameter) -> [i16; WORDS] {
+        match parameter {
+            Parameter::Identity => self.identity_words(),
+            Parameter::Mode => padded([self.flags.has(State::TEST_MODE).into()]),
+            Parameter::Reply => self.switches.reply.words(),
+            Parameter::Sensing => self.switches.sensing.words(),
+            Parameter::Events => self.switches.events.words(),
+            Parameter::Cuts => self.switches.cuts.words(),
+            Parameter::Mount
+            | Parameter::Pose
+            | Parameter::Contact
+            | Parameter::Timing
+            | Parameter::Row(_)
+            | Parameter::Commit => self.configuration.read(parameter),
+        }
+    }
+
+    /// Sets a switch at once, or stages what is kept; else why not. Ports are cut in test mode only.
+    fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<(), i16> {
+        let (switches, test_mode) = (&mut self.switches, self.flags.has(State::TEST_MODE));
+        let set = match parameter {
+            Parameter::Reply => Reply::from_words(words).map(|reply| switches.reply = reply),
+            Parameter::Sensing => Sensing::from_words(words).map(|sensing| switches.sensing = sensing),
+            Parameter::Events => Events::from_words(words).map(|events| switches.events = events),
+            Parameter::Cuts => test_mode.then(|| switches.cuts = Cuts::from_words(words)),
+            Parameter::Mode => {
+                self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
+                self.stimuli.clear();
+                return Ok(());
+            }
+            Parameter::Identity
+            | Parameter::Mount
+            | Parameter::Pose
+            | Parameter::Contact
+            | Parameter::Timing
+            | Parameter::Row(_)
+            | Parameter::Commit => return self.configuration.stage(parameter, words),
+        };
+        self.summing.network.deaf = switches.cuts.deaf;
+        self.summing.sum.set_slots(match switches.reply {
+            Reply::Torque => None,
+            Reply::Sum(slots) => Some(slots),
+        });
+        self.after_network(now);
+        set.ok_or(Answer::CANNOT_BE)
+    }
+
+    fn identity_words(&self) -> [i16; WORDS] {
+        let [a, b, c, d] = self.identity.serial.to_le_bytes();
+        padded([
+            i16::from_le_bytes([a, b]),
+            i16::from_le_bytes([c, d]),
+            VERSION.into(),
+            self.configuration.hash().cast_signed(),
+            self.state().0.cast_signed(),
+        ])
+    }
+}
+
+/// These words, and zeros.
+fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
+    let mut first = first.into_iter();
+    core::array::from_fn(|_| first.next().unwrap_or(0))
+}

@@ -1,0 +1,51 @@
+//! From frames to packets: which identifiers are whose slot, halves, and what cannot be used.
+
+use protocol::can::{Format, Frame};
+use protocol::id::Id;
+use protocol::message::Refused;
+use protocol::packet::{Half, Packet, PacketError, Paired};
+use protocol::time::Micros;
+
+use super::{HEARD, count};
+
+/// What waits for its other half, and what was refused.
+#[derive(Debug)]
+pub(super) struct Receiver {
+    format: Format,
+    /// By slot of the identifier among those that are heard.
+    halves: [Half; HEARD],
+    /// What cannot be used, by its reason.
+    pub(super) refused: Refused,
+}
+
+impl Receiver {
+    pub(super) fn new(format: Format) -> Self {
+        Self { format, halves: [Half::NONE; HEARD], refused: Refused::default() }
+    }
+
+    /// The packet that this frame, which arrived then, is or completes.
+    pub(super) fn take(&mut self, arrived: Micros, id: Id, slot: usize, frame: &Frame) -> Option<Packet> {
+        let packet = match self.format {
+            Format::Fd => Packet::from_fd(frame),
+            Format::Classic if frame.format() != Format::Classic => {
+                Err(PacketError::Length { expected: 8, got: frame.data().len() })
+            }
+            Format::Classic => match self.halves.get_mut(slot)?.push(arrived, id, frame.data()) {
+                Ok(Paired::Waiting) => return None,
+                Ok(Paired::Incomplete) => {
+                    count(&mut self.refused.incomplete);
+                    return None;
+                }
+                Ok(Paired::Whole(packet)) => Ok(packet),
+                Err(error) => Err(error),
+            },
+        };
+        match packet {
+            Ok(packet) => return Some(packet),
+            Err(PacketError::Length { .. }) => count(&mut self.refused.length),
+            Err(PacketError::Crc { .. }) => count(&mut self.refused.crc),
+            Err(_) => count(&mut self.refused.foreign),
+        }
+        None
+    }
+}

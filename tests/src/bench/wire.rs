@@ -1,0 +1,177 @@
+//! The wire of a bench: from who sends a frame to everybody who hears it.
+
+use protocol::can::Frame;
+use protocol::packet::Packet;
+use protocol::time::{Micros, Span};
+use rand::RngExt;
+
+use super::{Bench, Event};
+use crate::fault::Party;
+use crate::witness::Truth;
+
+/// From one frame on the wire to the next: about what vcan needs.
+const FRAME: Span = Span(5);
+/// From the wire to a receiver, at least and at most, without faults.
+const LATENCY: (u64, u64) = (10, 60);
+
+/// A frame that stood on the wire.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct OnTheWire {
+    /// When.
+    pub at: Micros,
+    /// Whose it was.
+    pub from: Party,
+    /// What everybody could hear, but for what happened at receivers.
+    pub frame: Frame,
+}
+
+/// A frame as it was sent, and what is true of it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sent {
+    pub(super) frame: Frame,
+    pub(super) truth: Truth,
+}
+
+/// A frame on its way to a receiver.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Delivery {
+    to: Party,
+    stood: Micros,
+    sent: Sent,
+    after_next: bool,
+}
+
+/// What a receiver has, beside itself.
+#[derive(Debug, Default)]
+pub(super) struct Inlet {
+    /// When its newest frame comes in, so that a later one does not overtake it.
+    newest: Micros,
+    /// A frame that comes after the next one.
+    held: Option<Delivery>,
+}
+
+impl Bench {
+    /// Enters when the real bus is looked at next.
+    pub(super) fn look_at_the_bus(&mut self) {
+        let Some(real) = &mut self.real else { return };
+        if let Some(next) = real.next()
+            && real.look.is_none_or(|look| next < look)
+        {
+            real.look = Some(next);
+            self.agenda.enter(next, Event::Bus);
+        }
+    }
+
+    pub(super) fn packets(&mut self, from: Party, life: u32, at: Micros, packets: &[Packet]) {
+        for packet in packets {
+            self.packets += 1;
+            for (half, frame) in packet.frames(self.format).enumerate() {
+                let truth =
+                    Truth { from, life, packet: Some(*packet), number: self.packets, half, damage: None };
+                self.agenda.enter(at, Event::Send(Sent { frame, truth }, true));
+            }
+        }
+    }
+
+    /// A frame wants a place on the wire.
+    pub(super) fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
+        if may_be_hit {
+            let fate = self.faults.fate(self.agenda.now, sent.truth.from, None, sent.frame);
+            sent.frame = fate.frame;
+            sent.truth = sent.truth.and(fate.damage);
+            if fate.after_next && fate.times > 0 && self.held.is_none() {
+                self.held = Some(sent);
+                return;
+            }
+            for _ in 0..fate.times {
+                self.agenda.enter_in(fate.delay, Event::Send(sent, false));
+            }
+            return;
+        }
+        self.stand(&sent);
+        if let Some(held) = self.held.take() {
+            self.stand(&held);
+        }
+    }
+
+    /// A frame has its place in the order, or waits for it.
+    fn stand(&mut self, sent: &Sent) {
+        if let Some(real) = &mut self.real {
+            real.ask(self.agenda.now, &sent.frame, *sent);
+            self.look_at_the_bus();
+            return;
+        }
+        let stood = self.agenda.now.max(self.free);
+        self.free = stood + FRAME;
+        self.reach(stood, sent);
+    }
+
+    /// A frame stood on the wire, and goes to whoever hears it.
+    pub(super) fn reach(&mut self, stood: Micros, sent: &Sent) {
+        let from = sent.truth.from;
+        self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
+        self.pass(Party::Gateway, stood, sent);
+        let hearers = self.hearers.get(&sent.frame.raw_id()).cloned().unwrap_or_default();
+        for seat in hearers {
+            if from != Party::Seat(seat) {
+                self.pass(Party::Seat(seat), stood, sent);
+            }
+        }
+    }
+
+    /// From the wire to one receiver.
+    fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
+        let fate = self.faults.fate(self.agenda.now, sent.truth.from, Some(to), sent.frame);
+        // A real bus is everywhere at once.
+        let latency = match self.real {
+            Some(_) => Span(0),
+            None => Span(self.dice.random_range(LATENCY.0..=LATENCY.1)),
+        };
+        let mut at = stood + latency;
+        if let Some(inlet) = self.inlet(to) {
+            at = at.max(inlet.newest);
+            if fate.delay == Span(0) {
+                inlet.newest = at;
+            }
+        }
+        let sent = Sent { frame: fate.frame, truth: sent.truth.and(fate.damage) };
+        for _ in 0..fate.times {
+            let delivery = Delivery { to, stood, sent, after_next: fate.after_next };
+            self.agenda.enter(at + fate.delay, Event::Deliver(delivery));
+        }
+    }
+
+    fn inlet(&mut self, party: Party) -> Option<&mut Inlet> {
+        match party {
+            Party::Gateway => Some(&mut self.gateway_inlet),
+            Party::Seat(seat) => self.inlets.get_mut(seat),
+            Party::Stranger => None,
+        }
+    }
+
+    pub(super) fn deliver(&mut self, delivery: Delivery) {
+        let Some(inlet) = self.inlet(delivery.to) else { return };
+        if delivery.after_next && inlet.held.is_none() {
+            inlet.held = Some(delivery);
+            return;
+        }
+        let held = inlet.held.take();
+        for delivery in core::iter::once(delivery).chain(held) {
+            let Delivery { to, stood, sent: Sent { frame, truth }, .. } = delivery;
+            match to {
+                Party::Gateway => {
+                    let own = truth.from == Party::Gateway;
+                    self.gateway.hear(stood, own, &frame);
+                    self.witness.hear(stood, &truth, &frame);
+                }
+                Party::Seat(seat) => {
+                    let now = self.agenda.now;
+                    let Some(there) = self.seats.get_mut(seat) else { return };
+                    let packets = there.hear(now, stood, frame);
+                    self.sends(seat, &packets);
+                }
+                Party::Stranger => {}
+            }
+        }
+    }
+}

@@ -1,0 +1,118 @@
+//! One cell, and what it computes with.
+
+use std::collections::{HashMap, VecDeque};
+
+use cell_node::contact::{Force, Torque};
+use cell_node::kernel::{Kernel, Wrench};
+use cell_node::node::Node;
+use cell_node::sum::Words;
+use protocol::can::Frame;
+use protocol::fixed::{Q1_14, Q3_12, Q7_8};
+use protocol::id::CellId;
+use protocol::message::{Ports, Tree};
+use protocol::packet::WORDS;
+use protocol::parameters::{Contact, Parameters, Pose, Row};
+use protocol::time::Micros;
+use protocol::wire::{PORTS, PortMessage};
+use rand::RngExt;
+use rand_pcg::Pcg64Mcg;
+
+use super::{End, POSITIONS};
+
+/// How a cell is.
+#[derive(Debug)]
+pub(super) enum Life {
+    Off,
+    Runs(Box<Node>),
+    Hangs(Box<Node>, VecDeque<(Micros, Inlet)>),
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Inlet {
+    Frame(Frame),
+    Port(usize, PortMessage),
+}
+
+/// One cell.
+#[derive(Debug)]
+pub struct Place {
+    /// Its number, once it has one; kept over restarts as in flash.
+    pub number: Option<CellId>,
+    /// What its ports lead to.
+    pub wires: [Option<End>; PORTS + 1],
+    /// Port p hears nothing.
+    pub deaf: [bool; PORTS + 1],
+    /// The last page of its place in the tree.
+    pub tree: Option<Tree>,
+    /// The last page of its ports.
+    pub ports: Option<Ports>,
+    /// Its own torque, as it enters sums.
+    pub(super) own: [i32; WORDS],
+    pub(super) serial: u32,
+    pub(super) parameters: Parameters,
+    pub(super) force: Force,
+    pub(super) life: Life,
+    pub(super) wake: Option<Micros>,
+    /// What it hears aside, and when that stood on the bus: it does not wake it.
+    pub(super) aside: VecDeque<(Micros, Frame)>,
+    pub(super) newest: Micros,
+    /// What it said in each of the last epochs: words, and who is in it.
+    pub(super) said: HashMap<u8, Vec<(Words, u128)>>,
+}
+
+impl Place {
+    pub(super) fn new(index: usize, dice: &mut Pcg64Mcg) -> Self {
+        let mut normal = [0.0_f64; 3].map(|_| dice.random_range(-1.0..1.0_f64));
+        let length = normal.iter().map(|n| n * n).sum::<f64>().sqrt().max(1e-3);
+        normal.iter_mut().for_each(|n| *n /= length);
+        if (normal.iter().map(|n| n * n).sum::<f64>() - 1.0).abs() > 1e-3 {
+            normal = [0.0, 0.0, 1.0];
+        }
+        let row = |a, alpha, d| Row {
+            a: Q1_14::nearest(a),
+            d: Q1_14::nearest(d),
+            alpha: Q1_14::nearest(alpha),
+            theta_offset: Q1_14::ZERO,
+        };
+        let parameters = Parameters {
+            joint: 6,
+            joints: 6,
+            pose: Pose {
+                position: [0.0; 3].map(|_: f64| Q1_14::nearest(dice.random_range(-0.2..0.2))),
+                normal: normal.map(Q1_14::nearest),
+            },
+            contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
+            period_us: 16_000,
+            rows: [
+                row(0.0, 1.0, 0.09),
+                row(-0.425, 0.0, 0.0),
+                row(-0.392, 0.0, 0.0),
+                row(0.0, 1.0, 0.11),
+                row(0.0, -1.0, 0.095),
+                row(0.0, 0.0, 0.08),
+            ],
+        };
+        let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
+        let jacobian = Wrench::new(&parameters).jacobian(&POSITIONS.map(Q1_14::nearest));
+        let own = Torque::new(&jacobian, force).exact().map(|exact| {
+            let word: Q7_8 = exact.round();
+            i32::from(word.to_bits())
+        });
+        Self {
+            number: None,
+            wires: [None; PORTS + 1],
+            deaf: [false; PORTS + 1],
+            tree: None,
+            ports: None,
+            own,
+            serial: 1_000 + u32::try_from(index).expect("few cells"),
+            parameters,
+            force,
+            life: Life::Off,
+            wake: None,
+            aside: VecDeque::new(),
+            newest: Micros(0),
+            said: HashMap::new(),
+        }
+    }
+}

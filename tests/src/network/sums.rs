@@ -1,0 +1,134 @@
+//! Who is in a sum that a cell says, and who hears it.
+
+use std::collections::BTreeSet;
+
+use cell_node::sum::Words;
+use protocol::can::Format;
+use protocol::id::CellId;
+use protocol::message::Message;
+use protocol::packet::{Epoch, WORDS};
+
+use super::place::{Inlet, Life};
+use super::{End, Event, Wiring};
+
+impl Wiring {
+    /// A cell says a sum: who is in it, and who hears it.
+    pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
+        let cells = self.decode(cell, epoch, words);
+        let said = &mut self.cells[cell].said;
+        if said.len() > 8 {
+            said.retain(|of, _| Epoch(*of).since(epoch) >= -4);
+        }
+        said.entry(epoch.0).or_default().push((words, cells));
+        let frame = Message::Sum { from, epoch, torque: words.torque, count: words.count }.encode();
+        let frame = frame.frames(Format::Fd).next().expect("one frame");
+        let neighbours: BTreeSet<usize> = self.cells[cell]
+            .wires
+            .iter()
+            .filter_map(|end| match end {
+                Some(End::Cell(other, _)) => Some(*other),
+                Some(End::Gateway(_)) | None => None,
+            })
+            .collect();
+        for other in neighbours {
+            let hears = match &self.cells[other].life {
+                Life::Runs(node) | Life::Hangs(node, _) => node.hears().any(|id| id == frame_id(from)),
+                Life::Off => false,
+            };
+            if hears {
+                let at = self.arrival(Some(other));
+                self.agenda.enter(at, Event::Deliver(other, Inlet::Frame(frame)));
+            }
+        }
+        let root = self.roots.iter().position(|&root| root == cell);
+        if root.is_some_and(|root| self.uplinks.is_child(root)) && self.epoch == Some(epoch) {
+            let best = self.root_sums.entry(cell).or_insert((words, cells));
+            if words.count >= best.0.count {
+                *best = (words, cells);
+            }
+            if let Some(took) = self.took.last_mut() {
+                took.frames += 1;
+                took.cells = 0;
+                for (root, (_, cells)) in &self.root_sums {
+                    assert_eq!(
+                        took.cells & cells,
+                        0,
+                        "root {root} counts cells of another one in {epoch:?}: {:?}; {}",
+                        self.root_sums,
+                        self.ways()
+                    );
+                    took.cells |= cells;
+                }
+            }
+        }
+    }
+
+    /// Which cells are in a sum: its own torque or not, and some of the sums that its neighbours said.
+    fn decode(&self, cell: usize, epoch: Epoch, words: Words) -> u128 {
+        let place = &self.cells[cell];
+        let mut heard: Vec<Vec<(Words, u128)>> = Vec::new();
+        let mut seen = BTreeSet::new();
+        for end in place.wires.iter().flatten() {
+            if let End::Cell(other, _) = end
+                && seen.insert(*other)
+                && let Some(said) = self.cells[*other].said.get(&epoch.0)
+            {
+                heard.push(said.clone());
+            }
+        }
+        let wanted = words.torque.map(|word| i32::from(word.to_bits()));
+        let mut found = None;
+        for own in [1_u32, 0] {
+            let sum = if own == 1 { place.own } else { [0; WORDS] };
+            choose(&heard, sum, own, u128::from(own) << cell, (&wanted, words.count.into()), &mut found);
+        }
+        // The end of a contact: zeros of its own, and no torque.
+        if words.is_end() {
+            return 0;
+        }
+        let cells = found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));
+        assert_ne!(
+            cells,
+            TWICE,
+            "cell {cell} counts a cell twice in {epoch:?} at {:?}: {words:?} of {heard:?}; {}",
+            self.agenda.now,
+            self.ways()
+        );
+        cells
+    }
+}
+
+/// Instead of the cells in a sum: one of them is in it twice.
+const TWICE: u128 = u128::MAX;
+
+fn frame_id(from: CellId) -> protocol::id::Id {
+    protocol::id::Id::new(protocol::id::Kind::Sum, protocol::id::Node::Cell(from))
+}
+
+/// Tries every choice of one sum, or none, of each neighbour.
+fn choose(
+    heard: &[Vec<(Words, u128)>],
+    sum: [i32; WORDS],
+    count: u32,
+    cells: u128,
+    wanted: (&[i32; WORDS], u32),
+    found: &mut Option<u128>,
+) {
+    if count == wanted.1 && sum == *wanted.0 && found.is_none_or(|before| before == TWICE) {
+        *found = Some(cells);
+    }
+    let Some((first, rest)) = heard.split_first() else { return };
+    if count > wanted.1 {
+        return;
+    }
+    for (words, of) in first {
+        let mut with = sum;
+        for (sum, word) in with.iter_mut().zip(words.torque) {
+            *sum += i32::from(word.to_bits());
+        }
+        // Where a cell is in it twice, all the bits are set that nobody has.
+        let both = if cells & of == 0 { cells | of } else { TWICE };
+        choose(rest, with, count + u32::from(words.count), both, wanted, found);
+    }
+    choose(rest, sum, count, cells, wanted, found);
+}

@@ -1,0 +1,83 @@
+//! What is true of the cells and their wires, and what they say of it.
+
+use std::collections::BTreeSet;
+
+use protocol::id::{CellId, Command, Id};
+
+use super::place::Life;
+use super::{End, Wiring};
+
+impl Wiring {
+    /// Whether a cell works.
+    #[must_use]
+    pub fn runs(&self, cell: usize) -> bool {
+        matches!(self.cells[cell].life, Life::Runs(_))
+    }
+
+    /// Whether a cell is woken by its children and not by joints.
+    #[must_use]
+    pub fn waits_for_children(&self, cell: usize) -> bool {
+        let joints = Id::command(Command::Joints);
+        matches!(&self.cells[cell].life, Life::Runs(node) if node.hears_aside(joints))
+    }
+
+    /// Cells that have a way to the gateway, by wires that work in both directions and cells that run.
+    #[must_use]
+    pub fn reachable(&self) -> BTreeSet<usize> {
+        let mut reached = BTreeSet::new();
+        let mut next: Vec<usize> = self.roots.iter().copied().filter(|&root| self.runs(root)).collect();
+        while let Some(cell) = next.pop() {
+            if !reached.insert(cell) {
+                continue;
+            }
+            for (port, end) in self.cells[cell].wires.iter().enumerate() {
+                if let Some(End::Cell(other, at)) = *end {
+                    let works = !self.cells[cell].deaf[port] && !self.cells[other].deaf[at];
+                    if works && self.runs(other) {
+                        next.push(other);
+                    }
+                }
+            }
+        }
+        reached
+    }
+
+    /// The way of a cell's sums to a root, by what the cells report; `None` without one, or in a circle.
+    #[must_use]
+    pub fn way(&self, cell: usize) -> Option<Vec<usize>> {
+        let mut way = vec![cell];
+        loop {
+            let at = *way.last()?;
+            let tree = self.cells[at].tree?;
+            match tree.parent? {
+                0 => return Some(way),
+                parent => {
+                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
+                        return None;
+                    };
+                    if self.cells[other].number.map(CellId::get) != Some(parent) || way.contains(&other) {
+                        return None;
+                    }
+                    way.push(other);
+                }
+            }
+        }
+    }
+
+    /// All ways, for people.
+    #[must_use]
+    pub fn ways(&self) -> String {
+        let way = |cell: usize| {
+            let place = &self.cells[cell];
+            let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
+            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.way(cell))
+        };
+        (0..self.cells.len()).map(way).collect::<Vec<_>>().join("; ")
+    }
+
+    /// The bits of some cells.
+    #[must_use]
+    pub fn bits(cells: &BTreeSet<usize>) -> u128 {
+        cells.iter().map(|cell| 1 << cell).sum()
+    }
+}

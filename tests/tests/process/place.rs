@@ -1,0 +1,148 @@
+//! Where a test's benches run: a directory of its own.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use protocol::bus::BusKind;
+use rustix::process::Pid;
+use tempfile::TempDir;
+
+use super::guest::Guest;
+use super::running::{Running, all_processes, command_line, proc};
+use super::{PATIENCE, PRESSED, Summary, names, program, skin, vcan};
+
+/// A directory of its own for a test, and in it its embedded buses.
+pub(crate) struct Place {
+    directory: TempDir,
+    /// What its benches run on.
+    kind: BusKind,
+}
+
+impl Place {
+    pub(crate) fn new() -> Self {
+        Self { directory: TempDir::new().unwrap(), kind: BusKind::Embedded }
+    }
+
+    /// One whose benches run on `vcan0` of a network that is the test's own.
+    pub(crate) fn on_vcan() -> Self {
+        vcan::needs("vcan0");
+        Self { kind: BusKind::SocketCan, ..Self::new() }
+    }
+
+    /// What its benches run on.
+    pub(crate) const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    /// Where its buses are: `SKINBUS_DIR`.
+    pub(crate) fn buses(&self) -> PathBuf {
+        self.path("buses")
+    }
+
+    pub(crate) fn write(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.path(name);
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    pub(crate) fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap()
+    }
+
+    /// The files in it, in order.
+    pub(crate) fn files(&self) -> Vec<String> {
+        names(self.directory.path())
+    }
+
+    /// `skin.toml`: some cells on an arm, on one bus.
+    pub(crate) fn skin(&self, cells: usize) -> PathBuf {
+        self.write("skin.toml", &skin(cells))
+    }
+
+    /// `scenario.toml`.
+    pub(crate) fn scenario(&self, text: &str) -> PathBuf {
+        self.write("scenario.toml", text)
+    }
+
+    /// `skin.toml` and `scenario.toml` for a bench of eight cells that are all pressed.
+    pub(crate) fn pressed(&self) {
+        self.skin(8);
+        self.scenario(PRESSED);
+    }
+
+    /// A command in this place; words are parted by spaces.
+    pub(crate) fn command(&self, name: &str, words: &str) -> Command {
+        self.command_of(&program(name), words)
+    }
+
+    /// The same of any program.
+    pub(crate) fn command_of(&self, program: &Path, words: &str) -> Command {
+        let mut command = Command::new(program);
+        command.args(words.split(' ').filter(|word| !word.is_empty()));
+        command.current_dir(self.directory.path()).env("SKINBUS_DIR", self.buses()).env("NO_COLOR", "1");
+        command
+    }
+
+    pub(crate) fn start(&self, name: &str, words: &str) -> Running {
+        Running::start(self.command(name, words))
+    }
+
+    /// A bench of `skin.toml` and `scenario.toml` for some seconds, with a log and a summary.
+    pub(crate) fn bench(&self, seconds: f64, more: &str) -> Running {
+        self.start(
+            "gateway",
+            &format!(
+                "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
+                 --candump run.log --force --summary run.json {more}",
+                self.kind
+            ),
+        )
+    }
+
+    /// The same, once its loop runs.
+    pub(crate) fn running_bench(&self, seconds: f64, more: &str) -> Running {
+        let bench = self.bench(seconds, more);
+        bench.hears_the_loop();
+        bench
+    }
+
+    /// What a bench left.
+    pub(crate) fn summary(&self) -> Summary {
+        Summary(serde_json::from_str(&self.read("run.json")).unwrap())
+    }
+
+    /// Another client of its bus.
+    pub(crate) fn guest(&self) -> Guest {
+        Guest::on(self, "vcan0", protocol::can::Format::Fd)
+    }
+
+    /// Processes of this place that live, with their command lines.
+    pub(crate) fn processes(&self) -> Vec<(Pid, String)> {
+        let mark = format!("SKINBUS_DIR={}", self.buses().display());
+        let ours = |pid: &Pid| {
+            let environment = fs::read(proc(*pid, "environ")).unwrap_or_default();
+            environment.split(|&byte| byte == 0).any(|word| word == mark.as_bytes())
+        };
+        all_processes().into_iter().filter(ours).map(|pid| (pid, command_line(pid))).collect()
+    }
+
+    /// Sees that no process and no socket of this place is left, soon.
+    pub(crate) fn is_left_clean(&self) {
+        let left = || {
+            let processes = self.processes();
+            if processes.is_empty() && !self.buses().exists() { None } else { Some(processes) }
+        };
+        let give_up = Instant::now() + PATIENCE;
+        while let Some(processes) = left() {
+            let sockets = if self.buses().exists() { names(&self.buses()) } else { Vec::new() };
+            assert!(Instant::now() < give_up, "left behind: {processes:?} {sockets:?}");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
