@@ -15,11 +15,11 @@ use protocol::packet::Epoch;
 use trace::capture::Reader;
 use trace::capture::convert::{Output, convert};
 use trace::capture::log::Style;
-use trace::ros2::{Header, Message};
 use trace::ros2::cdr::Writer as Cdr;
 use trace::ros2::messages::{CanFrame, CaptureNote};
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
+use trace::ros2::{Header, Message};
 
 use crate::mutate::{chunk, record, string};
 

@@ -30,7 +30,8 @@ pub struct Torques {
 /// When the bytes are no such message.
 pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = Reader::new(message)?;
-    (from.get::<Header<'_>>()?, from.get::<Vec<&str>>()?);
+    from.get::<Header<'_>>()?;
+    from.get::<Vec<&str>>()?;
     Ok(Joints { position: from.get()?, velocity: from.get()? })
 }
 
