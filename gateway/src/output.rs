@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use protocol::stop::Stoppable;
 use protocol::usage::Failure;
-use trace::files::{WholeFile, check};
+use trace::files::{WholeFile, check, folder_of};
 
 /// Whether files that exist may be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
@@ -82,9 +82,7 @@ pub(crate) fn apart<'a>(
 
 /// Where a name leads: two names of one file are the same, whether it is there or not.
 fn place(path: &Path) -> PathBuf {
-    let folder =
-        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
-    let inside = || Some(fs::canonicalize(folder).ok()?.join(path.file_name()?));
+    let inside = || Some(fs::canonicalize(folder_of(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
 }
 

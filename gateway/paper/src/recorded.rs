@@ -71,7 +71,7 @@ fn take(
         row.distributed = by_joint(&torques.distributed);
         row.central = (!torques.central.is_empty()).then(|| by_joint(&torques.central));
     } else if schema == LoopTiming::TYPE {
-        let timing = read::timing(message, nanos)?;
+        let timing = read::timing(message)?;
         let row = rows.entry(nanos).or_default();
         (row.took_us, row.central_us, row.contributing) =
             (timing.took_us, timing.central_us, timing.contributing);
@@ -87,7 +87,7 @@ fn by_joint(numbers: &[f64]) -> [f64; WORDS] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use trace::ros2::cdr::Writer;
+    use trace::ros2::cdr::{Encode, Writer};
 
     #[test]
     fn the_messages_of_a_tick_make_one_row() {
@@ -109,12 +109,12 @@ mod tests {
         let torques = Torques { nanos: 5, distributed: &[1.0, 2.0], central: &[1.5, 2.5], active: 3 };
         let timing =
             LoopTiming { nanos: 5, took_us: 6.0, central_us: 4.0, contributing: 3, ..LoopTiming::default() };
-        say("/UR5/joint_commands", JointState::TYPE, 5, &|out| commands.write(out));
-        say("/UR5/joint_states", JointState::TYPE, 5, &|out| states.write(out));
-        say("/UR5/torques", Torques::TYPE, 5, &|out| torques.write(out));
-        say("/gateway/timing", LoopTiming::TYPE, 5, &|out| timing.write(out));
+        say("/UR5/joint_commands", JointState::TYPE, 5, &|out| commands.encode(out));
+        say("/UR5/joint_states", JointState::TYPE, 5, &|out| states.encode(out));
+        say("/UR5/torques", Torques::TYPE, 5, &|out| torques.encode(out));
+        say("/gateway/timing", LoopTiming::TYPE, 5, &|out| timing.encode(out));
         let without = Torques { nanos: 9, central: &[], active: 0, ..torques };
-        say("/UR5/torques", Torques::TYPE, 9, &|out| without.write(out));
+        say("/UR5/torques", Torques::TYPE, 9, &|out| without.encode(out));
         assert_eq!(rows.len(), 2);
         let row = rows[&5];
         assert_eq!(row.velocity[..3], [0.5, -0.5, 0.0]);

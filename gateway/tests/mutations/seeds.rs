@@ -15,11 +15,11 @@ use protocol::packet::Epoch;
 use trace::capture::Reader;
 use trace::capture::convert::{Output, convert};
 use trace::capture::log::Style;
-use trace::ros2::Message;
 use trace::ros2::cdr::Writer as Cdr;
 use trace::ros2::messages::{CanFrame, CaptureNote};
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
+use trace::ros2::{Header, Message};
 
 use crate::mutate::{chunk, record, string};
 
@@ -177,11 +177,9 @@ fn bridge() -> Vec<u8> {
         let nanos = BEGAN + u64::from(number) * 1_000_000;
         let mut data = Vec::new();
         let mut out = Cdr::new(&mut data);
-        out.i32(i32::from(number));
-        out.u32(5);
-        out.str("can0");
-        out.u32(0x100 + u32::from(number));
-        [0, 1, 0, 8, 1, 2, 3, 4, 5, 6, 7, 8].into_iter().for_each(|byte| out.u8(byte));
+        out.put(Header { nanos: u64::from(number) * 1_000_000_000 + 5, frame_id: "can0" });
+        out.put(0x100 + u32::from(number));
+        [0_u8, 1, 0, 8, 1, 2, 3, 4, 5, 6, 7, 8].into_iter().for_each(|byte| out.put(byte));
         file.put(("can_msgs/msg/Frame", ""), "/from_can_bus", nanos, &data);
     }
     file.writer.finish().unwrap();

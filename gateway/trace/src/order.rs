@@ -9,45 +9,12 @@
 //! ever changed: what a cell heard before it heard the joints, it has to hear before the joints again, whatever the
 //! time stamps say. Frames of the same time keep the capture's order.
 
-use std::cmp::Ordering;
-use std::collections::BinaryHeap;
+use std::collections::BTreeMap;
 
 /// A frame waits until one has been read that is so much newer, in ns.
 pub const WINDOW_NS: u64 = 1_000_000_000;
 /// At most so many frames wait.
 pub const WINDOW_FRAMES: usize = 8_192;
-
-/// One that waits.
-#[derive(Debug)]
-struct Waiting<T> {
-    /// Its time, or that of a frame before it on its bus, when that was later.
-    key: u64,
-    /// Where it stood in the capture.
-    place: u64,
-    nanos: u64,
-    item: T,
-}
-
-impl<T> Ord for Waiting<T> {
-    /// The earliest is the greatest, for the heap gives out the greatest.
-    fn cmp(&self, other: &Self) -> Ordering {
-        (other.key, other.place).cmp(&(self.key, self.place))
-    }
-}
-
-impl<T> PartialOrd for Waiting<T> {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl<T> PartialEq for Waiting<T> {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other) == Ordering::Equal
-    }
-}
-
-impl<T> Eq for Waiting<T> {}
 
 /// The next one to be sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -65,7 +32,9 @@ pub struct Ordered<T> {
 /// Merges buses by time.
 #[derive(Debug)]
 pub struct Order<T> {
-    heap: BinaryHeap<Waiting<T>>,
+    /// Those that wait, by their time, or that of a frame before them on their bus when that was later, and by where
+    /// they stood in the capture: their own time, and what they are.
+    waiting: BTreeMap<(u64, u64), (u64, T)>,
     /// The greatest time so far on each bus.
     buses: Vec<u64>,
     places: u64,
@@ -76,7 +45,7 @@ pub struct Order<T> {
 
 impl<T> Default for Order<T> {
     fn default() -> Self {
-        Self { heap: BinaryHeap::new(), buses: Vec::new(), places: 0, newest: 0, released: 0 }
+        Self { waiting: BTreeMap::new(), buses: Vec::new(), places: 0, newest: 0, released: 0 }
     }
 }
 
@@ -90,21 +59,21 @@ impl<T> Order<T> {
             *greatest = nanos.max(*greatest);
             *greatest
         });
-        self.heap.push(Waiting { key, place: self.places, nanos, item });
+        self.waiting.insert((key, self.places), (nanos, item));
         self.places += 1;
         self.newest = self.newest.max(nanos);
     }
 
     /// The next one, if it need not wait any longer.
     pub fn pop(&mut self) -> Option<Ordered<T>> {
-        let next = self.heap.peek()?;
-        let waits = self.newest - next.key.min(self.newest) <= WINDOW_NS && self.heap.len() <= WINDOW_FRAMES;
+        let (&(key, _), _) = self.waiting.first_key_value()?;
+        let waits = self.newest.saturating_sub(key) <= WINDOW_NS && self.waiting.len() <= WINDOW_FRAMES;
         if waits { None } else { self.pop_last() }
     }
 
     /// The next one, when the capture has no more.
     pub fn pop_last(&mut self) -> Option<Ordered<T>> {
-        let Waiting { key, nanos, item, .. } = self.heap.pop()?;
+        let ((key, _), (nanos, item)) = self.waiting.pop_first()?;
         let is_late = nanos < self.released;
         self.released = self.released.max(key);
         Some(Ordered { at: self.released, nanos, is_late, item })
@@ -159,7 +128,7 @@ mod tests {
         for place in 0..3 * WINDOW_FRAMES {
             order.push(0, 7, place);
             while order.pop().is_some() {}
-            assert!(order.heap.len() <= WINDOW_FRAMES);
+            assert!(order.waiting.len() <= WINDOW_FRAMES);
         }
     }
 

@@ -2,14 +2,16 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use protocol::stop::Stoppable;
-use rustix::fs::{Access, FlockOperation, OFlags, access, flock};
+use rustix::fs::{Access, access};
 
-use super::target::{Target, exists, folder_of, open_stream, part_of, sync_folder, with_remedy};
+use super::target::{
+    Target, folder_of, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
+    sync_folder, with_remedy,
+};
 
 /// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
 /// takes another file's place does so with its first line.
@@ -43,10 +45,8 @@ impl LogFile {
             Ok(Target::New) => State::Ours(begin(path)?),
             Ok(Target::Old) => {
                 // A link that took its place meanwhile is not followed.
-                let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed();
-                let old = OpenOptions::new().read(true).custom_flags(flags).open(path);
-                let old = old.map_err(with_remedy)?;
-                hold(&old)?;
+                let old = open_unfollowed(path).map_err(with_remedy)?;
+                hold_log(&old)?;
                 // That nothing can take its place is known before the first line.
                 let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
                 writes.map_err(|errno| with_remedy(errno.into()))?;
@@ -56,7 +56,7 @@ impl LogFile {
                 // That somebody writes it says more than that it is there.
                 let about = fs::symlink_metadata(path);
                 if about.is_ok_and(|about| about.is_file()) {
-                    File::open(path).map_or(Ok(()), |old| hold(&old))?;
+                    File::open(path).map_or(Ok(()), |old| hold_log(&old))?;
                 }
                 return Err(error);
             }
@@ -69,22 +69,17 @@ impl LogFile {
     /// # Errors
     /// When none can be written, and what to do.
     pub fn create_numbered(path: &Path, stopped: &AtomicBool) -> io::Result<Self> {
-        let (stem, end) = (path.file_stem().unwrap_or_default(), path.extension().unwrap_or_default());
-        let name = |number: u32| {
-            let mut name = stem.to_owned();
-            name.push(format!("-{number}"));
-            path.with_file_name(name).with_extension(end)
-        };
-        let mut created = Self::create(path, false, stopped);
-        for number in 1.. {
-            match created {
+        let mut number = 0;
+        let mut name = path.to_owned();
+        loop {
+            match Self::create(&name, false, stopped) {
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-                    created = Self::create(&name(number), false, stopped);
+                    number += 1;
+                    name = suffixed(path, format!("-{number}"), path.extension().unwrap_or_default());
                 }
-                _ => break,
+                created => return created,
             }
         }
-        created
     }
 
     /// Its name.
@@ -154,9 +149,8 @@ impl Drop for LogFile {
     /// A log that was never ended, and in which nothing stands, is taken away.
     fn drop(&mut self) {
         let State::Ours(file) = &self.state else { return };
-        let inode = |about: fs::Metadata| (about.dev(), about.ino());
-        let [own, there] = [file.metadata(), fs::symlink_metadata(&self.path)].map(|it| it.map(inode).ok());
-        if !self.ended && self.bytes == 0 && own == there {
+        let is_there = file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)));
+        if !self.ended && self.bytes == 0 && is_there {
             // Nothing more can be done.
             let _ = fs::remove_file(&self.path);
         }
@@ -165,16 +159,15 @@ impl Drop for LogFile {
 
 /// Makes a file that nobody else has, and holds it.
 fn begin(path: &Path) -> io::Result<File> {
-    let file = OpenOptions::new().append(true).create_new(true).open(path).map_err(|error| {
-        if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { with_remedy(error) }
-    })?;
-    hold(&file)?;
+    let file = OpenOptions::new().append(true).create_new(true).open(path);
+    let file = file.map_err(|error| or_exists(with_remedy(error)))?;
+    hold_log(&file)?;
     Ok(file)
 }
 
-/// Holds a file against other writers, as long as it is open; where the file system has no locks it is not held.
-fn hold(file: &File) -> io::Result<()> {
-    if flock(file, FlockOperation::NonBlockingLockExclusive) == Err(rustix::io::Errno::WOULDBLOCK) {
+/// Holds a log against other writers; where the file system has no locks it is not held.
+fn hold_log(file: &File) -> io::Result<()> {
+    if hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
         let why = "another run is writing it: name another file, or wait for that run's end";
         return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
     }

@@ -8,15 +8,13 @@ mod target;
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
-use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use rustix::fs::{AtFlags, CWD, Mode, OFlags, linkat, open};
-
 pub use log::LogFile;
-use target::{Target, exists, folder_of, open_stream, part_of, sync_folder};
-pub use target::{check, check_regular, rename, sync, with_remedy};
+use target::{Target, open_stream, or_exists, part_of, sync_folder};
+pub use target::{check, check_regular, folder_of, rename, suffixed, sync, with_remedy};
+pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
 /// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run
@@ -27,17 +25,10 @@ pub use target::{check, check_regular, rename, sync, with_remedy};
 pub struct WholeFile {
     path: PathBuf,
     force: bool,
-    state: State,
-}
-
-#[derive(Debug)]
-enum State {
-    /// Written to as it is, or finished.
-    Named,
-    /// Without a name, held open by this.
-    Nameless(File),
-    /// Under another name.
-    Part(File),
+    /// Until it has its name; of what is written to as it is, never.
+    file: Option<File>,
+    /// Whether it has another name until then.
+    is_part: bool,
 }
 
 impl WholeFile {
@@ -55,20 +46,17 @@ impl WholeFile {
     /// # Errors
     /// When it cannot be written, and what to do.
     pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
-        let path = path.to_owned();
-        if Target::of(&path, force)? == Target::Stream {
-            let file = open_stream(&path, stopped).map_err(with_remedy)?;
-            return Ok((Self { path, force, state: State::Named }, file));
+        let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
+        if Target::of(path, force)? == Target::Stream {
+            let file = open_stream(path, stopped).map_err(with_remedy)?;
+            return Ok((begun(None, false), file));
         }
-        let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
-        if let Ok(file) = open(folder_of(&path), flags, Mode::from_raw_mode(0o666)).map(File::from) {
-            let state = State::Nameless(file.try_clone()?);
-            return Ok((Self { path, force, state }, file));
+        if let Ok(file) = nameless(folder_of(path), 0o666) {
+            return Ok((begun(Some(file.try_clone()?), false), file));
         }
-        let part = OpenOptions::new().write(true).create_new(true).open(part_of(&path));
+        let part = OpenOptions::new().write(true).create_new(true).open(part_of(path));
         let file = part.map_err(with_remedy)?;
-        let state = State::Part(file.try_clone()?);
-        Ok((Self { path, force, state }, file))
+        Ok((begun(Some(file.try_clone()?), true), file))
     }
 
     /// Its name, once it is whole.
@@ -82,27 +70,18 @@ impl WholeFile {
     /// # Errors
     /// When the file system refuses, or another program has made a file of this name meanwhile.
     pub fn finish(mut self) -> io::Result<()> {
-        match &self.state {
-            State::Named => return Ok(()),
-            State::Nameless(file) => {
-                file.sync_all()?;
-                let nameless = format!("/proc/self/fd/{}", file.as_raw_fd());
-                // A link never takes another file's place, so that one gets a name of its own first.
-                let name = if self.force { part_of(&self.path) } else { self.path.clone() };
-                match linkat(CWD, nameless, CWD, name, AtFlags::SYMLINK_FOLLOW) {
-                    Err(rustix::io::Errno::EXIST) => return Err(exists()),
-                    linked => linked?,
-                }
-                if self.force {
-                    self.state = State::Part(file.try_clone()?);
-                }
-            }
-            State::Part(file) => file.sync_all()?,
+        let Some(file) = &self.file else { return Ok(()) };
+        file.sync_all()?;
+        if !self.is_part {
+            // A link never takes another file's place, so that one gets a name of its own first.
+            let name = if self.force { part_of(&self.path) } else { self.path.clone() };
+            link(file, &name).map_err(or_exists)?;
+            self.is_part = self.force;
         }
-        if let State::Part(_) = self.state {
+        if self.is_part {
             rename(&part_of(&self.path), &self.path, self.force)?;
+            self.is_part = false;
         }
-        self.state = State::Named;
         sync_folder(&self.path);
         Ok(())
     }
@@ -110,7 +89,7 @@ impl WholeFile {
 
 impl Drop for WholeFile {
     fn drop(&mut self) {
-        if matches!(self.state, State::Part(_)) {
+        if self.is_part {
             // Nothing more can be done.
             let _ = fs::remove_file(part_of(&self.path));
         }

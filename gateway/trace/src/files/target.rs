@@ -1,15 +1,18 @@
 //! What stands under the name of a file that is to be written, and whether it may be.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, FileType, OpenOptions};
 use std::io;
-use std::os::fd::{AsFd, OwnedFd};
-use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rustix::fs::{CWD, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, renameat_with};
+use rustix::fs::{
+    AtFlags, CWD, FlockOperation, Mode, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, flock, linkat, open,
+    renameat_with,
+};
 use rustix::io::Errno;
 
 /// Between two looks whether somebody reads a FIFO.
@@ -85,6 +88,11 @@ pub(super) fn exists() -> io::Error {
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
+/// The same in place of an error that says no more.
+pub(super) fn or_exists(error: io::Error) -> io::Error {
+    if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { error }
+}
+
 fn is_stream(kind: FileType) -> bool {
     kind.is_fifo() || kind.is_char_device()
 }
@@ -134,8 +142,66 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
 }
 
 /// The folder of a file.
-pub(super) fn folder_of(path: &Path) -> &Path {
+#[must_use]
+pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
+}
+
+/// A file's name with something between its stem and its end.
+#[must_use]
+pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf {
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push(suffix);
+    if !end.is_empty() {
+        name.push(".");
+        name.push(end);
+    }
+    path.with_file_name(name)
+}
+
+/// A file without a name in a folder, for writing.
+///
+/// # Errors
+/// When it cannot be written there, or the file system has no such files.
+pub(crate) fn nameless(folder: &Path, mode: u32) -> io::Result<File> {
+    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+    Ok(open(folder, flags, Mode::from_raw_mode(mode))?.into())
+}
+
+/// Gives a file without a name one; never another file's.
+///
+/// # Errors
+/// When it cannot have it.
+pub(crate) fn link(file: &File, path: &Path) -> io::Result<()> {
+    let nameless = format!("/proc/self/fd/{}", file.as_raw_fd());
+    Ok(linkat(CWD, nameless, CWD, path, AtFlags::SYMLINK_FOLLOW)?)
+}
+
+/// Opens what may be anybody's: a link is not followed, and a pipe without a writer is not waited for.
+///
+/// # Errors
+/// When it cannot be read.
+pub(crate) fn open_unfollowed(path: &Path) -> io::Result<File> {
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
+    OpenOptions::new().read(true).custom_flags(flags).open(path)
+}
+
+/// Holds a file against everybody else, as long as it is open.
+///
+/// # Errors
+/// Of the kind [`io::ErrorKind::WouldBlock`], when somebody else does; when the file system has no locks.
+pub(crate) fn hold(file: &File) -> io::Result<()> {
+    Ok(flock(file, FlockOperation::NonBlockingLockExclusive)?)
+}
+
+/// Which file it is, whatever has its name: device and inode.
+pub(crate) fn identity(about: &fs::Metadata) -> (u64, u64) {
+    (about.dev(), about.ino())
+}
+
+/// Whether a name is that of a file, and not of a link to it.
+pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|about| identity(&about) == is)
 }
 
 /// Beside a file, a name that no other program gives.

@@ -1,7 +1,10 @@
 use super::*;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::symlink;
+
+use rustix::fs::{CWD, Mode};
 
 fn names(folder: &Path) -> Vec<OsString> {
     let mut names: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
@@ -91,7 +94,7 @@ fn a_name_that_another_program_took_meanwhile_is_left_to_it() {
     let nameless = begun();
     let mut part = begun();
     let file = OpenOptions::new().write(true).create_new(true).open(part_of(&path)).unwrap();
-    part.state = State::Part(file);
+    (part.file, part.is_part) = (Some(file), true);
     assert_eq!(names(folder.path()).len(), 1, "the part");
     fs::write(&path, "another's").unwrap();
     for whole in [nameless, part] {
@@ -218,6 +221,11 @@ fn a_numbered_log_takes_the_first_name_that_is_free() {
     let logs = [create(), create(), create()];
     let taken = logs.each_ref().map(|log| log.path().file_name().unwrap().to_owned());
     assert_eq!(taken, ["demo.log", "demo-1.log", "demo-2.log"]);
+    // Points in a name are a part of it.
+    let dotted = folder.path().join("a.b.log");
+    let logs = [(); 3].map(|()| LogFile::create_numbered(&dotted, &AtomicBool::new(false)).unwrap());
+    let taken = logs.each_ref().map(|log| log.path().file_name().unwrap().to_owned());
+    assert_eq!(taken, ["a.b.log", "a.b-1.log", "a.b-2.log"]);
     let nowhere = folder.path().join("none/demo.log");
     assert!(LogFile::create_numbered(&nowhere, &AtomicBool::new(false)).is_err());
 }

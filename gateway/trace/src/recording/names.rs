@@ -11,18 +11,18 @@
 use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
-use std::os::fd::AsRawFd;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, flock, linkat, open};
-
 use super::file;
-use super::sink::folder_of;
-use crate::files::{rename, with_remedy};
+use crate::files::{
+    folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_remedy,
+};
 
 /// What a file is called in addition until it is whole.
 const PART: &str = "part";
+/// How a recording's name ends.
+const MCAP: &str = "mcap";
 
 /// A file that is being written, held against others.
 #[derive(Debug)]
@@ -44,22 +44,14 @@ pub fn goal_of(part: &Path) -> PathBuf {
 /// The name of a recording's file: the one that was asked for, then with a number.
 #[must_use]
 pub fn numbered(path: &Path, number: u32) -> PathBuf {
-    if number == 0 { path.to_owned() } else { suffixed(path, &format!("-{number}")) }
+    if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP.as_ref()) }
 }
 
 /// What a recovered file is called; never the name of one that is there.
 #[must_use]
 pub fn recovered(goal: &Path) -> PathBuf {
-    let first = suffixed(goal, "-recovered");
-    let others = (1_u32..).map(|number| suffixed(goal, &format!("-recovered-{number}")));
-    std::iter::once(first).chain(others).find(|path| !exists(path)).unwrap_or_default()
-}
-
-fn suffixed(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.file_stem().unwrap_or_default().to_owned();
-    name.push(suffix);
-    name.push(".mcap");
-    path.with_file_name(name)
+    let first = suffixed(goal, "-recovered", MCAP.as_ref());
+    (0..).map(|number| numbered(&first, number)).find(|path| !exists(path)).unwrap_or_default()
 }
 
 fn exists(path: &Path) -> bool {
@@ -69,14 +61,12 @@ fn exists(path: &Path) -> bool {
 /// The files of an earlier recording of this name that are there: it, and those with a number.
 #[must_use]
 pub fn series(path: &Path) -> Vec<PathBuf> {
-    let numbers = (0..).map(|number| numbered(path, number)).take_while(|path| exists(path));
+    let from = |first: u32| -> Vec<_> {
+        (first..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
+    };
+    let all = from(0);
     // The first one may have been taken away.
-    let numbers: Vec<_> = numbers.collect();
-    if numbers.is_empty() {
-        (1..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
-    } else {
-        numbers
-    }
+    if all.is_empty() { from(1) } else { all }
 }
 
 impl Part {
@@ -95,7 +85,7 @@ impl Part {
             }
             with_remedy(error)
         };
-        let file = nameless(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
+        let file = unnamed(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
         let is = identity(&file.metadata()?);
         Ok((Self { path, goal, is }, file))
     }
@@ -124,7 +114,7 @@ impl Part {
     /// # Errors
     /// When it cannot be opened, or its name is that of another file now.
     pub fn open(&self) -> io::Result<File> {
-        let file = opened(&self.path)?;
+        let file = open_unfollowed(&self.path)?;
         if identity(&file.metadata()?) != self.is {
             return Err(io::Error::other("it is another file now"));
         }
@@ -139,7 +129,7 @@ fn why_taken(path: &Path) -> String {
     if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
         return format!("{name} is there and is no regular file: move it away, or record to another name");
     }
-    match opened(path) {
+    match open_unfollowed(path) {
         Ok(file) if !is_held(&file) => format!(
             "{name} is there, and no run that was killed has left it: move it away, or record to another name"
         ),
@@ -148,15 +138,12 @@ fn why_taken(path: &Path) -> String {
 }
 
 /// A file that gets its name when it is held and bears its mark; nothing where the file system has none like it.
-fn nameless(path: &Path) -> Option<io::Result<File>> {
-    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
-    let mut file = File::from(open(folder_of(path), flags, Mode::from_raw_mode(0o666)).ok()?);
+fn unnamed(path: &Path) -> Option<io::Result<File>> {
+    let mut file = nameless(folder_of(path), 0o666).ok()?;
     claim(&mut file).ok()?;
-    let from = format!("/proc/self/fd/{}", file.as_raw_fd());
-    match linkat(CWD, from, CWD, path, AtFlags::SYMLINK_FOLLOW) {
-        Ok(()) => Some(Ok(file)),
-        Err(rustix::io::Errno::EXIST) => Some(Err(io::ErrorKind::AlreadyExists.into())),
-        Err(_) => None,
+    match link(&file, path) {
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => None,
+        linked => Some(linked.map(|()| file)),
     }
 }
 
@@ -174,27 +161,6 @@ fn claim(file: &mut File) -> io::Result<()> {
     hold(file)?;
     let about = file.metadata()?;
     file.write_all(&file::mark(&about)?)
-}
-
-fn identity(about: &fs::Metadata) -> (u64, u64) {
-    (about.dev(), about.ino())
-}
-
-/// Whether a name is that of a file, and not of a link to it.
-fn is_still(path: &Path, is: (u64, u64)) -> bool {
-    fs::symlink_metadata(path).is_ok_and(|about| identity(&about) == is)
-}
-
-/// Opens what may be anybody's: a link is not followed, and a pipe without a writer is not waited for.
-fn opened(path: &Path) -> io::Result<File> {
-    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY;
-    let flags = i32::try_from(flags.bits()).unwrap_or_default();
-    OpenOptions::new().read(true).custom_flags(flags).open(path)
-}
-
-/// Holds a file against everybody else, as long as it is open.
-fn hold(file: &File) -> io::Result<()> {
-    Ok(flock(file, FlockOperation::NonBlockingLockExclusive)?)
 }
 
 /// Whether somebody writes this file now.
@@ -221,7 +187,7 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Found)>> {
     for entry in fs::read_dir(folder_of(path))? {
         let path = path.with_file_name(entry?.file_name());
         let is_part = path.extension() == Some(OsStr::new(PART))
-            && goal_of(&path).extension() == Some(OsStr::new("mcap"));
+            && goal_of(&path).extension() == Some(OsStr::new(MCAP));
         if is_part {
             let what = look(&path);
             found.push((path, what));
@@ -241,7 +207,7 @@ fn look(path: &Path) -> Found {
         Ok(_) => {}
         Err(error) => return left(&error.to_string()),
     }
-    let mut file = match opened(path) {
+    let mut file = match open_unfollowed(path) {
         Ok(file) => file,
         Err(error) => return Found::Left(format!("it cannot be read: {error}"), false),
     };

@@ -18,7 +18,8 @@ use super::file::FileWriter;
 use super::names::{self, Part};
 use super::recover::RecoverError;
 use super::repair::{self, Repaired};
-use super::sink::{Gauge, Sink, folder_of};
+use super::sink::{Gauge, Sink};
+use crate::files::folder_of;
 
 /// Bytes that go to the file together; a chunk is larger and goes by itself.
 const BUFFER: usize = 64 << 10;
@@ -241,7 +242,7 @@ impl<T> Series<T> {
     ) -> io::Result<Open<T>> {
         let begin = || {
             let about = file.metadata()?;
-            let (sink, gauge) = Sink::new(file, &folder_of(&part.path))?;
+            let (sink, gauge) = Sink::new(file, folder_of(&part.path))?;
             let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), &about)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
@@ -251,27 +252,10 @@ impl<T> Series<T> {
             }
             Ok((writer, topics, gauge))
         };
-        match begin() {
-            Ok((writer, topics, gauge)) => {
-                let (kept, pending, head) = (Count::default(), Count::default(), gauge.bytes());
-                Ok(Open {
-                    writer,
-                    topics,
-                    part,
-                    gauge,
-                    head,
-                    began: Instant::now(),
-                    enough: None,
-                    kept,
-                    pending,
-                })
-            }
-            Err(error) => {
-                // There is nothing in it.
-                part.remove();
-                Err(error)
-            }
-        }
+        // There is nothing in it.
+        let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
+        let (kept, pending, head) = (Count::default(), Count::default(), gauge.bytes());
+        Ok(Open { writer, topics, part, gauge, head, began: Instant::now(), enough: None, kept, pending })
     }
 
     /// Writes something into the file that is open; without one it is counted.

@@ -3,11 +3,13 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, open};
+use rustix::fs::{FallocateFlags, fallocate};
+
+use crate::files::nameless;
 
 /// What a file without a single chunk may need for its end, a chunk on the way included.
 const RESERVE: u64 = 512 << 10;
@@ -99,9 +101,7 @@ impl Sink {
 
 /// Room for an end; none where the file system has no files without a name, or no room that is held.
 fn reserve(folder: &Path) -> io::Result<Option<Reserve>> {
-    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
-    let Ok(file) = open(folder, flags, Mode::from_raw_mode(0o600)) else { return Ok(None) };
-    let file = File::from(file);
+    let Ok(file) = nameless(folder, 0o600) else { return Ok(None) };
     match fallocate(&file, FallocateFlags::empty(), 0, RESERVE) {
         Ok(()) => Ok(Some(Reserve { file, bytes: RESERVE })),
         Err(error) if is_full(&error.into()) => Err(error.into()),
@@ -134,11 +134,4 @@ impl Write for Sink {
     fn flush(&mut self) -> io::Result<()> {
         self.file.flush()
     }
-}
-
-/// The folder of a file.
-#[must_use]
-pub fn folder_of(path: &Path) -> PathBuf {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-    folder.unwrap_or_else(|| Path::new(".")).to_owned()
 }

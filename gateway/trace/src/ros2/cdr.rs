@@ -10,6 +10,130 @@ use thiserror::Error;
 
 /// "Plain CDR, little endian", and two bytes of options.
 const HEAD: [u8; 4] = [0, 1, 0, 0];
+/// Sequences longer than this are none of ours.
+const LONGEST: u32 = 64;
+
+/// What a message is made of, as it is written.
+pub trait Encode {
+    /// Writes it behind what is there.
+    fn encode(&self, out: &mut Writer<'_>);
+}
+
+/// What a message is made of, as it is read; texts are borrowed from the message.
+pub trait Decode<'a>: Sized {
+    /// Reads it where the reader is. Never panics.
+    ///
+    /// # Errors
+    /// When the message ends before it, or holds a value that it does not have.
+    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError>;
+}
+
+macro_rules! numbers {
+    ($($number:ty: $what:literal),+) => {$(
+        impl Encode for $number {
+            fn encode(&self, out: &mut Writer<'_>) {
+                out.number(self.to_le_bytes());
+            }
+        }
+
+        impl Decode<'_> for $number {
+            fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+                from.number($what).map(Self::from_le_bytes)
+            }
+        }
+    )+};
+}
+numbers!(
+    u8: "a byte",
+    u16: "a number",
+    u32: "a number",
+    i32: "a number",
+    u64: "a number",
+    f32: "a number",
+    f64: "a number"
+);
+
+impl Encode for bool {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(u8::from(*self));
+    }
+}
+
+impl Decode<'_> for bool {
+    fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+        Ok(from.get::<u8>()? != 0)
+    }
+}
+
+impl Encode for str {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.count(self.len() + 1);
+        out.out.extend_from_slice(self.as_bytes());
+        out.out.push(0);
+    }
+}
+
+impl<'a> Decode<'a> for &'a str {
+    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+        let bytes = from.bytes()?;
+        let wrong = CdrError::Text { at: from.at - bytes.len() };
+        let text = match bytes {
+            // Some writers leave the NUL of an empty text away.
+            [] => bytes,
+            [text @ .., 0] => text,
+            _ => return Err(wrong),
+        };
+        str::from_utf8(text).map_err(|_| wrong)
+    }
+}
+
+impl Encode for String {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(self.as_str());
+    }
+}
+
+/// Elements of a kind, with their count before them.
+impl<T: Encode> Encode for [T] {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.sequence(self.iter());
+    }
+}
+
+/// At most [`LONGEST`] elements.
+impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
+    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+        let count = from.get::<u32>()?;
+        if count > LONGEST {
+            return Err(CdrError::Value { what: "a count", got: count.into(), allowed: "0 to 64" });
+        }
+        (0..count).map(|_| from.get()).collect()
+    }
+}
+
+/// One after the other, without a count.
+impl<'a, T: Decode<'a> + Copy + Default, const N: usize> Decode<'a> for [T; N] {
+    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+        let mut all = [T::default(); N];
+        for one in &mut all {
+            *one = from.get()?;
+        }
+        Ok(all)
+    }
+}
+
+impl<A: Encode, B: Encode> Encode for (A, B) {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(&self.0);
+        out.put(&self.1);
+    }
+}
+
+impl<T: Encode + ?Sized> Encode for &T {
+    fn encode(&self, out: &mut Writer<'_>) {
+        (**self).encode(out);
+    }
+}
 
 /// Writes a message into a buffer that can be used again.
 #[derive(Debug)]
@@ -25,51 +149,9 @@ impl<'a> Writer<'a> {
         Self { out }
     }
 
-    /// A byte.
-    pub fn u8(&mut self, value: u8) {
-        self.out.push(value);
-    }
-
-    /// A truth value.
-    pub fn bool(&mut self, value: bool) {
-        self.out.push(u8::from(value));
-    }
-
-    /// Two bytes.
-    pub fn u16(&mut self, value: u16) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// Four bytes.
-    pub fn u32(&mut self, value: u32) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// Four bytes with a sign.
-    pub fn i32(&mut self, value: i32) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// Eight bytes.
-    pub fn u64(&mut self, value: u64) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// A number of single precision.
-    pub fn f32(&mut self, value: f32) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// A number of double precision.
-    pub fn f64(&mut self, value: f64) {
-        self.number(value.to_le_bytes());
-    }
-
-    /// A text.
-    pub fn str(&mut self, text: &str) {
-        self.count(text.len() + 1);
-        self.out.extend_from_slice(text.as_bytes());
-        self.out.push(0);
+    /// A number, a text, or what else a message is made of.
+    pub fn put(&mut self, value: impl Encode) {
+        value.encode(self);
     }
 
     /// How many elements follow.
@@ -77,7 +159,7 @@ impl<'a> Writer<'a> {
     /// # Panics
     /// When they are more than 2^32 - 1: no message of ours comes near.
     pub fn count(&mut self, count: usize) {
-        self.u32(u32::try_from(count).expect("a message has fewer than 2^32 elements"));
+        self.put(u32::try_from(count).expect("a message has fewer than 2^32 elements"));
     }
 
     /// A sequence of bytes.
@@ -87,15 +169,9 @@ impl<'a> Writer<'a> {
     }
 
     /// A sequence of anything.
-    pub fn sequence<T>(
-        &mut self,
-        elements: impl ExactSizeIterator<Item = T>,
-        mut write: impl FnMut(&mut Self, T),
-    ) {
+    pub fn sequence(&mut self, elements: impl ExactSizeIterator<Item = impl Encode>) {
         self.count(elements.len());
-        for element in elements {
-            write(self, element);
-        }
+        elements.for_each(|element| self.put(element));
     }
 
     /// A number at a multiple of its size.
@@ -164,92 +240,12 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A byte.
+    /// A number, a text, or what else a message is made of.
     ///
     /// # Errors
-    /// When the message ends before it.
-    pub fn u8(&mut self) -> Result<u8, CdrError> {
-        self.number("a byte").map(u8::from_le_bytes)
-    }
-
-    /// A truth value.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn bool(&mut self) -> Result<bool, CdrError> {
-        Ok(self.u8()? != 0)
-    }
-
-    /// Two bytes.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn u16(&mut self) -> Result<u16, CdrError> {
-        self.number("a number").map(u16::from_le_bytes)
-    }
-
-    /// Four bytes.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn u32(&mut self) -> Result<u32, CdrError> {
-        self.number("a number").map(u32::from_le_bytes)
-    }
-
-    /// Four bytes with a sign.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn i32(&mut self) -> Result<i32, CdrError> {
-        self.number("a number").map(i32::from_le_bytes)
-    }
-
-    /// Eight bytes.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn u64(&mut self) -> Result<u64, CdrError> {
-        self.number("a number").map(u64::from_le_bytes)
-    }
-
-    /// A number of single precision.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn f32(&mut self) -> Result<f32, CdrError> {
-        self.number("a number").map(f32::from_le_bytes)
-    }
-
-    /// A number of double precision.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn f64(&mut self) -> Result<f64, CdrError> {
-        self.number("a number").map(f64::from_le_bytes)
-    }
-
-    /// A text.
-    ///
-    /// # Errors
-    /// When the message ends before it, or it is none.
-    pub fn str(&mut self) -> Result<&'a str, CdrError> {
-        let bytes = self.bytes()?;
-        let wrong = CdrError::Text { at: self.at - bytes.len() };
-        let text = match bytes {
-            // Some writers leave the NUL of an empty text away.
-            [] => bytes,
-            [text @ .., 0] => text,
-            _ => return Err(wrong),
-        };
-        str::from_utf8(text).map_err(|_| wrong)
-    }
-
-    /// How many elements follow; the message may be shorter than that.
-    ///
-    /// # Errors
-    /// When the message ends before it.
-    pub fn count(&mut self) -> Result<usize, CdrError> {
-        self.u32().map(|count| usize::try_from(count).unwrap_or(usize::MAX))
+    /// When the message ends before it, or holds a value that it does not have.
+    pub fn get<T: Decode<'a>>(&mut self) -> Result<T, CdrError> {
+        T::decode(self)
     }
 
     /// A sequence of bytes.
@@ -257,14 +253,8 @@ impl<'a> Reader<'a> {
     /// # Errors
     /// When the message ends before its end.
     pub fn bytes(&mut self) -> Result<&'a [u8], CdrError> {
-        let count = self.count()?;
-        self.take(count, "a sequence of bytes")
-    }
-
-    /// Whether everything has been read.
-    #[must_use]
-    pub const fn is_at_end(&self) -> bool {
-        self.at >= self.bytes.len()
+        let count = self.get::<u32>()?;
+        self.take(usize::try_from(count).unwrap_or(usize::MAX), "a sequence of bytes")
     }
 
     fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
@@ -326,42 +316,36 @@ mod tests {
     fn ours(value: &Everything) -> Vec<u8> {
         let mut buffer = b"what was there before".to_vec();
         let mut out = Writer::new(&mut buffer);
-        out.u8(value.byte);
-        out.f64(value.wide);
-        out.bool(value.truth);
-        out.u16(value.short);
-        out.str(&value.text);
-        out.i32(value.signed);
+        out.put(value.byte);
+        out.put(value.wide);
+        out.put(value.truth);
+        out.put(value.short);
+        out.put(&value.text);
+        out.put(value.signed);
         out.bytes(&value.bytes);
-        out.u64(value.long);
-        out.sequence(value.singles.iter(), |out, &value| out.f32(value));
-        out.sequence(value.doubles.iter(), |out, &value| out.f64(value));
-        out.sequence(value.texts.iter(), |out, text| out.str(text));
-        out.u32(value.last);
+        out.put(value.long);
+        out.put(&value.singles[..]);
+        out.put(&value.doubles[..]);
+        out.put(&value.texts[..]);
+        out.put(value.last);
         buffer
     }
 
     fn read(bytes: &[u8]) -> Result<Everything, CdrError> {
-        fn some<T>(
-            from: &mut Reader<'_>,
-            one: impl Fn(&mut Reader<'_>) -> Result<T, CdrError>,
-        ) -> Result<Vec<T>, CdrError> {
-            (0..from.count()?).map(|_| one(from)).collect()
-        }
         let mut from = Reader::new(bytes)?;
         Ok(Everything {
-            byte: from.u8()?,
-            wide: from.f64()?,
-            truth: from.bool()?,
-            short: from.u16()?,
-            text: from.str()?.to_owned(),
-            signed: from.i32()?,
+            byte: from.get()?,
+            wide: from.get()?,
+            truth: from.get()?,
+            short: from.get()?,
+            text: from.get::<&str>()?.to_owned(),
+            signed: from.get()?,
             bytes: from.bytes()?.to_vec(),
-            long: from.u64()?,
-            singles: some(&mut from, |from| from.f32())?,
-            doubles: some(&mut from, |from| from.f64())?,
-            texts: some(&mut from, |from| from.str().map(str::to_owned))?,
-            last: from.u32()?,
+            long: from.get()?,
+            singles: from.get()?,
+            doubles: from.get()?,
+            texts: from.get::<Vec<&str>>()?.into_iter().map(str::to_owned).collect(),
+            last: from.get()?,
         })
     }
 
@@ -369,8 +353,8 @@ mod tests {
     fn numbers_stand_at_multiples_of_their_size_counted_from_byte_4() {
         let mut buffer = Vec::new();
         let mut out = Writer::new(&mut buffer);
-        out.str("ab");
-        out.u64(1);
+        out.put("ab");
+        out.put(1_u64);
         assert_eq!(
             buffer,
             [0, 1, 0, 0, 3, 0, 0, 0, b'a', b'b', 0, 0, 1, 0, 0, 0, 0, 0, 0, 0],
@@ -392,7 +376,7 @@ mod tests {
             "a message ends at byte 9 in the middle of a sequence of bytes"
         );
         let mut text = Reader::new(&[0, 1, 0, 0, 1, 0, 0, 0, b'a']).unwrap();
-        assert_eq!(text.str(), Err(CdrError::Text { at: 8 }));
+        assert_eq!(text.get::<&str>(), Err(CdrError::Text { at: 8 }));
     }
 
     proptest! {

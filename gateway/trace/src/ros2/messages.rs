@@ -8,48 +8,9 @@ use std::borrow::Cow;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
 use protocol::candump::{Direction, Record, Timestamp};
 
-use super::Message;
-use super::cdr::{CdrError, Reader, Writer};
+use super::cdr::{CdrError, Encode, Reader, Writer};
+use super::{Header, Message, definition};
 use crate::capture::{Note, NoteKind};
-
-/// The definitions of a header, to stand behind a message that has one.
-macro_rules! header {
-    () => {
-        "\
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"
-    };
-}
-pub(super) use header;
-
-const NANOS: u64 = 1_000_000_000;
-
-/// Writes a header. Its seconds end in 2038; the recording's own times do not.
-pub(super) fn write_header(out: &mut Writer<'_>, nanos: u64, frame_id: &str) {
-    write_time(out, nanos);
-    out.str(frame_id);
-}
-
-/// Writes a time.
-pub(super) fn write_time(out: &mut Writer<'_>, nanos: u64) {
-    out.i32(i32::try_from(nanos / NANOS).unwrap_or(i32::MAX));
-    out.u32(u32::try_from(nanos % NANOS).unwrap_or(0));
-}
-
-/// Reads a header's name; its time is said better by the recording itself.
-fn frame_id<'a>(from: &mut Reader<'a>) -> Result<&'a str, CdrError> {
-    from.i32()?;
-    from.u32()?;
-    from.str()
-}
 
 /// A frame of a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -57,40 +18,26 @@ pub struct CanFrame<'a>(pub Record<'a>);
 
 impl Message for CanFrame<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CanFrame";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header      # when it was on the bus, by the kernel; frame_id is the bus
-uint32 id                   # 11 or 29 bits, without flags
-bool is_extended            # 29 bits
-bool is_rtr                 # remote frame
-bool is_error               # error frame: a message of the driver
-bool is_fd
-uint8 flags                 # of an FD frame: 1 BRS, 2 ESI, 4 FDF
-uint8 length                # bytes of data, or those that a remote frame asks for
-uint8 raw_dlc               # DLC 9..15 of a classic frame of 8 bytes, else 0
-uint8 direction             # 0 unknown, 1 received, 2 sent by whoever took the capture
-uint8[] data
+    const DEFINITION: &'static str =
+        definition!("skinbus_msgs/CanFrame", "std_msgs/Header", "builtin_interfaces/Time");
+}
 
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
+impl Encode for CanFrame<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
         let Record { time, interface, frame, direction } = &self.0;
-        write_header(out, time.nanos, interface);
-        out.u32(frame.raw_id() & EXTENDED_MASK);
-        out.bool(frame.is_extended());
-        out.bool(frame.is_remote());
-        out.bool(frame.is_error());
-        out.bool(frame.format() == Format::Fd);
-        out.u8(frame.flags());
-        out.u8(frame.len());
-        out.u8(frame.raw_dlc());
-        out.u8(match direction {
+        out.put(Header { nanos: time.nanos, frame_id: interface });
+        out.put(frame.raw_id() & EXTENDED_MASK);
+        for flag in [frame.is_extended(), frame.is_remote(), frame.is_error(), frame.format() == Format::Fd] {
+            out.put(flag);
+        }
+        let direction = match direction {
             None => 0,
             Some(Direction::Received) => 1,
             Some(Direction::Sent) => 2,
-        });
+        };
+        for number in [frame.flags(), frame.len(), frame.raw_dlc(), direction] {
+            out.put(number);
+        }
         out.bytes(frame.data());
     }
 }
@@ -102,9 +49,7 @@ impl<'a> CanFrame<'a> {
     /// # Errors
     /// When it is no such message.
     pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
-        let mut from = Reader::new(message)?;
-        let (sec, nanosec) = (from.i32()?, from.u32()?);
-        Ok(u64::try_from(sec).unwrap_or(0) * NANOS + u64::from(nanosec))
+        Ok(Reader::new(message)?.get::<Header<'_>>()?.nanos)
     }
 
     /// Reads a message that the recording holds at a time. Never panics.
@@ -113,23 +58,20 @@ impl<'a> CanFrame<'a> {
     /// When it is no such message.
     pub fn decode(message: &'a [u8], time: Timestamp) -> Result<Self, CdrError> {
         let mut from = Reader::new(message)?;
-        let interface = frame_id(&mut from)?;
-        let mut id = from.u32()?;
+        let (Header { frame_id: interface, .. }, mut id) = (from.get()?, from.get::<u32>()?);
         if id > EXTENDED_MASK {
             return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
         }
         for flag in [EXTENDED, REMOTE, ERROR] {
-            id |= if from.bool()? { flag } else { 0 };
+            id |= if from.get()? { flag } else { 0 };
         }
-        let format = if from.bool()? { Format::Fd } else { Format::Classic };
-        let [flags, length, raw_dlc, direction] = [from.u8()?, from.u8()?, from.u8()?, from.u8()?];
+        let format = if from.get()? { Format::Fd } else { Format::Classic };
+        let [flags, length, raw_dlc, direction]: [u8; 4] = from.get()?;
         let direction = match direction {
             0 => None,
             1 => Some(Direction::Received),
             2 => Some(Direction::Sent),
-            got => {
-                return Err(CdrError::Value { what: "direction", got: got.into(), allowed: "0, 1 or 2" });
-            }
+            got => return Err(CdrError::Value { what: "direction", got: got.into(), allowed: "0, 1 or 2" }),
         };
         let data = from.bytes()?;
         let wrong = CdrError::Value {
@@ -154,51 +96,30 @@ pub struct CaptureNote<'a>(pub Cow<'a, Note<'a>>);
 
 impl Message for CaptureNote<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CaptureNote";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header      # frame_id is the bus, or empty
-uint8 TEXT=0                # a comment, an empty line
-uint8 DROPPED=1             # frames are missing here
-uint8 CAN_XL=2              # a CAN XL frame, which is not read
-uint8 UNREADABLE=3          # a line that begins like a frame and is none
-uint8 kind
-uint64 frames               # how many were dropped
-uint64 line                 # in the log it comes from, from 1, else 0
-string text                 # the line or, of an unreadable one, what is wrong with it
-uint8[] bytes               # the line, when text is not the same
+    const DEFINITION: &'static str =
+        definition!("skinbus_msgs/CaptureNote", "std_msgs/Header", "builtin_interfaces/Time");
+}
 
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
+impl Encode for CaptureNote<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
         let note = self.0.as_ref();
-        let (kind, frames) = match note.kind {
-            NoteKind::Text => (0, 0),
-            NoteKind::Dropped(frames) => (1, frames),
-            NoteKind::CanXl => (2, 0),
-            NoteKind::Unreadable(_) => (3, 0),
-        };
-        write_header(out, note.nanos, note.interface);
-        out.u8(kind);
-        out.u64(frames);
-        out.u64(note.line);
         // A text of CDR ends at its NUL for some readers.
-        let text = str::from_utf8(note.text).ok().filter(|text| !text.contains('\0'));
-        match (&note.kind, text) {
-            (NoteKind::Unreadable(why), _) => {
-                out.str(&why.replace('\0', "?"));
-                out.bytes(note.text);
-            }
-            (NoteKind::Text | NoteKind::Dropped(_) | NoteKind::CanXl, Some(text)) => {
-                out.str(text);
-                out.bytes(&[]);
-            }
-            (NoteKind::Text | NoteKind::Dropped(_) | NoteKind::CanXl, None) => {
-                out.str(&String::from_utf8_lossy(note.text).replace('\0', "?"));
-                out.bytes(note.text);
-            }
+        let same = || str::from_utf8(note.text).ok().filter(|text| !text.contains('\0'));
+        let (kind, frames, same) = match note.kind {
+            NoteKind::Text => (0_u8, 0, same()),
+            NoteKind::Dropped(frames) => (1, frames, same()),
+            NoteKind::CanXl => (2, 0, same()),
+            NoteKind::Unreadable(_) => (3, 0, None),
+        };
+        out.put(Header { nanos: note.nanos, frame_id: note.interface });
+        out.put(kind);
+        out.put((frames, note.line));
+        match (&note.kind, same) {
+            (_, Some(text)) => out.put(text),
+            (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?")),
+            (_, None) => out.put(String::from_utf8_lossy(note.text).replace('\0', "?")),
         }
+        out.bytes(if same.is_some() { &[] } else { note.text });
     }
 }
 
@@ -209,29 +130,25 @@ impl<'a> CaptureNote<'a> {
     /// When it is no such message.
     pub fn decode(message: &'a [u8], nanos: u64) -> Result<Self, CdrError> {
         let mut from = Reader::new(message)?;
-        let interface = frame_id(&mut from)?;
-        let (kind, frames, line) = (from.u8()?, from.u64()?, from.u64()?);
-        let (text, bytes) = (from.str()?, from.bytes()?);
+        let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
+        let [frames, line]: [u64; 2] = from.get()?;
+        let (words, bytes) = (from.get::<&str>()?, from.bytes()?);
+        let text = if bytes.is_empty() { words.as_bytes() } else { bytes };
         let (kind, text) = match kind {
-            3 => (NoteKind::Unreadable(text.to_owned()), bytes),
-            0 => (NoteKind::Text, if bytes.is_empty() { text.as_bytes() } else { bytes }),
-            1 => (NoteKind::Dropped(frames), if bytes.is_empty() { text.as_bytes() } else { bytes }),
-            2 => (NoteKind::CanXl, if bytes.is_empty() { text.as_bytes() } else { bytes }),
+            0 => (NoteKind::Text, text),
+            1 => (NoteKind::Dropped(frames), text),
+            2 => (NoteKind::CanXl, text),
+            3 => (NoteKind::Unreadable(words.to_owned()), bytes),
             got => return Err(CdrError::Value { what: "kind", got: got.into(), allowed: "0 to 3" }),
         };
         Ok(Self(Cow::Owned(Note { kind, nanos, interface, line, text })))
     }
 }
 
-/// The time of a message, with as many digits as its channel says.
-#[must_use]
-pub const fn timestamp(log_time: u64, nine_digits: bool) -> Timestamp {
-    Timestamp { nanos: log_time, nine_digits }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ros2::NANOS;
     use proptest::prelude::*;
     use protocol::can::STANDARD_MASK;
 
@@ -324,7 +241,7 @@ mod tests {
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(0_u8..4, 0..80)) {
-            let _ = CanFrame::decode(&bytes, timestamp(0, true));
+            let _ = CanFrame::decode(&bytes, Timestamp { nanos: 0, nine_digits: true });
             let _ = CaptureNote::decode(&bytes, 0);
         }
     }

@@ -1,7 +1,7 @@
 //! Messages as ROS 2 writes them: the encoding (CDR) and the types that recordings carry, with their definitions.
 //!
 //! Viewers and bag tools interpret these bytes by the definition that stands in the file beside them; neither ROS
-//! nor a generated type is needed on either side.
+//! nor a generated type is needed on either side. The definitions are the files in `gateway/trace/msg`.
 
 pub mod cdr;
 pub mod messages;
@@ -9,18 +9,60 @@ pub mod read;
 pub mod skin;
 pub mod standard;
 
+use cdr::{CdrError, Decode, Encode, Reader, Writer};
+
 /// A type of message: what a recording says of it, and how its bytes come about.
-pub trait Message {
+pub trait Message: Encode {
     /// Its full name, `package/msg/Type`.
     const TYPE: &'static str;
     /// Its fields and those of every type in it (encoding `ros2msg`).
     const DEFINITION: &'static str;
 
-    /// Writes it, without the encoding's head.
-    fn write(&self, out: &mut cdr::Writer<'_>);
-
     /// Writes it into a buffer, in the place of what is there; allocates only while the buffer grows.
     fn encode_into(&self, buffer: &mut Vec<u8>) {
-        self.write(&mut cdr::Writer::new(buffer));
+        self.encode(&mut Writer::new(buffer));
+    }
+}
+
+/// The definition of a type, and those of the types in it, by their files.
+macro_rules! definition {
+    ($own:literal $(, $used:literal)*) => {
+        concat!(
+            include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/msg/", $own, ".msg")),
+            $(
+                "\n================================================================================\nMSG: ",
+                $used,
+                "\n",
+                include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/msg/", $used, ".msg")),
+            )*
+        )
+    };
+}
+use definition;
+
+const NANOS: u64 = 1_000_000_000;
+
+/// What a message begins with: `std_msgs/Header`.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Header<'a> {
+    /// When, in ns since 1970. Written seconds end in 2038; the recording's own times do not.
+    pub nanos: u64,
+    /// What the message is about: a bus, a link, or nothing.
+    pub frame_id: &'a str,
+}
+
+impl Encode for Header<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(i32::try_from(self.nanos / NANOS).unwrap_or(i32::MAX));
+        out.put(u32::try_from(self.nanos % NANOS).unwrap_or(0));
+        out.put(self.frame_id);
+    }
+}
+
+impl<'a> Decode<'a> for Header<'a> {
+    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+        let (sec, nanosec) = (from.get::<i32>()?, from.get::<u32>()?);
+        let nanos = u64::try_from(sec).unwrap_or(0) * NANOS + u64::from(nanosec);
+        Ok(Self { nanos, frame_id: from.get()? })
     }
 }

@@ -1,10 +1,8 @@
 //! Messages of the control loop, read back from a recording.
 
+use super::Header;
 use super::cdr::{CdrError, Reader};
 use super::skin::LoopTiming;
-
-/// Sequences longer than this are none of ours.
-const MOST: usize = 64;
 
 /// The robot's joints at a tick.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -26,35 +24,15 @@ pub struct Torques {
     pub active: u32,
 }
 
-fn header(from: &mut Reader<'_>) -> Result<(), CdrError> {
-    from.i32()?;
-    from.u32()?;
-    from.str()?;
-    Ok(())
-}
-
-fn count(from: &mut Reader<'_>) -> Result<usize, CdrError> {
-    match from.count()? {
-        count if count <= MOST => Ok(count),
-        count => Err(CdrError::Value { what: "a count of joints", got: count as u64, allowed: "0 to 64" }),
-    }
-}
-
-fn numbers(from: &mut Reader<'_>) -> Result<Vec<f64>, CdrError> {
-    (0..count(from)?).map(|_| from.f64()).collect()
-}
-
 /// `sensor_msgs/JointState`.
 ///
 /// # Errors
 /// When the bytes are no such message.
 pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = Reader::new(message)?;
-    header(&mut from)?;
-    for _ in 0..count(&mut from)? {
-        from.str()?;
-    }
-    Ok(Joints { position: numbers(&mut from)?, velocity: numbers(&mut from)? })
+    from.get::<Header<'_>>()?;
+    from.get::<Vec<&str>>()?;
+    Ok(Joints { position: from.get()?, velocity: from.get()? })
 }
 
 /// `skinbus_msgs/Torques`.
@@ -63,35 +41,17 @@ pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
 /// When the bytes are no such message.
 pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
     let mut from = Reader::new(message)?;
-    header(&mut from)?;
-    let (distributed, central) = (numbers(&mut from)?, numbers(&mut from)?);
-    numbers(&mut from)?;
-    Ok(Torques { distributed, central, active: from.u32()? })
+    from.get::<Header<'_>>()?;
+    let [distributed, central, _difference] = [from.get()?, from.get()?, from.get()?];
+    Ok(Torques { distributed, central, active: from.get()? })
 }
 
-/// `skinbus_msgs/LoopTiming`; its time is the recording's.
+/// `skinbus_msgs/LoopTiming`.
 ///
 /// # Errors
 /// When the bytes are no such message.
-pub fn timing(message: &[u8], nanos: u64) -> Result<LoopTiming, CdrError> {
-    let mut from = Reader::new(message)?;
-    header(&mut from)?;
-    Ok(LoopTiming {
-        nanos,
-        tick: from.u64()?,
-        skipped: from.u64()?,
-        late_us: from.f64()?,
-        took_us: from.f64()?,
-        central_us: from.f64()?,
-        contributing: from.u32()?,
-        age: from.u32()?,
-        stale: from.u32()?,
-        dead: from.u32()?,
-        bad: from.u8()?,
-        halted: from.u8()?,
-        at_limit: from.u8()?,
-        refused: from.bool()?,
-    })
+pub fn timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
+    Reader::new(message)?.get()
 }
 
 #[cfg(test)]
@@ -138,8 +98,8 @@ mod tests {
             refused: true,
         };
         written.encode_into(&mut bytes);
-        assert_eq!(format!("{:?}", timing(&bytes, 5).unwrap()), format!("{written:?}"));
-        assert!(timing(bytes.get(..60).unwrap(), 5).is_err());
+        assert_eq!(format!("{:?}", timing(&bytes).unwrap()), format!("{written:?}"));
+        assert!(timing(bytes.get(..60).unwrap()).is_err());
         assert!(torques(&bytes).is_err(), "another type");
     }
 }

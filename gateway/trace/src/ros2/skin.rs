@@ -1,8 +1,7 @@
 //! Our own types of a run: the loop's timing, torques, and what cells feel.
 
-use super::Message;
-use super::cdr::Writer;
-use super::messages::{header, write_header};
+use super::cdr::{CdrError, Decode, Encode, Reader, Writer};
+use super::{Header, Message, definition};
 
 /// What a tick was like, in numbers that any viewer plots.
 #[derive(Clone, Copy, Debug, Default)]
@@ -39,53 +38,32 @@ pub struct LoopTiming {
 
 impl Message for LoopTiming {
     const TYPE: &'static str = "skinbus_msgs/msg/LoopTiming";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header      # when the tick should have begun
-uint64 tick                 # skipped ticks are counted in
-uint64 skipped              # ticks skipped just before this one
-float64 late_us             # how late it began
-float64 took_us             # how long it took
-float64 central_us          # the central computation's part of that, 0 without one
-uint32 contributing         # cells in the torque
-uint32 age                  # epochs that the oldest of them has missed
-uint32 stale                # cells in contact that missed the last epoch
-uint32 dead                 # cells that have fallen silent
-uint8 GOOD=0
-uint8 TORQUE=1              # the torque is not valid
-uint8 NO_PEER=2             # no external controller is connected
-uint8 NO_ANSWER=3           # the external controller's answer is missing
-uint8 NONSENSE=4            # the external controller sent nonsense
-uint8 OTHER=255
-uint8 bad                   # why the cycle was bad
-uint8 NOT_HALTED=0
-uint8 BAD_CYCLES=1          # too many bad cycles in a row
-uint8 HALT_FRAME=2          # somebody sent a halt frame
-uint8 halted                # why the robot is halted
-uint8 at_limit              # joints that stand at a limit, bit 0 is the first
-bool refused                # a velocity was not finite and was taken as zero
-
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, "");
-        out.u64(self.tick);
-        out.u64(self.skipped);
-        out.f64(self.late_us);
-        out.f64(self.took_us);
-        out.f64(self.central_us);
-        out.u32(self.contributing);
-        out.u32(self.age);
-        out.u32(self.stale);
-        out.u32(self.dead);
-        out.u8(self.bad);
-        out.u8(self.halted);
-        out.u8(self.at_limit);
-        out.bool(self.refused);
-    }
+    const DEFINITION: &'static str =
+        definition!("skinbus_msgs/LoopTiming", "std_msgs/Header", "builtin_interfaces/Time");
 }
+
+/// Writes and reads a header without a name, and then these fields in this order.
+macro_rules! fields {
+    ($message:ty: $($field:ident),+) => {
+        impl Encode for $message {
+            fn encode(&self, out: &mut Writer<'_>) {
+                out.put(Header { nanos: self.nanos, frame_id: "" });
+                $(out.put(self.$field);)+
+            }
+        }
+
+        impl Decode<'_> for $message {
+            fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+                let Header { nanos, .. } = from.get()?;
+                Ok(Self { nanos, $($field: from.get()?),+ })
+            }
+        }
+    };
+}
+fields!(
+    LoopTiming: tick, skipped, late_us, took_us, central_us, contributing, age, stale, dead, bad, halted, at_limit,
+    refused
+);
 
 /// The cells' torque beside the central one.
 #[derive(Clone, Copy, Debug)]
@@ -102,26 +80,17 @@ pub struct Torques<'a> {
 
 impl Message for Torques<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/Torques";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header      # when the tick should have begun
-float64[] distributed       # the sum of what cells said, Nm by joint
-float64[] central           # computed by the gateway of the same joints and touches, Nm; empty without
-float64[] difference        # distributed - central, Nm
-uint32 active               # cells with a force above zero, by the central computation
+    const DEFINITION: &'static str =
+        definition!("skinbus_msgs/Torques", "std_msgs/Header", "builtin_interfaces/Time");
+}
 
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, "");
-        for values in [self.distributed, self.central] {
-            out.sequence(values.iter(), |out, &value| out.f64(value));
-        }
-        let difference = self.distributed.iter().zip(self.central);
-        out.sequence(difference, |out, (distributed, central)| out.f64(distributed - central));
-        out.u32(self.active);
+impl Encode for Torques<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(Header { nanos: self.nanos, frame_id: "" });
+        out.put((self.distributed, self.central));
+        let both = self.distributed.iter().zip(self.central);
+        out.sequence(both.map(|(distributed, central)| distributed - central));
+        out.put(self.active);
     }
 }
 
@@ -153,30 +122,17 @@ pub struct PatchState<'a> {
 
 impl Message for PatchState<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/PatchState";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header      # when the epoch's joints stood on the bus; frame_id is the link
-uint8 epoch                 # of those joints
-uint16[] node               # the cells' numbers on their bus; the arrays below are in the same order
-float32[] force             # N, by Algorithm 1; not a number while nobody knows
-float32[] proximity         # 0 (nothing near) to 1; not a number while nobody knows
-uint8 UNKNOWN=0             # never heard
-uint8 QUIET=1               # alive and not in contact
-uint8 ACTIVE=2              # in contact, and answered the last epoch that had time for it
-uint8 STALE=3               # in contact, and missed an epoch
-uint8 DEAD=4                # silent for too long
-uint8[] status
+    const DEFINITION: &'static str =
+        definition!("skinbus_msgs/PatchState", "std_msgs/Header", "builtin_interfaces/Time");
+}
 
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, self.frame_id);
-        out.u8(self.epoch);
-        out.sequence(self.cells.iter(), |out, cell| out.u16(cell.node));
-        out.sequence(self.cells.iter(), |out, cell| out.f32(cell.force));
-        out.sequence(self.cells.iter(), |out, cell| out.f32(cell.proximity));
-        out.sequence(self.cells.iter(), |out, cell| out.u8(cell.status));
+impl Encode for PatchState<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(Header { nanos: self.nanos, frame_id: self.frame_id });
+        out.put(self.epoch);
+        out.sequence(self.cells.iter().map(|cell| cell.node));
+        out.sequence(self.cells.iter().map(|cell| cell.force));
+        out.sequence(self.cells.iter().map(|cell| cell.proximity));
+        out.sequence(self.cells.iter().map(|cell| cell.status));
     }
 }

@@ -1,8 +1,7 @@
 //! Types that ROS 2 has: every viewer knows what to make of them.
 
-use super::Message;
-use super::cdr::Writer;
-use super::messages::{header, write_header};
+use super::cdr::{Encode, Writer};
+use super::{Header, Message, definition};
 
 /// `sensor_msgs/JointState`: a robot's joints. What is not known is empty.
 #[derive(Clone, Copy, Debug)]
@@ -21,23 +20,16 @@ pub struct JointState<'a> {
 
 impl Message for JointState<'_> {
     const TYPE: &'static str = "sensor_msgs/msg/JointState";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header
-string[] name
-float64[] position    # rad
-float64[] velocity    # rad/s
-float64[] effort      # Nm
+    const DEFINITION: &'static str =
+        definition!("sensor_msgs/JointState", "std_msgs/Header", "builtin_interfaces/Time");
+}
 
-",
-        header!()
-    );
-
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, "");
-        out.sequence(self.names.iter(), |out, name| out.str(name));
+impl Encode for JointState<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(Header { nanos: self.nanos, frame_id: "" });
+        out.put(self.names);
         for values in [self.position, self.velocity, self.effort] {
-            out.sequence(values.iter(), |out, &value| out.f64(value));
+            out.put(values);
         }
     }
 }
@@ -71,62 +63,30 @@ impl PointCloud<'_> {
 
 impl Message for PointCloud<'_> {
     const TYPE: &'static str = "sensor_msgs/msg/PointCloud2";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header
-uint32 height
-uint32 width
-sensor_msgs/PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-
-",
-        header!(),
-        "
-================================================================================
-MSG: sensor_msgs/PointField
-uint8 INT8    = 1
-uint8 UINT8   = 2
-uint8 INT16   = 3
-uint8 UINT16  = 4
-uint8 INT32   = 5
-uint8 UINT32  = 6
-uint8 FLOAT32 = 7
-uint8 FLOAT64 = 8
-string name
-uint32 offset
-uint8 datatype
-uint32 count
-"
+    const DEFINITION: &'static str = definition!(
+        "sensor_msgs/PointCloud2",
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+        "sensor_msgs/PointField"
     );
+}
 
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, self.frame_id);
+impl Encode for PointCloud<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(Header { nanos: self.nanos, frame_id: self.frame_id });
         let width = u32::try_from(self.points.len()).unwrap_or(u32::MAX);
-        out.u32(1);
-        out.u32(width);
-        out.sequence([("x", 0), ("y", 4), ("z", 8), ("force", 12)].into_iter(), |out, (name, offset)| {
-            out.str(name);
-            out.u32(offset);
-            out.u8(Self::FLOAT32);
-            out.u32(1);
-        });
-        out.bool(false);
-        out.u32(Self::STEP);
-        out.u32(Self::STEP * width);
+        out.put((1_u32, width));
+        let fields = [("x", 0_u32), ("y", 4), ("z", 8), ("force", 12)].into_iter();
+        out.sequence(fields.map(|field| (field, (Self::FLOAT32, 1_u32))));
+        out.put(false);
+        out.put((Self::STEP, Self::STEP * width));
         out.count(self.points.len() * Self::STEP as usize);
-        for point in self.points {
-            let [x, y, z] = point.position;
-            for value in [x, y, z, point.force] {
-                for byte in value.to_le_bytes() {
-                    out.u8(byte);
-                }
+        for &Point { position: [x, y, z], force } in self.points {
+            for value in [x, y, z, force] {
+                out.put(value);
             }
         }
-        out.bool(true);
+        out.put(true);
     }
 }
 
@@ -166,44 +126,26 @@ pub struct Diagnostics<'a> {
 
 impl Message for Diagnostics<'_> {
     const TYPE: &'static str = "diagnostic_msgs/msg/DiagnosticArray";
-    const DEFINITION: &'static str = concat!(
-        "\
-std_msgs/Header header
-diagnostic_msgs/DiagnosticStatus[] status
-
-",
-        header!(),
-        "
-================================================================================
-MSG: diagnostic_msgs/DiagnosticStatus
-byte OK=0
-byte WARN=1
-byte ERROR=2
-byte STALE=3
-byte level
-string name
-string message
-string hardware_id
-diagnostic_msgs/KeyValue[] values
-
-================================================================================
-MSG: diagnostic_msgs/KeyValue
-string key
-string value
-"
+    const DEFINITION: &'static str = definition!(
+        "diagnostic_msgs/DiagnosticArray",
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+        "diagnostic_msgs/DiagnosticStatus",
+        "diagnostic_msgs/KeyValue"
     );
+}
 
-    fn write(&self, out: &mut Writer<'_>) {
-        write_header(out, self.nanos, "");
-        out.sequence(self.parts.iter(), |out, part| {
-            out.u8(part.level as u8);
-            out.str(&part.name);
-            out.str(&part.message);
-            out.str("");
-            out.sequence(part.values.iter(), |out, (key, value)| {
-                out.str(key);
-                out.str(value);
-            });
-        });
+impl Encode for Diagnostics<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(Header { nanos: self.nanos, frame_id: "" });
+        out.put(self.parts);
+    }
+}
+
+impl Encode for Diagnosis {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put((self.level as u8, &self.name));
+        out.put((&self.message, ""));
+        out.put(&self.values[..]);
     }
 }

@@ -254,7 +254,7 @@ impl Run {
         } else if other.topic == torques {
             read::torques(other.message).map(|torques| self.motion.torques(at, &torques))
         } else if other.topic == "/gateway/timing" {
-            read::timing(other.message, other.nanos).map(|timing| self.motion.timing(at, &timing))
+            read::timing(other.message).map(|timing| self.motion.timing(at, &timing))
         } else {
             Ok(())
         };

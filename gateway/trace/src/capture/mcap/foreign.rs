@@ -12,6 +12,7 @@
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame};
 use protocol::candump::{Record, Timestamp};
 
+use crate::ros2::Header;
 use crate::ros2::cdr::{CdrError, Reader};
 
 /// A type of frames that is not ours.
@@ -40,17 +41,14 @@ impl Foreign {
         topic: &'a str,
     ) -> Result<Record<'a>, CdrError> {
         let mut from = Reader::new(message)?;
-        let (sec, nanosec) = (from.i32()?, from.u32()?);
-        let stamp = u64::try_from(sec).unwrap_or(0) * 1_000_000_000 + u64::from(nanosec);
-        let name = from.str()?;
-        let id = from.u32()?;
+        let (Header { nanos: stamp, frame_id: name }, id) = (from.get()?, from.get::<u32>()?);
         if id > EXTENDED_MASK {
             return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
         }
-        let remote = self == Self::Classic && from.bool()?;
-        let extended = if from.bool()? { EXTENDED } else { 0 };
-        let error = if from.bool()? { ERROR } else { 0 };
-        let length = from.u8()?;
+        let remote = self == Self::Classic && from.get()?;
+        let extended = if from.get()? { EXTENDED } else { 0 };
+        let error = if from.get()? { ERROR } else { 0 };
+        let length: u8 = from.get()?;
         let wrong = CdrError::Value {
             what: "length",
             got: length.into(),
@@ -59,11 +57,7 @@ impl Foreign {
         let id = id | extended | error;
         let frame = match self {
             Self::Classic => {
-                let data = [(); 8].map(|()| from.u8());
-                let mut bytes = [0; 8];
-                for (to, from) in bytes.iter_mut().zip(data) {
-                    *to = from?;
-                }
+                let bytes: [u8; 8] = from.get()?;
                 let data = bytes.get(..usize::from(length)).ok_or(wrong)?;
                 if remote { Frame::remote(id, length) } else { Frame::classic(id, data) }
             }
@@ -83,20 +77,18 @@ mod tests {
     use super::*;
     use crate::ros2::cdr::Writer;
 
-    fn head(out: &mut Writer<'_>, name: &str, id: u32) {
-        out.i32(17);
-        out.u32(5);
-        out.str(name);
-        out.u32(id);
+    fn head(out: &mut Writer<'_>, nanos: u64, name: &str, id: u32) {
+        out.put(Header { nanos, frame_id: name });
+        out.put(id);
     }
 
     #[test]
     fn a_classic_frame_of_another_bridge_is_read() {
         let mut bytes = Vec::new();
         let mut out = Writer::new(&mut bytes);
-        head(&mut out, "can", 0x1F33_4455);
-        for byte in [0, 1, 0, 2, 0xAA, 0xBB, 0, 0, 0, 0, 0, 0] {
-            out.u8(byte);
+        head(&mut out, 17_000_000_005, "can", 0x1F33_4455);
+        for byte in [0_u8, 1, 0, 2, 0xAA, 0xBB, 0, 0, 0, 0, 0, 0] {
+            out.put(byte);
         }
         let record = Foreign::of("can_msgs/msg/Frame").unwrap().decode(&bytes, 9, "/from_can_bus").unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
@@ -113,12 +105,9 @@ mod tests {
     fn an_fd_frame_of_another_bridge_is_read() {
         let mut bytes = Vec::new();
         let mut out = Writer::new(&mut bytes);
-        out.i32(0);
-        out.u32(0);
-        out.str("");
-        out.u32(0x22C);
-        for byte in [0, 0, 3] {
-            out.u8(byte);
+        head(&mut out, 0, "", 0x22C);
+        for byte in [0_u8, 0, 3] {
+            out.put(byte);
         }
         out.bytes(&[1, 2, 3]);
         let foreign = Foreign::of("ros2_socketcan_msgs/msg/FdFrame").unwrap();
