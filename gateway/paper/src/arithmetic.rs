@@ -10,7 +10,7 @@ use protocol::skin::Skin;
 use super::line::count;
 use super::ticks::POSE;
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table};
+use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
 
 /// One in so many angles is drawn.
 const DRAWN: usize = 16;
@@ -61,60 +61,38 @@ pub fn sine_section() -> Section {
         SineError::of(sine),
         SineError::of(|angle| Q1_14::nearest(angle.to_radians().sin())),
     ];
-    let figure = |name: &str, title: &str, error: &str, series| Figure {
-        name: name.to_owned(),
-        title: title.to_owned(),
-        x: Axis::new("angle", "quarter turns").between(-2.0, 2.0),
-        y: Axis::new(error, ""),
-        series,
-        ..Figure::default()
+    let figure = |name: &str, title: &str, error: &str| {
+        let angle = Axis::new("angle", "quarter turns").between(-2.0, 2.0);
+        Figure::new(name, title, angle, Axis::new(error, ""))
     };
-    let greatest_there =
-        |label: &str, error: &SineError| Series::new(label, Shape::Steps, error.parts.clone());
     let mean = |what: &str, error: &SineError, bar: f64| {
-        Finding::less_is_better(what, Quantity::new(paper::SINE, ""), Quantity::new(error.mean, ""))
-            .must(format!("at most {bar}"), error.mean <= bar)
+        Finding::less_is_better(what, paper::SINE, error.mean).at_most(bar)
     };
-    let greatest = |what: &str, error: &SineError, bar: f64| {
-        Finding::told(what, Quantity::new(error.greatest, ""))
-            .must(format!("at most {bar}"), error.greatest <= bar)
-    };
-    Section {
-        name: "sine".to_owned(),
-        title: "The sine in 16 bits".to_owned(),
-        text: vec![
+    let greatest = |what: &str, error: &SineError, bar: f64| Finding::told(what, error.greatest).at_most(bar);
+    Section::new("sine", "The sine in 16 bits")
+        .text(
             "The difference to the sine in double precision, over all 65 536 angles that a word can say. Of the \
              polynomial of fifth order the paper gives a mean error; the one of seventh order is what cells compute with, and \
-             costs one multiplication more. Below it is what rounding to Q1.14 alone costs."
-                .to_owned(),
-        ],
-        figures: vec![
-            figure(
-                "sine-fifth",
-                "Fifth order, the paper's (Eq. 17)",
-                "error",
-                vec![Series::new("fifth order", Shape::Line, fifth.points.clone())],
+             costs one multiplication more. Below it is what rounding to Q1.14 alone costs.",
+        )
+        .figures([
+            figure("sine-fifth", "Fifth order, the paper's (Eq. 17)", "error").draw(
+                "fifth order",
+                Shape::Line,
+                fifth.points.clone(),
             ),
-            figure(
-                "sine-greatest",
-                "The greatest errors in 256 parts of the circle",
-                "greatest error",
-                vec![
-                    greatest_there("fifth order", &fifth),
-                    greatest_there("seventh order, the cells'", &seventh),
-                    greatest_there("rounding alone", &rounded),
-                ],
-            ),
-        ],
-        findings: vec![
+            figure("sine-greatest", "The greatest errors in 256 parts of the circle", "greatest error")
+                .draw("fifth order", Shape::Steps, fifth.parts.clone())
+                .draw("seventh order, the cells'", Shape::Steps, seventh.parts.clone())
+                .draw("rounding alone", Shape::Steps, rounded.parts.clone()),
+        ])
+        .findings([
             mean("sine of fifth order, mean error", &fifth, 1.9e-4),
             greatest("sine of fifth order, greatest error", &fifth, 4.6e-4),
             mean("sine of seventh order, mean error", &seventh, 2e-5),
             greatest("sine of seventh order, greatest error", &seventh, 1e-4),
-            Finding::told("rounding to Q1.14 alone, mean error", Quantity::new(rounded.mean, "")),
-        ],
-        tables: Vec::new(),
-    }
+            Finding::told("rounding to Q1.14 alone, mean error", rounded.mean),
+        ])
 }
 
 /// What the Jacobian of a cell on each link of a robot costs.
@@ -163,62 +141,43 @@ const WRENCH: [u32; 4] = [40, 24, 5, 5];
 /// Operations of both kernels.
 #[must_use]
 pub fn kernels_section(robot: &str, costs: &Costs) -> Section {
+    let links = |costs: &[Operations]| (1_u8..).zip(costs.to_vec()).collect::<Vec<_>>();
     let products = |costs: &[Operations]| {
-        (1..)
-            .zip(costs)
-            .map(|(link, done): (u8, _)| (f64::from(link), f64::from(done.multiplications + done.additions)))
-            .collect::<Vec<_>>()
+        let of_link =
+            |(link, done): (u8, Operations)| (link.into(), (done.multiplications + done.additions).into());
+        links(costs).into_iter().map(of_link).collect::<Vec<_>>()
     };
-    let number = |value: u32| Quantity::new(f64::from(value), "");
-    let mut findings = Vec::new();
-    let last = |costs: &[Operations]| costs.last().copied().unwrap_or_default();
-    for (((name, ours), paper), bar) in
-        named(&last(&costs.wrench)).into_iter().zip(paper::OPERATIONS).zip(WRENCH)
-    {
-        let what = format!("{name} of the wrench kernel, cell on the last link");
-        findings.push(
-            Finding::less_is_better(what, number(paper), number(ours))
-                .must(format!("at most {bar}"), ours <= bar),
-        );
-    }
-    for ((name, ours), paper) in named(&last(&costs.projection)).into_iter().zip(paper::OPERATIONS) {
-        let what = format!("{name} of the paper's projections, cell on the last link");
-        findings.push(Finding::less_is_better(what, number(paper), number(ours)));
-    }
+    let last = |costs: &[Operations]| named(&costs.last().copied().unwrap_or_default());
+    let finding = |((name, ours), paper): ((&str, u32), u32), kernel: &str| {
+        let what = format!("{name} of {kernel}, cell on the last link");
+        Finding::less_is_better(what, f64::from(paper), f64::from(ours))
+    };
+    let wrench = last(&costs.wrench).into_iter().zip(paper::OPERATIONS).zip(WRENCH);
+    let projection = last(&costs.projection).into_iter().zip(paper::OPERATIONS);
+    let figure = Figure::new(
+        "kernels",
+        "Multiplications and additions over the link that the cell is on",
+        Axis::new("link", "").between(0.0, 7.0),
+        Axis::new("multiplications and additions", ""),
+    );
     let rows = [("wrench", &costs.wrench), ("projections", &costs.projection)];
-    Section {
-        name: "kernels".to_owned(),
-        title: "Operations of one cell's Jacobian".to_owned(),
-        text: vec![format!(
+    let rows = rows.into_iter().flat_map(|(kernel, costs)| {
+        links(costs).into_iter().map(move |(link, done)| {
+            let counts = named(&done).map(|(_, count)| count.to_string());
+            [kernel.to_owned(), link.to_string()].into_iter().chain(counts).collect::<Vec<_>>()
+        })
+    });
+    Section::new("kernels", "Operations of one cell's Jacobian")
+        .text(format!(
             "Counted by running the cells' code on words that count what is done to them, on a {robot}. The wrench kernel \
              carries the contact's force and moment down to the base; the paper carries frames up to the cell.",
-        )],
-        figures: vec![Figure {
-            name: "kernels".to_owned(),
-            title: "Multiplications and additions over the link that the cell is on".to_owned(),
-            x: Axis::new("link", "").between(0.0, 7.0),
-            y: Axis::new("multiplications and additions", ""),
-            series: vec![
-                Series::new("wrench", Shape::Line, products(&costs.wrench)),
-                Series::new("the paper's projections", Shape::Line, products(&costs.projection)),
-            ],
-            ..Figure::default()
-        }],
-        findings,
-        tables: vec![Table {
-            title: "Operations".to_owned(),
-            head: ["kernel", "link", "mul", "add", "sin", "cos"].map(str::to_owned).to_vec(),
-            rows: rows
-                .into_iter()
-                .flat_map(|(kernel, costs)| {
-                    (1..).zip(costs).map(move |(link, done): (u8, _)| {
-                        let counts = named(done).map(|(_, count)| count.to_string());
-                        [kernel.to_owned(), link.to_string()].into_iter().chain(counts).collect()
-                    })
-                })
-                .collect(),
-        }],
-    }
+        ))
+        .figures([figure
+            .draw("wrench", Shape::Line, products(&costs.wrench))
+            .draw("the paper's projections", Shape::Line, products(&costs.projection))])
+        .findings(wrench.map(|(counts, bar)| finding(counts, "the wrench kernel").at_most(bar.into())))
+        .findings(projection.map(|counts| finding(counts, "the paper's projections")))
+        .tables([Table::new("Operations", ["kernel", "link", "mul", "add", "sin", "cos"], rows)])
 }
 
 #[cfg(test)]

@@ -3,25 +3,16 @@
 use protocol::skin::Skin;
 
 use super::Effort;
-use model::generate::{self, Wanted, generate};
+use model::generate::{Wanted, generate};
 
-/// What cells answer with.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Reply {
-    /// Each its own torque, Q3.12.
-    Torque,
-    /// Sums along the tree, Q7.8.
-    Sum,
-}
+pub use model::generate::Reply;
 
-impl Reply {
-    /// How files of its run are called.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Torque => "single",
-            Self::Sum => "sum",
-        }
+/// How files of a run with these answers are called.
+#[must_use]
+pub const fn name(reply: Reply) -> &'static str {
+    match reply {
+        Reply::Torque => "single",
+        Reply::Sum => "sum",
     }
 }
 
@@ -66,10 +57,6 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
     let cells = match effort {
         Effort::Quick => FEW,
         Effort::Full => CELLS,
-    };
-    let reply = match reply {
-        Reply::Torque => generate::Reply::Torque,
-        Reply::Sum => generate::Reply::Sum,
     };
     generate(&Wanted { cells, reply, ..Wanted::default() }).expect("so many cells fit on the arm")
 }

@@ -16,7 +16,7 @@ use super::line::{Line, Weighted, count, quantile};
 use super::samples;
 use super::ticks::{POSE, nanos, touch};
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
+use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Shape, Table, number};
 use model::central::Central;
 
 /// Computations between two looks at the clock.
@@ -104,12 +104,7 @@ pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option
         }
     }
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
-    let points = points.map(|(active, values)| Weighted {
-        x: count(active),
-        y: quantile(values, 0.5),
-        weight: count(values.len()),
-    });
-    let points: Vec<_> = points.collect();
+    let points: Vec<_> = points.map(|(active, values)| Weighted::median(count(active), values)).collect();
     Some(OverActive { cells, line: Line::through(&points)?, points })
 }
 
@@ -117,25 +112,51 @@ pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option
 const QUALITY: f64 = 0.99;
 
 fn quality(line: &Line, paper: f64) -> Finding {
-    Finding::more_is_better(
-        "quality of the fit, R²",
-        Quantity::new(paper, ""),
-        Quantity::new(line.quality, ""),
-    )
-    .must(format!("at least {QUALITY}"), line.quality >= QUALITY)
+    let finding = Finding::more_is_better("quality of the fit, R²", paper, line.quality);
+    finding.must(format!("at least {QUALITY}"), line.quality >= QUALITY)
 }
 
 /// A slope or a start in ns beside the paper's in s, as it is and as a ratio.
-fn cost(what: &str, ours: Quantity, paper_s: f64) -> [Finding; 2] {
+fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
+    let ours = ours.into();
     let ratio = ours.value / (paper_s * 1e9);
     [
-        Finding::less_is_better(what, Quantity::new(paper_s * 1e9, "ns"), ours),
-        Finding::told(format!("{what}: ours by the paper's"), Quantity::new(ratio, "")),
+        Finding::less_is_better(what, (paper_s * 1e9, "ns"), ours),
+        Finding::told(format!("{what}: ours by the paper's"), ratio),
     ]
 }
 
-fn slope(line: &Line) -> Quantity {
-    Quantity::new(line.slope, "ns").plus_minus(line.slope_half)
+/// How many cells fit into a cycle, so many of them active.
+fn limit(active: &str, paper: f64, ours: f64) -> Finding {
+    let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
+    Finding::more_is_better(what, (paper, "cells"), (ours, "cells"))
+}
+
+/// T_skin over something.
+fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
+    Figure::new(name, title, Axis::new(x, ""), Axis::new("T_skin", "µs"))
+}
+
+/// A figure again up to the greatest x, on a logarithmic axis, with the paper's law in s as a polyline that is smooth
+/// there too.
+fn beside(
+    figure: &Figure,
+    equation: &str,
+    measured: Vec<(f64, f64)>,
+    most: f64,
+    law: impl Fn(f64) -> f64,
+) -> Figure {
+    let law = (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, law(x) * 1e6));
+    let title = format!("The same beside the paper's law ({equation})");
+    let y = Axis::new("T_skin", "µs").log().between(0.1, 10_000.0);
+    Figure::new(format!("{}-paper", figure.name), title, figure.x.clone(), y)
+        .draw("measured", Shape::Points, measured)
+        .draw("the paper's law", Shape::Dashed, law.collect())
+}
+
+/// A law in ns as a line from 0 on, in µs.
+fn law(line: &Line, most: f64) -> Vec<(f64, f64)> {
+    [0.0, most].map(|x| (x, line.at(x) * 1e-3)).into()
 }
 
 /// Fig. 9 with Eq. 29.
@@ -143,85 +164,39 @@ fn slope(line: &Line) -> Quantity {
 pub fn fig9(over: &OverCells) -> Section {
     let OverCells { points, line } = over;
     let most = points.last().map_or(0.0, |point| point[0]);
-    let micros =
-        |place: fn(&[f64; 4]) -> f64| points.iter().map(move |point| (point[0], place(point) * 1e-3));
-    let band = micros(|point| point[2]).chain(micros(|point| point[3]).collect::<Vec<_>>().into_iter().rev());
-    let figure = |name: &str, title: &str, series| Figure {
-        name: name.to_owned(),
-        title: title.to_owned(),
-        x: Axis::new("cells, none active", ""),
-        y: Axis::new("T_skin", "µs"),
-        series,
-        ..Figure::default()
+    let micros = |place: fn(&[f64; 4]) -> f64| {
+        points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
     };
-    let law = |at: &dyn Fn(f64) -> f64| vec![(0.0, at(0.0)), (most, at(most))];
-    let ours = law(&|cells| line.at(cells) * 1e-3);
-    let beside = Figure {
-        y: Axis::new("T_skin", "µs").log().between(0.1, 10_000.0),
-        ..figure(
-            "fig9-paper",
-            "The same beside the paper's law (Eq. 29)",
-            vec![
-                Series::new("measured", Shape::Points, micros(|point| point[1]).collect()),
-                Series::new(
-                    "the paper's law",
-                    Shape::Dashed,
-                    steps(most, |cells| (paper::CELL_S * cells + paper::FIXED_S) * 1e6),
-                ),
-            ],
-        )
-    };
-    let limit = paper::most_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
-    let mut findings = Vec::new();
-    findings.extend(cost("T_skin for each cell (slope of Eq. 29)", slope(line), paper::CELL_S));
-    findings.extend(cost("T_skin without a cell", Quantity::new(line.intercept, "ns"), paper::FIXED_S));
-    findings.push(quality(line, paper::CELLS_QUALITY));
-    findings.push(Finding::more_is_better(
-        "most cells at 500 Hz, none active, with 0.2 ms for the rest of a cycle",
-        Quantity::new(paper::LIMIT, "cells"),
-        Quantity::new(limit, "cells"),
-    ));
-    Section {
-        name: "fig9".to_owned(),
-        title: "Fig. 9: central computation over the number of cells".to_owned(),
-        text: vec![
+    let band = micros(|point| point[2]).into_iter().chain(micros(|point| point[3]).into_iter().rev());
+    let median = micros(|point| point[1]);
+    let fig9 = figure("fig9", "T_skin over cells, none active", "cells, none active")
+        .draw("middle half", Shape::Band, band.collect())
+        .draw("median", Shape::Points, median.clone())
+        .draw("least squares", Shape::Line, law(line, most));
+    let papers = beside(&fig9, "Eq. 29", median, most, |cells| paper::CELL_S * cells + paper::FIXED_S);
+    let cells = paper::most_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
+    Section::new("fig9", "Fig. 9: central computation over the number of cells")
+        .text(
             "Whoever computes the skin's torques in the loop has to look at every cell in every cycle, also when none is \
              touched. Timed is the gateway's own central computation, the code that a comparing tick runs; the medians of \
-             many rounds in random order, with the middle half of the measurements as a band."
-                .to_owned(),
-            format!(
-                "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on a computer \
-                 and in a program of its own: that the line is straight is the claim, how steep it is says how quick \
-                 the computer and the loop are.",
-                number(line.slope),
-                number(line.intercept),
-                line.quality
-            ),
-            format!(
-                "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer would hold {limit} cells; its law \
-                 leads to 2163, which the paper rounds to 2160.",
-            ),
-        ],
-        figures: vec![
-            figure(
-                "fig9",
-                "T_skin over cells, none active",
-                vec![
-                    Series::new("middle half", Shape::Band, band.collect()),
-                    Series::new("median", Shape::Points, micros(|point| point[1]).collect()),
-                    Series::new("least squares", Shape::Line, ours),
-                ],
-            ),
-            beside,
-        ],
-        findings,
-        tables: Vec::new(),
-    }
-}
-
-/// A law as a polyline that is smooth on a logarithmic axis too.
-fn steps(most: f64, at: impl Fn(f64) -> f64) -> Vec<(f64, f64)> {
-    (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, at(x))).collect()
+             many rounds in random order, with the middle half of the measurements as a band.",
+        )
+        .text(format!(
+            "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on a computer \
+             and in a program of its own: that the line is straight is the claim, how steep it is says how quick \
+             the computer and the loop are.",
+            number(line.slope),
+            number(line.intercept),
+            line.quality
+        ))
+        .text(format!(
+            "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer would hold {cells} cells; its law \
+             leads to 2163, which the paper rounds to 2160.",
+        ))
+        .figures([fig9, papers])
+        .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CELL_S))
+        .findings(cost("T_skin without a cell", (line.intercept, "ns"), paper::FIXED_S))
+        .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::LIMIT, cells)])
 }
 
 /// Fig. 10 with Eq. 30 and 31, and the limits of both laws.
@@ -230,106 +205,50 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let OverActive { points, line, cells: of } = over;
     let most = count(*of);
     let of_cells = cells.line;
-    let limit = |active| {
-        paper::most_cells(of_cells.slope * 1e-9, of_cells.intercept * 1e-9, line.slope * 1e-9, active)
-    };
+    let limits = [(0.0, paper::LIMIT), (paper::LIMIT_AT, paper::LIMIT_ACTIVE)].map(|(active, paper)| {
+        let [cell, fixed, each] = [of_cells.slope, of_cells.intercept, line.slope].map(|ns| ns * 1e-9);
+        limit(&active.to_string(), paper, paper::most_cells(cell, fixed, each, active))
+    });
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
-    let figure = |name: &str, title: String, series| Figure {
-        name: name.to_owned(),
-        title,
-        x: Axis::new("active cells", ""),
-        y: Axis::new("T_skin", "µs"),
-        series,
-        ..Figure::default()
-    };
-    let mut findings = Vec::new();
-    findings.extend(cost("T_skin for each active cell (slope of Eq. 30)", slope(line), paper::ACTIVE_S));
-    findings.extend(cost(
-        &format!("T_skin of {of} cells, none active"),
-        Quantity::new(line.intercept, "ns"),
-        paper::NONE_ACTIVE_S,
-    ));
-    findings.push(quality(line, paper::ACTIVE_QUALITY));
-    findings.push(
-        Finding::told(
-            format!("T_skin of {of} cells, all active (Eq. 31)"),
-            Quantity::new((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
-        )
-        .beside(Quantity::new((paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6, "µs")),
+    let fig10 = figure("fig10", format!("T_skin over active cells, of {of}"), "active cells")
+        .draw("median of touches", Shape::Points, micros.clone())
+        .draw("least squares", Shape::Line, law(line, most));
+    let papers =
+        beside(&fig10, "Eq. 30", micros, most, |active| paper::ACTIVE_S * active + paper::NONE_ACTIVE_S);
+    let all = Finding::told(
+        format!("T_skin of {of} cells, all active (Eq. 31)"),
+        ((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
     );
-    let limits = [(0.0, paper::LIMIT), (paper::LIMIT_AT, paper::LIMIT_ACTIVE)];
-    findings.extend(limits.map(|(active, paper)| {
-        Finding::more_is_better(
-            format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle"),
-            Quantity::new(paper, "cells"),
-            Quantity::new(limit(active), "cells"),
-        )
-    }));
+    let all_papers = (paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6;
     let touches: f64 = points.iter().map(|point| point.weight).sum();
-    Section {
-        name: "fig10".to_owned(),
-        title: "Fig. 10: central computation over the number of active cells".to_owned(),
-        text: vec![
-            format!(
-                "{of} cells, {touches} touches, each of a patch of cells of random size at a random place; the line is \
-                 weighted with the number of touches, as the paper's is with the number of samples."
-            ),
-            format!(
-                "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
-                number(line.slope),
-                number(of_cells.slope),
-                number(of_cells.intercept)
-            ),
-        ],
-        figures: vec![
-            figure(
-                "fig10",
-                format!("T_skin over active cells, of {of}"),
-                vec![
-                    Series::new("median of touches", Shape::Points, micros.clone()),
-                    Series::new(
-                        "least squares",
-                        Shape::Line,
-                        vec![(0.0, line.at(0.0) * 1e-3), (most, line.at(most) * 1e-3)],
-                    ),
-                ],
-            ),
-            Figure {
-                y: Axis::new("T_skin", "µs").log().between(0.1, 10_000.0),
-                ..figure(
-                    "fig10-paper",
-                    "The same beside the paper's law (Eq. 30)".to_owned(),
-                    vec![
-                        Series::new("measured", Shape::Points, micros),
-                        Series::new(
-                            "the paper's law",
-                            Shape::Dashed,
-                            steps(most, |active| (paper::ACTIVE_S * active + paper::NONE_ACTIVE_S) * 1e6),
-                        ),
-                    ],
-                )
-            },
-        ],
-        findings,
-        tables: vec![Table {
-            title: "Laws".to_owned(),
-            head: ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"].map(str::to_owned).to_vec(),
-            rows: [
-                ("cells (Eq. 29)", of_cells, paper::CELL_S),
-                ("active cells (Eq. 30)", *line, paper::ACTIVE_S),
-            ]
-            .map(|(name, line, paper)| {
-                vec![
-                    name.to_owned(),
-                    number(line.slope),
-                    number(line.intercept),
-                    format!("{:.4}", line.quality),
-                    number(paper * 1e9),
-                ]
-            })
-            .to_vec(),
-        }],
-    }
+    let laws =
+        [("cells (Eq. 29)", of_cells, paper::CELL_S), ("active cells (Eq. 30)", *line, paper::ACTIVE_S)];
+    let laws = laws.map(|(name, line, paper)| {
+        let quality = format!("{:.4}", line.quality);
+        let [slope, start, papers] = [line.slope, line.intercept, paper * 1e9].map(number);
+        [name.to_owned(), slope, start, quality, papers]
+    });
+    Section::new("fig10", "Fig. 10: central computation over the number of active cells")
+        .text(format!(
+            "{of} cells, {touches} touches, each of a patch of cells of random size at a random place; the line is \
+             weighted with the number of touches, as the paper's is with the number of samples."
+        ))
+        .text(format!(
+            "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
+            number(line.slope),
+            number(of_cells.slope),
+            number(of_cells.intercept)
+        ))
+        .figures([fig10, papers])
+        .findings(cost("T_skin for each active cell (slope of Eq. 30)", line.slope_in("ns"), paper::ACTIVE_S))
+        .findings(cost(
+            &format!("T_skin of {of} cells, none active"),
+            (line.intercept, "ns"),
+            paper::NONE_ACTIVE_S,
+        ))
+        .findings([quality(line, paper::ACTIVE_QUALITY), all.beside((all_papers, "µs"))])
+        .findings(limits)
+        .tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
 }
 
 #[cfg(test)]

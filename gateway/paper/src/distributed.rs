@@ -17,7 +17,7 @@ use protocol::time::Micros;
 use super::line::{Line, count};
 use super::samples;
 use super::ticks::{BUSES, Ticks, nanos, spread};
-use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, number};
+use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
 use model::scenario::Mode;
 use model::table::Table;
 
@@ -162,14 +162,13 @@ const SHARE: f64 = 0.01;
 
 fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     let Over { distributed, central, .. } = over;
-    let slope = |line: &Line| Quantity::new(line.slope, "ns").plus_minus(line.slope_half);
     [
-        Finding::told(format!("central T_skin for each {what}"), slope(central)),
-        Finding::told(format!("distributed tick for each {what}"), slope(distributed))
-            .beside(Quantity::new(0.0, "ns")),
+        Finding::told(format!("central T_skin for each {what}"), central.slope_in("ns")),
+        Finding::told(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
+            .beside((0.0, "ns")),
         Finding::told(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
-            Quantity::new(over.share() * 100.0, "%"),
+            (over.share() * 100.0, "%"),
         )
         .must(format!("at most {} %", SHARE * 100.0), over.share() <= SHARE),
     ]
@@ -184,65 +183,46 @@ pub fn section(measured: &Distributed) -> Section {
             over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
         };
         let most = over.points.last().map_or(0.0, |point| point[0]);
-        let law = |line: &Line| vec![(0.0, line.at(0.0) * 1e-3), (most, line.at(most) * 1e-3)];
-        Figure {
-            name: name.to_owned(),
-            title,
-            x: Axis::new(what, ""),
-            y: Axis::new("time in a tick", "µs"),
-            series: vec![
-                Series::new("central T_skin", Shape::Points, micros(|point| point[2])),
-                Series::new("distributed: the whole tick", Shape::Points, micros(|point| point[1])),
-                Series::new("", Shape::Line, law(&over.central)),
-                Series::new("", Shape::Line, law(&over.distributed)),
-            ],
-            ..Figure::default()
-        }
+        let law = |line: &Line| [0.0, most].map(|x| (x, line.at(x) * 1e-3)).to_vec();
+        Figure::new(name, title, Axis::new(what, ""), Axis::new("time in a tick", "µs"))
+            .draw("central T_skin", Shape::Points, micros(|point| point[2]))
+            .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
+            .draw("", Shape::Line, law(&over.central))
+            .draw("", Shape::Line, law(&over.distributed))
     };
-    let mut findings = Vec::new();
-    findings.extend(of_share("cell", cells));
-    findings.extend(of_share("active cell", active));
-    findings.push(Finding::told(
-        "distributed tick for each further bus",
-        Quantity::new(buses.slope, "ns").plus_minus(buses.slope_half),
-    ));
-    findings.push(Finding::told(
-        "the same by the most cells that a bus has numbers for",
-        Quantity::new(buses.slope / 254.0, "ns"),
-    ));
-    findings.push(Finding::told(
-        "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
-        Quantity::new(*receiving, "ns"),
-    ));
-    findings.push(Finding::told(
-        "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
-        Quantity::new(receiving / (8.0 * active.central.slope), ""),
-    ));
-    Section {
-        name: "distributed".to_owned(),
-        title: "The distributed way over cells and active cells".to_owned(),
-        text: vec![
-            format!(
-                "Up to {of} cells on {BUSES} buses. Of the distributed way the whole tick is timed: sums of all buses, controller, \
-                 robot, joints. Of the central way only T_skin, the part that computes torques. Both in the same run, \
-                 in random order. The robot is held where it is.",
-            ),
-            format!(
-                "A tick of the distributed way is given one sum of each bus and nothing of its cells, so only buses make it \
-                 longer: {} ns each, whether they have cells or not. What becomes more with the cells is the receivers' work, in \
-                 threads of their own: {} ns for a torque that came, once an epoch, and only of cells in contact. What the \
-                 kernel takes to bring a frame to the receiver is not in that.",
-                number(buses.slope),
-                number(*receiving)
-            ),
-        ],
-        figures: vec![
+    let findings = [
+        Finding::told("distributed tick for each further bus", buses.slope_in("ns")),
+        Finding::told("the same by the most cells that a bus has numbers for", (buses.slope / 254.0, "ns")),
+        Finding::told(
+            "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
+            (*receiving, "ns"),
+        ),
+        Finding::told(
+            "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
+            receiving / (8.0 * active.central.slope),
+        ),
+    ];
+    Section::new("distributed", "The distributed way over cells and active cells")
+        .text(format!(
+            "Up to {of} cells on {BUSES} buses. Of the distributed way the whole tick is timed: sums of all buses, controller, \
+             robot, joints. Of the central way only T_skin, the part that computes torques. Both in the same run, \
+             in random order. The robot is held where it is.",
+        ))
+        .text(format!(
+            "A tick of the distributed way is given one sum of each bus and nothing of its cells, so only buses make it \
+             longer: {} ns each, whether they have cells or not. What becomes more with the cells is the receivers' work, in \
+             threads of their own: {} ns for a torque that came, once an epoch, and only of cells in contact. What the \
+             kernel takes to bring a frame to the receiver is not in that.",
+            number(buses.slope),
+            number(*receiving)
+        ))
+        .figures([
             figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
             figure("distributed-active", format!("Over active cells, of {of}"), "active cells", active),
-        ],
-        findings,
-        tables: Vec::new(),
-    }
+        ])
+        .findings(of_share("cell", cells))
+        .findings(of_share("active cell", active))
+        .findings(findings)
 }
 
 #[cfg(test)]

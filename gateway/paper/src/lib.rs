@@ -75,52 +75,59 @@ impl Experiment {
         Self::Load,
     ];
 
+    /// Its name, what it does, and how long it takes about, in s: quick and in full.
+    const fn about_it(self) -> (&'static str, &'static str, [u64; 2]) {
+        match self {
+            Self::Fig6 => (
+                "fig6",
+                "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8",
+                [10, 32],
+            ),
+            Self::Fig7 => ("fig7", "joint velocities and active cells of the moving arm", [1, 1]),
+            Self::Fig8 => (
+                "fig8",
+                "cycle times of the moving arm, the central computation switched off at 5.7 s",
+                [1, 1],
+            ),
+            Self::Fig9 => ("fig9", "central computation over 0 to 3000 cells, none active (Eq. 29)", [1, 4]),
+            Self::Fig10 => (
+                "fig10",
+                "central computation over active cells (Eq. 30, 31), and the most cells at 500 Hz",
+                [1, 4],
+            ),
+            Self::Distributed => (
+                "distributed",
+                "the loop's ticks over cells and active cells, and the cost of receiving",
+                [1, 20],
+            ),
+            Self::Sums => {
+                ("sums", "error of summed torques over active cells: cut off, rounded, carried", [1, 10])
+            }
+            Self::Sine => ("sine", "error of the 16-bit sines over the whole circle", [1, 1]),
+            Self::Kernels => ("kernels", "operations of one cell's Jacobian, by both kernels", [1, 1]),
+            Self::Load => ("load", "bus load over cells for common bit rates", [1, 1]),
+        }
+    }
+
     /// Its name on the command line and in files.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        match self {
-            Self::Fig6 => "fig6",
-            Self::Fig7 => "fig7",
-            Self::Fig8 => "fig8",
-            Self::Fig9 => "fig9",
-            Self::Fig10 => "fig10",
-            Self::Distributed => "distributed",
-            Self::Sums => "sums",
-            Self::Sine => "sine",
-            Self::Kernels => "kernels",
-            Self::Load => "load",
-        }
+        self.about_it().0
     }
 
     /// What it does, in a line.
     #[must_use]
     pub const fn about(self) -> &'static str {
-        match self {
-            Self::Fig6 => {
-                "torques of the moving arm, computed on the cells and in the loop; errors in Q3.12 and Q7.8"
-            }
-            Self::Fig7 => "joint velocities and active cells of the moving arm",
-            Self::Fig8 => "cycle times of the moving arm, the central computation switched off at 5.7 s",
-            Self::Fig9 => "central computation over 0 to 3000 cells, none active (Eq. 29)",
-            Self::Fig10 => "central computation over active cells (Eq. 30, 31), and the most cells at 500 Hz",
-            Self::Distributed => "the loop's ticks over cells and active cells, and the cost of receiving",
-            Self::Sums => "error of summed torques over active cells: cut off, rounded, carried",
-            Self::Sine => "error of the 16-bit sines over the whole circle",
-            Self::Kernels => "operations of one cell's Jacobian, by both kernels",
-            Self::Load => "bus load over cells for common bit rates",
-        }
+        self.about_it().1
     }
 
     /// About how long it takes, in s, beside what those before it have done already.
     #[must_use]
     pub const fn seconds(self, effort: Effort) -> u64 {
-        match (effort, self) {
-            (Effort::Full, Self::Fig6) => 32,
-            (Effort::Quick, Self::Fig6) => 10,
-            (Effort::Full, Self::Distributed) => 20,
-            (Effort::Full, Self::Sums) => 10,
-            (Effort::Full, Self::Fig9 | Self::Fig10) => 4,
-            (_, _) => 1,
+        let [quick, full] = self.about_it().2;
+        match effort {
+            Effort::Quick => quick,
+            Effort::Full => full,
         }
     }
 }

@@ -1,5 +1,7 @@
 //! A straight line through points by least squares, with its quality and how sure its slope is.
 
+use analysis::report::figure::Quantity;
+
 /// A point, and how much it counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weighted {
@@ -9,6 +11,14 @@ pub struct Weighted {
     pub y: f64,
     /// How many measurements it stands for; above 0.
     pub weight: f64,
+}
+
+impl Weighted {
+    /// The median of what was measured at x.
+    #[must_use]
+    pub fn median(x: f64, measured: &mut [f64]) -> Self {
+        Self { x, y: quantile(measured, 0.5), weight: count(measured.len()) }
+    }
 }
 
 /// `y = slope x + intercept`.
@@ -76,6 +86,12 @@ impl Line {
     #[must_use]
     pub fn at(&self, x: f64) -> f64 {
         self.slope * x + self.intercept
+    }
+
+    /// The slope with its 95 % interval, which is in this unit.
+    #[must_use]
+    pub fn slope_in(&self, unit: &str) -> Quantity {
+        Quantity::new(self.slope, unit).plus_minus(self.slope_half)
     }
 
     /// The upper end of the slope's 95 % interval.

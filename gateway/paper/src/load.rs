@@ -5,7 +5,7 @@ use super::line::count;
 use analysis::fit::limits::NODES;
 use analysis::fit::verdict::Answer;
 use analysis::fit::{self, COMPUTATION_NS, Row};
-use analysis::report::figure::{Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Table};
+use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table};
 
 /// Cells in the figure.
 const MOST: u32 = 300;
@@ -17,55 +17,49 @@ pub fn section() -> Section {
     let rows = fit::table(&skin, None, COMPUTATION_NS);
     let cells = skin.cells.len();
     let series = |row: &Row| {
-        let case = &row.fullest.judged.case;
-        let points = (0..=MOST).step_by(10);
-        let points =
-            points.map(|cells| (f64::from(cells), 100.0 * case.with_cells(cells).load().total())).collect();
-        Series::new(Answer::worst_case(&row.fullest.judged).rates, Shape::Line, points)
+        let judged = &row.fullest.judged;
+        let load = |cells| (f64::from(cells), 100.0 * judged.case.with_cells(cells).load().total());
+        let points = (0..=MOST).step_by(10).map(load).collect();
+        Series::new(Answer::worst_case(judged).rates, Shape::Line, points)
     };
     // Nobody has chosen any of these rates, so none is judged.
     let finding = |row: &Row| {
         let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.judged);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
-        Finding::told(what, Quantity::new(100.0 * load, "%"))
+        Finding::told(what, (100.0 * load, "%"))
     };
-    Section {
-        name: "load".to_owned(),
-        title: "Bus load over the number of cells".to_owned(),
-        text: vec![
+    let figure = Figure::new(
+        "load",
+        "Load of one bus, every cell in contact, worst case",
+        Axis::new("cells", "").between(0.0, f64::from(MOST)),
+        Axis::new("load", "%").between(0.0, 200.0),
+    );
+    let marks = [
+        Mark::y(100.0, "full"),
+        Mark::x(f64::from(NODES - 1), "nodes electrically"),
+        Mark::x(count(cells), "the paper's arm"),
+    ];
+    Section::new("load", "Bus load over the number of cells")
+        .text(
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
-                 each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
-                 100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
-                 numbers of gateway fit, which says more about one skin."
-                .to_owned(),
-            format!(
-                "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
-                 the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
-            ),
-        ],
-        figures: vec![Figure {
-            name: "load".to_owned(),
-            title: "Load of one bus, every cell in contact, worst case".to_owned(),
-            x: Axis::new("cells", "").between(0.0, f64::from(MOST)),
-            y: Axis::new("load", "%").between(0.0, 200.0),
-            series: rows.iter().map(series).collect(),
-            marks: vec![
-                Mark { on: On::Y, at: 100.0, label: "full".to_owned() },
-                Mark { on: On::X, at: f64::from(NODES - 1), label: "nodes electrically".to_owned() },
-                Mark { on: On::X, at: count(cells), label: "the paper's arm".to_owned() },
-            ],
-            ..Figure::default()
-        }],
-        findings: rows.iter().map(finding).collect(),
-        tables: vec![table(&rows, cells)],
-    }
+             each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
+             100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
+             numbers of gateway fit, which says more about one skin.",
+        )
+        .text(format!(
+            "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
+             the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
+        ))
+        .figures([figure.series(rows.iter().map(series)).marks(marks)])
+        .findings(rows.iter().map(finding))
+        .tables([table(&rows, cells)])
 }
 
 fn table(rows: &[Row], cells: usize) -> Table {
     let row = |row: &Row| {
         let judged = &row.fullest.judged;
         let Answer { load, rates, .. } = Answer::worst_case(judged);
-        vec![
+        [
             rates,
             format!("{:.1}", judged.case.packet_ns() as f64 / 1e3),
             format!("{:.1}", 100.0 * (load - judged.load.heartbeats)),
@@ -84,13 +78,10 @@ fn table(rows: &[Row], cells: usize) -> Table {
         "buses by time",
         "buses needed",
     ];
-    Table {
-        title: format!(
-            "Worst case: load of one bus with {cells} cells, cells that a bus has time for, buses for {cells} cells"
-        ),
-        head: head.map(str::to_owned).into(),
-        rows: rows.iter().map(row).collect(),
-    }
+    let title = format!(
+        "Worst case: load of one bus with {cells} cells, cells that a bus has time for, buses for {cells} cells"
+    );
+    Table::new(title, head, rows.iter().map(row))
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use super::line::{Line, Weighted, count, quantile};
 use super::recorded::Row;
 use analysis::paper;
 use analysis::report::figure::{
-    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
+    Axis, Figure, Finding, Mark, Quantity, Section, Series, Shape, Table, number,
 };
 
 /// A run: its ticks, and the figures of its end (`bench::summary::Summary` as JSON).
@@ -41,91 +41,87 @@ impl Run {
         self.rows.iter().map(|row| (row.time_s, value(row))).collect()
     }
 
+    /// A figure over the time of this run.
+    fn drawn(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
+        Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switched())
+    }
+
     fn switched(&self) -> Vec<Mark> {
-        let label = "central computation off".to_owned();
-        self.switched_s().map(|at| Mark { on: On::X, at, label }).into_iter().collect()
+        self.switched_s().map(|at| Mark::x(at, "central computation off")).into_iter().collect()
     }
 
     fn replies(&self) -> Finding {
         let due = self.figure(&["buses", "0", "replies", "due"]);
         let in_time = self.figure(&["buses", "0", "replies", "in_time"]);
-        Finding::told(format!("replies in time, of {due}"), Quantity::new(in_time, ""))
+        Finding::told(format!("replies in time, of {due}"), in_time)
     }
-}
-
-fn time() -> Axis {
-    Axis::new("time", "s")
 }
 
 /// Fig. 6: central against distributed torques of a run in which each cell answers itself, and the errors of that one
 /// and of one in which they answer with sums.
 #[must_use]
 pub fn fig6(single: &Run, summed: &Run) -> Section {
-    let joint = |joint: usize| Figure {
-        name: format!("fig6-joint{}", joint + 1),
-        title: format!("Joint {}", joint + 1),
-        size: Size::Half,
-        x: time(),
-        y: Axis::new("torque", "Nm"),
-        series: vec![
-            Series::new(
-                "central",
-                Shape::Line,
-                single.over_time(|row| row.central.map_or(f64::NAN, |torque| at(&torque, joint))),
-            ),
-            Series::new("distributed", Shape::Dashed, single.over_time(|row| at(&row.distributed, joint))),
-        ],
-        marks: single.switched(),
+    let joint = |joint: usize| {
+        let central = |row: &Row| row.central.map_or(f64::NAN, |torque| at(&torque, joint));
+        let (name, title) = (format!("fig6-joint{}", joint + 1), format!("Joint {}", joint + 1));
+        single
+            .drawn(name, title, Axis::new("torque", "Nm"))
+            .half()
+            .draw("central", Shape::Line, single.over_time(central))
+            .draw("distributed", Shape::Dashed, single.over_time(|row| at(&row.distributed, joint)))
     };
     let error = |run: &Run, kind: &str, key: &str| run.figure(&["accuracy", kind, key]);
     let (mean_single, mean_summed) = (error(single, "single", "mean_nm"), error(summed, "sums", "mean_nm"));
-    let nm = |value| Quantity::new(value, "Nm");
     let [summed_due, summed_in] =
         ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
     let row = |name: &str, run: &Run, kind: &str| {
         let [mean, greatest, torques] =
             ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
-        vec![name.to_owned(), mean, greatest, torques]
+        [name.to_owned(), mean, greatest, torques]
     };
-    Section {
-        name: "fig6".to_owned(),
-        title: "Fig. 6: torques of the moving arm, computed in the loop and on the cells".to_owned(),
-        text: vec![
-            format!(
-                "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm gives way to touches; up to {:.1} s \
-                 the loop computes the torques itself as well.",
-                single.figure(&["cells"]),
-                single.switched_s().unwrap_or(f64::NAN)
-            ),
+    let title = "Fig. 6: torques of the moving arm, computed in the loop and on the cells";
+    let cell = Finding::less_is_better(
+        "mean error of a cell's torque, Q3.12",
+        (paper::SINGLE_NM, "Nm"),
+        (mean_single, "Nm"),
+    );
+    let sum = Finding::less_is_better(
+        "mean error of the summed torque, Q7.8",
+        (paper::SUMMED_NM, "Nm"),
+        (mean_summed, "Nm"),
+    );
+    let rows = [
+        row("single cells, Q3.12, loaded joints", single, "single"),
+        row("the same against unrounded parameters", single, "unquantised"),
+        row("the whole skin, sum of Q3.12 words", single, "whole"),
+        row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
+    ];
+    Section::new("fig6", title)
+        .text(format!(
+            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm gives way to touches; up to {:.1} s \
+             the loop computes the torques itself as well.",
+            single.figure(&["cells"]),
+            single.switched_s().unwrap_or(f64::NAN)
+        ))
+        .text(
             "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
              the cell loads, so they hold nothing of what was on its way; the curves are what the loop had at each tick. \
              The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
-             compared."
-                .to_owned(),
-            bare(single),
-        ],
-        figures: (0..single.joints).map(joint).collect(),
-        findings: vec![
-            Finding::less_is_better("mean error of a cell's torque, Q3.12", nm(paper::SINGLE_NM), nm(mean_single))
-                .must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
-            Finding::less_is_better("mean error of the summed torque, Q7.8", nm(paper::SUMMED_NM), nm(mean_summed)),
+             compared.",
+        )
+        .text(bare(single))
+        .figures((0..single.joints).map(joint))
+        .findings([
+            cell.must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
+            sum,
             single.replies(),
-            Finding::told(
-                format!("cells' torques that were in sums in time, of {summed_due}"),
-                Quantity::new(summed_in, ""),
-            ),
-        ],
-        tables: vec![Table {
-            title: "Errors against the central computation, Nm".to_owned(),
-            head: ["what", "mean", "greatest", "torques"].map(str::to_owned).to_vec(),
-            rows: vec![
-                row("single cells, Q3.12, loaded joints", single, "single"),
-                row("the same against unrounded parameters", single, "unquantised"),
-                row("the whole skin, sum of Q3.12 words", single, "whole"),
-                row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
-            ],
-        }],
-    }
+            Finding::told(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
+        ])
+        .tables([Table::new(
+            "Errors against the central computation, Nm",
+            ["what", "mean", "greatest", "torques"],
+            rows,
+        )])
 }
 
 /// Which joints bear nothing.
@@ -153,43 +149,19 @@ pub fn fig7(run: &Run) -> Section {
     };
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
-    Section {
-        name: "fig7".to_owned(),
-        title: "Fig. 7: joint velocities and active cells".to_owned(),
-        text: vec![
-            "The same run. The arm moves because the cells' torques say so: the loop uses theirs only."
-                .to_owned(),
-        ],
-        figures: vec![
-            Figure {
-                name: "fig7-velocities".to_owned(),
-                title: "Joint velocities".to_owned(),
-                x: time(),
-                y: Axis::new("velocity", "rad/s"),
-                series: (0..run.joints).map(velocity).collect(),
-                marks: run.switched(),
-                ..Figure::default()
-            },
-            Figure {
-                name: "fig7-active".to_owned(),
-                title: "Active cells".to_owned(),
-                x: time(),
-                y: Axis::new("cells in the torque", ""),
-                series: vec![Series::new(
-                    "active cells",
-                    Shape::Steps,
-                    run.over_time(|row| f64::from(row.contributing)),
-                )],
-                marks: run.switched(),
-                ..Figure::default()
-            },
-        ],
-        findings: vec![
-            Finding::told("most cells active at once", Quantity::new(f64::from(active), "cells")),
-            Finding::told("greatest joint velocity", Quantity::new(fastest, "rad/s")),
-        ],
-        tables: Vec::new(),
-    }
+    let velocities = run.drawn("fig7-velocities", "Joint velocities", Axis::new("velocity", "rad/s"));
+    let cells = run.drawn("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
+    let contributing = run.over_time(|row| f64::from(row.contributing));
+    Section::new("fig7", "Fig. 7: joint velocities and active cells")
+        .text("The same run. The arm moves because the cells' torques say so: the loop uses theirs only.")
+        .figures([
+            velocities.series((0..run.joints).map(velocity)),
+            cells.draw("active cells", Shape::Steps, contributing),
+        ])
+        .findings([
+            Finding::told("most cells active at once", (f64::from(active), "cells")),
+            Finding::told("greatest joint velocity", (fastest, "rad/s")),
+        ])
 }
 
 /// Cycles of which the median is drawn.
@@ -220,15 +192,9 @@ pub fn fig8(run: &Run) -> Section {
     };
     let beyond = run.rows.iter().filter(|row| row.took_us > top).count();
     let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
-    let us = |value| Quantity::new(value, "µs");
-    let figure = |name: &str, title: &str, top, series| Figure {
-        name: name.to_owned(),
-        title: title.to_owned(),
-        x: time(),
-        y: Axis::new("time in a cycle", "µs").between(0.0, top),
-        series,
-        marks: run.switched(),
-        ..Figure::default()
+    let us = |value| (value, "µs");
+    let figure = |name: &str, title: &str, top| {
+        run.drawn(name, title, Axis::new("time in a cycle", "µs").between(0.0, top))
     };
     let medians = |time: &dyn Fn(&Row) -> f64| {
         let pieces = run.rows.chunks(TOGETHER).filter_map(|rows| Some((rows.first()?.time_s, rows)));
@@ -238,62 +204,51 @@ pub fn fig8(run: &Run) -> Section {
         let frames = run.figure(&["buses", "0", "uplink", "delivered"]);
         run.figure(&["processor", "gateway"]) * run.figure(&["duration_s"]) * 1e6 / frames
     };
-    let mut findings = vec![
-        Finding::less_is_better(
-            format!("mean T_skin while none of {cells} cells is active"),
-            us((paper::CELL_S * cells + paper::FIXED_S) * 1e6),
-            us(none_active),
-        ),
-        Finding::told("T_skin after the switch, greatest", us(off)).beside(us(0.0)).must("0", off <= 0.0),
-        Finding::told("T_total before the switch, median", us(total[0])),
-        Finding::less_is_better("T_total after the switch, median", us(paper::REST_S * 1e6), us(total[1]))
-            .must("less than before", total[1] < total[0]),
-    ];
-    findings.extend(slope.map(|line| {
+    let none = Finding::less_is_better(
+        format!("mean T_skin while none of {cells} cells is active"),
+        us((paper::CELL_S * cells + paper::FIXED_S) * 1e6),
+        us(none_active),
+    );
+    let after_switch =
+        Finding::less_is_better("T_total after the switch, median", us(paper::REST_S * 1e6), us(total[1]));
+    let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
         Finding::told("T_total after the switch for each active cell", slope)
-    }));
-    findings.push(Finding::told("ticks above 2 ms", Quantity::new(count(over), "")));
-    findings.push(Finding::told(
-        "all of the gateway's processor time by frames that came: socket, loop, recorder",
-        us(per_frame),
-    ));
-    Section {
-        name: "fig8".to_owned(),
-        title: format!("Fig. 8: cycle times, {cells} cells"),
-        text: vec![
+    });
+    let took = |row: &Row| row.took_us;
+    let central = |row: &Row| row.central_us;
+    Section::new("fig8", format!("Fig. 8: cycle times, {cells} cells"))
+        .text(
             "T_total is how long a tick took from reading the sums to handing on its record, T_skin the central computation in \
-             it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated."
-                .to_owned(),
-            format!(
-                "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine did something else, lie \
-                 beyond and are in the data.",
-                run.rows.len()
+             it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated.",
+        )
+        .text(format!(
+            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine did something else, lie \
+             beyond and are in the data.",
+            run.rows.len()
+        ))
+        .figures([
+            figure("fig8", "Cycle times", top)
+                .draw("T_total", Shape::Line, run.over_time(took))
+                .draw("T_skin", Shape::Line, run.over_time(central)),
+            figure("fig8-medians", "The same, medians of 25 cycles", top / 2.0)
+                .draw("T_total", Shape::Steps, medians(&took))
+                .draw("T_skin", Shape::Steps, medians(&central)),
+        ])
+        .findings([
+            none,
+            Finding::told("T_skin after the switch, greatest", us(off)).beside(us(0.0)).must("0", off <= 0.0),
+            Finding::told("T_total before the switch, median", us(total[0])),
+            after_switch.must("less than before", total[1] < total[0]),
+        ])
+        .findings(of_active)
+        .findings([
+            Finding::told("ticks above 2 ms", count(over)),
+            Finding::told(
+                "all of the gateway's processor time by frames that came: socket, loop, recorder",
+                us(per_frame),
             ),
-        ],
-        figures: vec![
-            figure(
-                "fig8",
-                "Cycle times",
-                top,
-                vec![
-                    Series::new("T_total", Shape::Line, run.over_time(|row| row.took_us)),
-                    Series::new("T_skin", Shape::Line, run.over_time(|row| row.central_us)),
-                ],
-            ),
-            figure(
-                "fig8-medians",
-                "The same, medians of 25 cycles",
-                top / 2.0,
-                vec![
-                    Series::new("T_total", Shape::Steps, medians(&|row| row.took_us)),
-                    Series::new("T_skin", Shape::Steps, medians(&|row| row.central_us)),
-                ],
-            ),
-        ],
-        findings,
-        tables: Vec::new(),
-    }
+        ])
 }
 
 /// Median times of ticks over active cells, by the number of ticks.
@@ -302,11 +257,7 @@ fn over_active<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<Line> {
     for row in rows {
         by_active.entry(row.contributing).or_default().push(row.took_us);
     }
-    let points = by_active.into_iter().map(|(active, mut times)| Weighted {
-        x: f64::from(active),
-        y: quantile(&mut times, 0.5),
-        weight: count(times.len()),
-    });
+    let points = by_active.iter_mut().map(|(&active, times)| Weighted::median(f64::from(active), times));
     Line::through(&points.collect::<Vec<_>>())
 }
 

@@ -12,7 +12,7 @@ use rand_pcg::Pcg64Mcg;
 use super::line::count;
 use super::tree::{Came, Tree};
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Series, Shape, Table, number};
+use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Table, number};
 
 /// Numbers of active cells; the paper's arm had about twenty.
 const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
@@ -135,79 +135,59 @@ fn averaged(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -
     (mean, last)
 }
 
+/// A column of [`Errors`]: its label, what a finding of it says, and its value.
+type Way = (&'static str, &'static str, fn(&Errors) -> f64);
+
+/// Each way to sum.
+const WAYS: [Way; 5] = [
+    ("truncated", "each cut off, mean error", |at| at.truncated),
+    ("rounded", "rounded, mean error", |at| at.rounded),
+    ("carried", "carried, mean error of single epochs", |at| at.carried),
+    ("rounded, average of 32", "rounded, mean error of the average over 32 epochs", |at| at.rounded_average),
+    ("carried, average of 32", "carried, mean error of the average over 32 epochs", |at| at.carried_average),
+];
+
 /// Errors over the number of active cells.
 #[must_use]
 pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
     let of = skin.cells.len();
-    let series = |label: &str, error: fn(&Errors) -> f64| {
+    let figure = Figure::new(
+        "sums",
+        format!("Mean error of the summed torque over active cells of {of}, Q7.8, loaded joints"),
+        Axis::new("active cells", "").log().between(0.9, 300.0),
+        Axis::new("mean absolute error", "Nm").log().between(1e-5, 1.0),
+    );
+    let series = WAYS.map(|(label, _, error)| {
         let points = errors.iter().map(|errors| (count(errors.active), error(errors))).collect();
         Series::new(label, Shape::Line, points)
-    };
-    let single = Figure {
-        name: "sums".to_owned(),
-        title: format!("Mean error of the summed torque over active cells of {of}, Q7.8, loaded joints"),
-        x: Axis::new("active cells", "").log().between(0.9, 300.0),
-        y: Axis::new("mean absolute error", "Nm").log().between(1e-5, 1.0),
-        series: vec![
-            series("truncated", |errors| errors.truncated),
-            series("rounded", |errors| errors.rounded),
-            series("carried", |errors| errors.carried),
-            series("rounded, average of 32", |errors| errors.rounded_average),
-            series("carried, average of 32", |errors| errors.carried_average),
-        ],
-        ..Figure::default()
-    };
-    let mut findings = Vec::new();
-    if let Some(at) = errors.iter().find(|errors| errors.active == FOUND_AT) {
-        let summed = |what: &str, ours| {
+    });
+    let at = errors.iter().filter(|errors| errors.active == FOUND_AT).take(1);
+    let findings = at.flat_map(|at| {
+        WAYS.map(|(label, what, error)| {
             let what = format!("sum of {FOUND_AT} active cells of {of}, {what}");
-            Finding::less_is_better(what, Quantity::new(paper::SUMMED_NM, "Nm"), Quantity::new(ours, "Nm"))
-        };
-        findings.push(summed("each cut off, mean error", at.truncated));
-        findings
-            .push(summed("rounded, mean error", at.rounded).must("at most 0.005 Nm", at.rounded <= 0.005));
-        findings.push(summed("carried, mean error of single epochs", at.carried));
-        findings.push(summed("rounded, mean error of the average over 32 epochs", at.rounded_average));
-        findings.push(summed("carried, mean error of the average over 32 epochs", at.carried_average));
-    }
-    Section {
-        name: "sums".to_owned(),
-        title: "Sums along the tree: cutting off, rounding, carrying".to_owned(),
-        text: vec![
+            let found = Finding::less_is_better(what, (paper::SUMMED_NM, "Nm"), (error(at), "Nm"));
+            if label == "rounded" { found.at_most(0.005) } else { found }
+        })
+    });
+    let rows = errors.iter().map(|at| {
+        let errors = WAYS.map(|(_, _, error)| number(error(at)));
+        core::iter::once(at.active.to_string()).chain(errors).collect::<Vec<_>>()
+    });
+    let [a, b, c, d, e] = WAYS.map(|(label, ..)| label);
+    Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
+        .text(
             "Random cells feel 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
              microcontroller. A cell that cuts off what Q7.8 has no room for errs by half a step of 0.0039 Nm to the same \
              side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
-             carries what rounding took away into its next value errs more in one epoch and not at all in the long run."
-                .to_owned(),
-            format!(
-                "The paper's {} Nm is what cutting off gives for about twenty active cells.",
-                number(paper::SUMMED_NM)
-            ),
-        ],
-        figures: vec![single],
-        findings,
-        tables: vec![Table {
-            title: "Mean absolute error in Nm".to_owned(),
-            head: [
-                "active cells",
-                "truncated",
-                "rounded",
-                "carried",
-                "rounded, average of 32",
-                "carried, average of 32",
-            ]
-            .map(str::to_owned)
-            .to_vec(),
-            rows: errors
-                .iter()
-                .map(|at| {
-                    let errors =
-                        [at.truncated, at.rounded, at.carried, at.rounded_average, at.carried_average];
-                    core::iter::once(at.active.to_string()).chain(errors.map(number)).collect()
-                })
-                .collect(),
-        }],
-    }
+             carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",
+        )
+        .text(format!(
+            "The paper's {} Nm is what cutting off gives for about twenty active cells.",
+            number(paper::SUMMED_NM)
+        ))
+        .figures([figure.series(series)])
+        .findings(findings)
+        .tables([Table::new("Mean absolute error in Nm", ["active cells", a, b, c, d, e], rows)])
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ const LOOK: Duration = Duration::from_millis(50);
 impl Benches {
     /// Runs `gateway run` on the arm and reads what it recorded.
     pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
-        let name = reply.name();
+        let name = arm::name(reply);
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
         let failed = |path: &Path, error: &dyn std::fmt::Display| {
             Failure::run(format!("the bench of the moving arm ({name}): {}: {error}", path.display()))

@@ -34,6 +34,42 @@ pub struct Section {
     pub tables: Vec<Table>,
 }
 
+impl Section {
+    /// A section that says nothing yet.
+    #[must_use]
+    pub fn new(name: &str, title: impl Into<String>) -> Self {
+        Self { name: name.to_owned(), title: title.into(), ..Self::default() }
+    }
+
+    /// The same with one more paragraph.
+    #[must_use]
+    pub fn text(mut self, paragraph: impl Into<String>) -> Self {
+        self.text.push(paragraph.into());
+        self
+    }
+
+    /// The same with more figures.
+    #[must_use]
+    pub fn figures(mut self, figures: impl IntoIterator<Item = Figure>) -> Self {
+        self.figures.extend(figures);
+        self
+    }
+
+    /// The same with more findings.
+    #[must_use]
+    pub fn findings(mut self, findings: impl IntoIterator<Item = Finding>) -> Self {
+        self.findings.extend(findings);
+        self
+    }
+
+    /// The same with more tables.
+    #[must_use]
+    pub fn tables(mut self, tables: impl IntoIterator<Item = Table>) -> Self {
+        self.tables.extend(tables);
+        self
+    }
+}
+
 /// One diagram.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Figure {
@@ -56,6 +92,40 @@ pub struct Figure {
 impl Figure {
     /// Colours that can be told apart; series beyond these begin with the first again.
     pub const COLOURS: usize = 7;
+
+    /// A figure of the page's width in which nothing is drawn yet.
+    #[must_use]
+    pub fn new(name: impl Into<String>, title: impl Into<String>, x: Axis, y: Axis) -> Self {
+        Self { name: name.into(), title: title.into(), x, y, ..Self::default() }
+    }
+
+    /// The same of half the width.
+    #[must_use]
+    pub const fn half(mut self) -> Self {
+        self.size = Size::Half;
+        self
+    }
+
+    /// The same with one more series; see [`Series`].
+    #[must_use]
+    pub fn draw(mut self, label: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
+        self.series.push(Series::new(label, shape, points));
+        self
+    }
+
+    /// The same with more series.
+    #[must_use]
+    pub fn series(mut self, series: impl IntoIterator<Item = Series>) -> Self {
+        self.series.extend(series);
+        self
+    }
+
+    /// The same with more marks.
+    #[must_use]
+    pub fn marks(mut self, marks: impl IntoIterator<Item = Mark>) -> Self {
+        self.marks.extend(marks);
+        self
+    }
 }
 
 /// How much of a page a figure takes.
@@ -169,6 +239,20 @@ pub struct Mark {
     pub label: String,
 }
 
+impl Mark {
+    /// An upright line.
+    #[must_use]
+    pub fn x(at: f64, label: impl Into<String>) -> Self {
+        Self { on: On::X, at, label: label.into() }
+    }
+
+    /// A level line.
+    #[must_use]
+    pub fn y(at: f64, label: impl Into<String>) -> Self {
+        Self { on: On::Y, at, label: label.into() }
+    }
+}
+
 /// An axis.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub enum On {
@@ -196,29 +280,47 @@ pub struct Finding {
 impl Finding {
     /// A number of which less is better: within 5 % of the paper's it is the same.
     #[must_use]
-    pub fn less_is_better(what: impl Into<String>, paper: Quantity, ours: Quantity) -> Self {
+    pub fn less_is_better(
+        what: impl Into<String>,
+        paper: impl Into<Quantity>,
+        ours: impl Into<Quantity>,
+    ) -> Self {
+        let (paper, ours) = (paper.into(), ours.into());
         let verdict = Verdict::less_is_better(paper.value, ours.value);
-        Self { what: what.into(), paper: Some(paper), ours, bar: None, verdict }
+        Self { verdict, ..Self::told(what, ours).beside(paper) }
     }
 
     /// A number of which more is better: within 5 % of the paper's it is the same.
     #[must_use]
-    pub fn more_is_better(what: impl Into<String>, paper: Quantity, ours: Quantity) -> Self {
+    pub fn more_is_better(
+        what: impl Into<String>,
+        paper: impl Into<Quantity>,
+        ours: impl Into<Quantity>,
+    ) -> Self {
+        let (paper, ours) = (paper.into(), ours.into());
         let verdict = Verdict::less_is_better(ours.value, paper.value);
-        Self { what: what.into(), paper: Some(paper), ours, bar: None, verdict }
+        Self { verdict, ..Self::told(what, ours).beside(paper) }
     }
 
     /// A number that is told and not judged.
     #[must_use]
-    pub fn told(what: impl Into<String>, ours: Quantity) -> Self {
-        Self { what: what.into(), paper: None, ours, bar: None, verdict: Verdict::Told }
+    pub fn told(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
+        Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Told }
     }
 
     /// The same, told beside the paper's: of what is no better for being more or less.
     #[must_use]
-    pub fn beside(mut self, paper: Quantity) -> Self {
-        self.paper = Some(paper);
+    pub fn beside(mut self, paper: impl Into<Quantity>) -> Self {
+        self.paper = Some(paper.into());
         self
+    }
+
+    /// The same, judged by a limit in its own unit.
+    #[must_use]
+    pub fn at_most(self, limit: f64) -> Self {
+        let unit = if self.ours.unit.is_empty() { String::new() } else { format!(" {}", self.ours.unit) };
+        let kept = self.ours.value <= limit;
+        self.must(format!("at most {limit}{unit}"), kept)
     }
 
     /// The same, judged by whether it holds what it must: kept or better is [`Verdict::Better`].
@@ -297,6 +399,19 @@ impl Quantity {
     }
 }
 
+impl<T: Into<String>> From<(f64, T)> for Quantity {
+    fn from((value, unit): (f64, T)) -> Self {
+        Self::new(value, unit)
+    }
+}
+
+impl From<f64> for Quantity {
+    /// A number of things.
+    fn from(value: f64) -> Self {
+        Self::new(value, "")
+    }
+}
+
 impl fmt::Display for Quantity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&number(self.value))?;
@@ -316,6 +431,19 @@ pub struct Table {
     pub head: Vec<String>,
     /// As many cells in each row as there are headings. What reads as a number stands to the right.
     pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// A table of some columns.
+    #[must_use]
+    pub fn new<const N: usize>(
+        title: impl Into<String>,
+        head: [&str; N],
+        rows: impl IntoIterator<Item: Into<Vec<String>>>,
+    ) -> Self {
+        let rows = rows.into_iter().map(Into::into).collect();
+        Self { title: title.into(), head: head.map(str::to_owned).into(), rows }
+    }
 }
 
 /// A number for people: whole ones below a million as they are, else at most three significant digits; very

@@ -21,7 +21,7 @@ pub fn html(page: &Page) -> String {
          <style>\n{STYLE}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
         svg::dark()
     );
-    paragraph(&mut out, "", &page.intro);
+    paragraph(&mut out, &page.intro);
     out.push_str("</header>\n");
     if page.sections.len() > 2 {
         out.push_str("<nav><ul>\n");
@@ -47,10 +47,9 @@ pub fn html(page: &Page) -> String {
     out
 }
 
-fn paragraph(out: &mut String, class: &str, text: &str) {
+fn paragraph(out: &mut String, text: &str) {
     if !text.is_empty() {
-        let class = if class.is_empty() { String::new() } else { format!(" class=\"{class}\"") };
-        let _ = writeln!(out, "<p{class}>{}</p>", svg::escaped(text));
+        let _ = writeln!(out, "<p>{}</p>", svg::escaped(text));
     }
 }
 
@@ -58,7 +57,7 @@ fn section(out: &mut String, section: &Section) {
     let (name, title) = (svg::escaped(&section.name), svg::escaped(&section.title));
     let _ = writeln!(out, "<section id=\"{name}\">\n<h2>{title}</h2>");
     for text in &section.text {
-        paragraph(out, "", text);
+        paragraph(out, text);
     }
     if !section.findings.is_empty() {
         findings(out, &section.findings);
@@ -90,45 +89,36 @@ fn figure(out: &mut String, figure: &Figure) {
     let _ = writeln!(out, "<figcaption>{}</figcaption>\n</figure>", svg::escaped(&figure.title));
 }
 
+/// The attribute of what stands to the right.
+const NUMBER: &str = " class=\"n\"";
+
 fn findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
     let bar = findings.iter().any(|finding| finding.bar.is_some());
-    out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead><tr><th>figure</th>");
-    if paper {
-        out.push_str("<th class=\"n\">paper</th>");
-    }
-    out.push_str("<th class=\"n\">here</th>");
-    if bar {
-        out.push_str("<th>must be</th>");
-    }
-    if paper || bar {
-        out.push_str("<th></th>");
-    }
-    out.push_str("</tr></thead>\n<tbody>\n");
+    let shown = [true, paper, true, bar, paper || bar];
+    out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
+    let head = [("figure", ""), ("paper", NUMBER), ("here", NUMBER), ("must be", ""), ("", "")];
+    row(out, "th", some(head, shown));
+    out.push_str("</thead>\n<tbody>\n");
     for finding in findings {
-        let _ = write!(out, "<tr><td>{}</td>", svg::escaped(&finding.what));
-        if paper {
-            let paper = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
-            let _ = write!(out, "<td class=\"n\" data-head=\"paper\">{}</td>", svg::escaped(&paper));
-        }
-        let ours = svg::escaped(&finding.ours.to_string());
-        let _ = write!(out, "<td class=\"n\" data-head=\"here\">{ours}</td>");
-        if bar {
-            let bar = svg::escaped(finding.bar.as_deref().unwrap_or_default());
-            let _ = write!(out, "<td class=\"bar\" data-head=\"must be\">{bar}</td>");
-        }
-        if paper || bar {
-            let (class, text) = match (finding.verdict, &finding.bar) {
-                (Verdict::Better, None) => ("better", "✓ better"),
-                (Verdict::Better, Some(_)) => ("better", "✓ holds"),
-                (Verdict::Same, _) => ("same", "= the same"),
-                (Verdict::Worse, None) => ("worse", "✗ worse"),
-                (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
-                (Verdict::Told, _) => ("told", ""),
-            };
-            let _ = write!(out, "<td class=\"verdict {class}\">{text}</td>");
-        }
-        out.push_str("</tr>\n");
+        let (class, verdict) = match (finding.verdict, &finding.bar) {
+            (Verdict::Better, None) => ("better", "✓ better"),
+            (Verdict::Better, Some(_)) => ("better", "✓ holds"),
+            (Verdict::Same, _) => ("same", "= the same"),
+            (Verdict::Worse, None) => ("worse", "✗ worse"),
+            (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
+            (Verdict::Told, _) => ("told", ""),
+        };
+        let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
+        let cells: [(&str, &str); 5] = [
+            (&finding.what, ""),
+            (&papers, " class=\"n\" data-head=\"paper\""),
+            (&finding.ours.to_string(), " class=\"n\" data-head=\"here\""),
+            (finding.bar.as_deref().unwrap_or_default(), " class=\"bar\" data-head=\"must be\""),
+            (verdict, &format!(" class=\"verdict {class}\"")),
+        ];
+        row(out, "td", some(cells, shown));
+        out.push('\n');
     }
     out.push_str("</tbody>\n</table></div>\n");
 }
@@ -138,21 +128,31 @@ fn table(out: &mut String, table: &Table) {
     if !table.title.is_empty() {
         let _ = writeln!(out, "<caption>{}</caption>", svg::escaped(&table.title));
     }
-    let right: Vec<bool> = (0..table.head.len()).map(|column| numbers(table, column)).collect();
-    let class = |column: usize| if right.get(column) == Some(&true) { " class=\"n\"" } else { "" };
-    out.push_str("<thead><tr>");
-    for (column, head) in table.head.iter().enumerate() {
-        let _ = write!(out, "<th{}>{}</th>", class(column), svg::escaped(head));
-    }
-    out.push_str("</tr></thead>\n<tbody>\n");
-    for row in &table.rows {
-        out.push_str("<tr>");
-        for (column, cell) in row.iter().enumerate() {
-            let _ = write!(out, "<td{}>{}</td>", class(column), svg::escaped(cell));
-        }
-        out.push_str("</tr>\n");
+    let columns = 0..table.head.len();
+    let classes: Vec<_> = columns.map(|column| if numbers(table, column) { NUMBER } else { "" }).collect();
+    let classes = || classes.iter().copied().chain(std::iter::repeat(""));
+    out.push_str("<thead>");
+    row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
+    out.push_str("</thead>\n<tbody>\n");
+    for cells in &table.rows {
+        row(out, "td", cells.iter().map(String::as_str).zip(classes()));
+        out.push('\n');
     }
     out.push_str("</tbody>\n</table></div>\n");
+}
+
+/// Those of some columns that are shown.
+fn some<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Item = T> {
+    cells.into_iter().zip(shown).filter(|(_, shown)| *shown).map(|(cell, _)| cell)
+}
+
+/// A row of a table: the text of each cell, and its attributes.
+fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
+    out.push_str("<tr>");
+    for (text, attributes) in cells {
+        let _ = write!(out, "<{tag}{attributes}>{}</{tag}>", svg::escaped(text));
+    }
+    out.push_str("</tr>");
 }
 
 /// Whether a column holds numbers, and stands to the right.

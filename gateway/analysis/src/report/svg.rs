@@ -270,7 +270,7 @@ fn runs(points: impl Iterator<Item = (f64, f64)>) -> Vec<Vec<(f64, f64)>> {
 }
 
 /// A line that holds each value until the next one.
-fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut stairs = Vec::with_capacity(points.len() * 2);
     for point in points {
         if let Some(&(_, held)) = stairs.last() {

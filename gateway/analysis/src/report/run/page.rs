@@ -6,7 +6,7 @@ mod bus;
 use super::Run;
 use super::lane::Lane;
 use crate::paper;
-use crate::report::figure::{Axis, Finding, Mark, On, Page, Quantity, Section, Series, Shape, number};
+use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number};
 use crate::report::thin::Thinned;
 use model::table::{Accuracy, Uplink};
 
@@ -57,18 +57,18 @@ impl Draft<'_> {
         Series::new(label, Shape::Line, self.points(thinned))
     }
 
+    /// A figure of the page's width over the time of the run.
+    fn figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
+        Figure::new(name, title, self.time(), y)
+    }
+
     fn time(&self) -> Axis {
         let axis = Axis::new("time", "s");
         if self.run.motion.ticks > 1 { axis.between(0.0, self.run.motion.seconds()) } else { axis }
     }
 
     fn marks(&self) -> Vec<Mark> {
-        let mark = |(at, what): &(f64, &'static str)| Mark {
-            on: On::X,
-            at: at - self.zero,
-            label: (*what).to_owned(),
-        };
-        self.run.motion.turns.iter().map(mark).collect()
+        self.run.motion.turns.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
     }
 
     fn named(&self, lane: &Lane) -> String {
@@ -81,19 +81,16 @@ impl Draft<'_> {
         let mut findings = Vec::new();
         let accuracy = self.run.lanes.iter().map(|lane| lane.table.accuracy()).reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
-        let nm = |value| Quantity::new(value, "Nm");
         for (what, theirs, errors) in [
-            (
-                "torques of single cells, loaded joints: mean absolute error",
-                paper::SINGLE_NM,
-                accuracy.single,
-            ),
-            ("the whole skin's torque, all joints: mean absolute error", paper::SUMMED_NM, accuracy.whole),
-            ("sums along the tree, loaded joints: mean absolute error", paper::SUMMED_NM, accuracy.sums),
+            ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single),
+            ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole),
+            ("sums along the tree, loaded joints", paper::SUMMED_NM, accuracy.sums),
         ] {
-            if let Some(mean) = errors.mean() {
-                findings.push(Finding::less_is_better(what, nm(theirs), nm(mean)));
-            }
+            let finding = |mean| {
+                let what = format!("{what}: mean absolute error");
+                Finding::less_is_better(what, (theirs, "Nm"), (mean, "Nm"))
+            };
+            findings.extend(errors.mean().map(finding));
         }
         if !motion.central_ns.is_empty() {
             let median = motion.central_ns.value_at_quantile(0.5) as f64 * 1e-3;
@@ -106,59 +103,41 @@ impl Draft<'_> {
                 skin.cells.len(),
                 number((active * 10.0).round() / 10.0)
             );
-            findings.push(Finding::less_is_better(
-                what,
-                Quantity::new(law, "µs"),
-                Quantity::new(median, "µs"),
-            ));
+            findings.push(Finding::less_is_better(what, (law, "µs"), (median, "µs")));
         }
-        let cells = Quantity::new(skin.cells.len() as f64, "");
-        findings.push(Finding::told("cells", cells).beside(Quantity::new(PAPER_CELLS, "")));
+        findings.push(Finding::told("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
         if motion.seconds() > 0.0 {
-            let hertz =
-                |count: u64, seconds: f64| Quantity::new(count.saturating_sub(1) as f64 / seconds, "Hz");
+            let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             let loop_hz = hertz(motion.ticks.saturating_add(motion.unrecorded), motion.seconds());
-            findings
-                .push(Finding::told("control loop", loop_hz).beside(Quantity::new(PAPER_CONTROL_HZ, "Hz")));
+            findings.push(Finding::told("control loop", loop_hz).beside((PAPER_CONTROL_HZ, "Hz")));
             let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
-                let hertz = hertz(count, last - first);
-                findings.push(Finding::told("joints", hertz).beside(Quantity::new(PAPER_BROADCAST_HZ, "Hz")));
+                let finding = Finding::told("joints", hertz(count, last - first));
+                findings.push(finding.beside((PAPER_BROADCAST_HZ, "Hz")));
             }
-            let none = motion.skipped == 0;
-            findings.push(Finding::told("ticks skipped", count(motion.skipped)).must("none", none));
+            findings.push(none("ticks skipped".to_owned(), motion.skipped));
         }
         let accounts = self.run.lanes.iter().map(Lane::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
             let what = format!("replies not there before the next joints, of {due} that were due");
-            findings.push(Finding::told(what, count(due - in_time)).must("none", in_time == due));
+            findings.push(none(what, due - in_time));
         }
         findings.extend(self.fits());
         let uplink =
             Uplink::total(self.run.lanes.iter().flat_map(|lane| lane.table.cells()).map(|cell| cell.uplink));
-        findings.push(
-            Finding::told("packets of cells lost, by their own count", count(uplink.lost))
-                .must("none", uplink.lost == 0),
-        );
-        let text = vec![
+        findings.push(none("packets of cells lost, by their own count".to_owned(), uplink.lost));
+        Section::new("summary", "In numbers").findings(findings).text(
             "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
-             5 % of the paper's, a number is the same."
-                .to_owned(),
-        ];
-        Section {
-            name: "summary".to_owned(),
-            title: "In numbers".to_owned(),
-            text,
-            findings,
-            ..Section::default()
-        }
+             5 % of the paper's, a number is the same.",
+        )
     }
 }
 
-fn count(count: u64) -> Quantity {
-    Quantity::new(count as f64, "")
+/// What must not be there at all.
+fn none(what: String, count: u64) -> Finding {
+    Finding::told(what, count as f64).must("none", count == 0)
 }
 
 fn several(count: usize, one: &str, more: &str) -> String {
@@ -167,47 +146,35 @@ fn several(count: usize, one: &str, more: &str) -> String {
 
 /// What it came about with.
 fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
-    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown").to_owned();
-    let machine = format!(
-        "{} {} on {}, {} processors",
-        fact("machine", "sysname"),
-        fact("machine", "release"),
-        fact("machine", "machine"),
-        fact("machine", "processors")
+    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown");
+    let [machine, program] = ["machine", "program"].map(|record| move |key: &str| fact(record, key));
+    let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc);
+    let idle = run.fact("machine", "idle_late_p50_us").map(|idle| {
+        let (p99, max) = (machine("idle_late_p99_us"), machine("idle_late_max_us"));
+        format!("woke a thread {idle} µs late (median), 99 % within {p99} µs, at most {max} µs")
+    });
+    let clock = format!(
+        "{}, of {}; wall clock in steps of {} ns",
+        machine("clocksource"),
+        machine("clocksources"),
+        machine("realtime_resolution_ns")
     );
-    let mut facts = vec![
-        ("run's command".to_owned(), fact("program", "command_line")),
-        (
-            "program".to_owned(),
-            format!("{}, revision {}", fact("program", "program"), fact("program", "git_revision")),
-        ),
-        ("began".to_owned(), fact("program", "began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc)),
-        ("machine".to_owned(), machine),
-        (
-            "clock".to_owned(),
-            format!(
-                "{}, of {}; wall clock in steps of {} ns",
-                fact("machine", "clocksource"),
-                fact("machine", "clocksources"),
-                fact("machine", "realtime_resolution_ns")
-            ),
-        ),
-        (
-            "recording".to_owned(),
-            format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes),
-        ),
-        ("report's command".to_owned(), command.to_owned()),
+    let kernel = [machine("sysname"), machine("release"), "on", machine("machine")].join(" ");
+    let configuration = run.metadata.iter().find(|(name, _)| name == "configuration").map(|(_, facts)| {
+        facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join("; ")
+    });
+    let facts = [
+        ("run's command", Some(program("command_line").to_owned())),
+        ("program", Some(format!("{}, revision {}", program("program"), program("git_revision")))),
+        ("began", Some(began)),
+        ("machine", Some(format!("{kernel}, {} processors", machine("processors")))),
+        ("clock", Some(clock)),
+        ("idle machine", idle),
+        ("recording", Some(format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes))),
+        ("report's command", Some(command.to_owned())),
+        ("configuration", configuration),
     ];
-    if let Some(idle) = run.fact("machine", "idle_late_p50_us") {
-        let (p99, max) = (fact("machine", "idle_late_p99_us"), fact("machine", "idle_late_max_us"));
-        let text = format!("woke a thread {idle} µs late (median), 99 % within {p99} µs, at most {max} µs");
-        facts.insert(5, ("idle machine".to_owned(), text));
-    }
-    let configuration = run.metadata.iter().find(|(name, _)| name == "configuration");
-    let pairs = configuration
-        .map(|(_, facts)| facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>());
-    facts.extend(pairs.map(|pairs| ("configuration".to_owned(), pairs.join("; "))));
-    facts
+    facts.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
 }
 
 /// A time in ns since 1970 as people write it (Hinnant's `civil_from_days`).

@@ -4,7 +4,7 @@ use protocol::packet::WORDS;
 
 use super::Draft;
 use crate::paper;
-use crate::report::figure::{Axis, Figure, Mark, On, Section, Series, Shape, Size, Table, number};
+use crate::report::figure::{Axis, Mark, Section, Shape, Table, number};
 use crate::report::thin::Thinned;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
@@ -14,49 +14,29 @@ impl Draft<'_> {
     pub(super) fn torque(&self) -> Section {
         let motion = &self.run.motion;
         let pairs = motion.distributed.iter().zip(&motion.central).enumerate();
-        let figures = pairs.map(|(joint, (distributed, central))| Figure {
-            name: format!("torque-joint{}", joint + 1),
-            title: format!("Joint {}: what the cells say together, and what the gateway computes", joint + 1),
-            size: Size::Half,
-            x: self.time(),
-            y: Axis::new("torque", "Nm"),
-            series: vec![
-                self.line("distributed", distributed),
-                Series::new("central", Shape::Dashed, self.points(central)),
-            ],
-            marks: Vec::new(),
+        let figures = pairs.map(|(joint, (distributed, central))| {
+            let joint = joint + 1;
+            let title = format!("Joint {joint}: what the cells say together, and what the gateway computes");
+            self.figure(format!("torque-joint{joint}"), title, Axis::new("torque", "Nm"))
+                .half()
+                .series([self.line("distributed", distributed)])
+                .draw("central", Shape::Dashed, self.points(central))
         });
-        let mut figures: Vec<_> = figures.collect();
         let errors: Vec<_> = self.run.lanes.iter().filter(|lane| lane.error.count() > 0).collect();
-        if !errors.is_empty() {
-            let papers = |format: &str, mean| Mark {
-                on: On::Y,
-                at: mean,
-                label: format!("paper, {format}: {} Nm", number(mean)),
-            };
-            figures.push(Figure {
-                name: "torque-error".to_owned(),
-                title: "Mean absolute error of an epoch that all cells answered in time".to_owned(),
-                size: Size::Wide,
-                x: self.time(),
-                y: Axis::new("error", "Nm").log(),
-                series: errors.iter().map(|lane| self.line(self.named(lane), &lane.error)).collect(),
-                marks: vec![papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)],
-            });
-        }
-        let text = vec![
-            "The curves hold what has come at each tick: while a touch changes they differ by what is on its way. The \
-             errors below compare like with like: each torque with the central computation for the joints that it answers."
-                .to_owned(),
-        ];
-        Section {
-            name: "torque".to_owned(),
-            title: "Distributed and central torque".to_owned(),
-            text,
-            figures,
-            tables: self.errors().into_iter().collect(),
-            ..Section::default()
-        }
+        let error = (!errors.is_empty()).then(|| {
+            let papers = |format: &str, mean| Mark::y(mean, format!("paper, {format}: {} Nm", number(mean)));
+            let title = "Mean absolute error of an epoch that all cells answered in time";
+            self.figure("torque-error", title, Axis::new("error", "Nm").log())
+                .series(errors.iter().map(|lane| self.line(self.named(lane), &lane.error)))
+                .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
+        });
+        Section::new("torque", "Distributed and central torque")
+            .text(
+                "The curves hold what has come at each tick: while a touch changes they differ by what is on its way. The \
+                 errors below compare like with like: each torque with the central computation for the joints that it answers.",
+            )
+            .figures(figures.chain(error))
+            .tables(self.errors())
     }
 
     /// Errors joint by joint.
@@ -69,102 +49,58 @@ impl Draft<'_> {
             [mean, number(errors.max()), errors.count().to_string()]
         };
         let row = |name: String, single: &Errors, whole: &Errors| {
-            let cells = [name].into_iter().chain(text(single)).chain(text(whole));
-            cells.collect::<Vec<_>>()
+            [name].into_iter().chain(text(single)).chain(text(whole)).collect::<Vec<_>>()
         };
-        let mut rows: Vec<_> = single
-            .enumerate()
-            .map(|(joint, (single, whole))| row(format!("joint {}", joint + 1), single, whole))
-            .collect();
         if accuracy.single.count() == 0 {
             return None;
         }
-        rows.push(row("all".to_owned(), &accuracy.single, &accuracy.whole));
-        rows.push(vec![
-            "paper".to_owned(),
-            number(paper::SINGLE_NM),
-            String::new(),
-            String::new(),
-            number(paper::SUMMED_NM),
-            String::new(),
-            String::new(),
-        ]);
-        let head =
-            ["", "single cells: mean", "greatest", "torques", "whole skin: mean", "greatest", "epochs"];
-        Some(Table {
-            title: "Absolute errors in Nm, joint by joint: single cells where the joint carries them, and the whole skin's sum".to_owned(),
-            head: head.map(str::to_owned).into(),
-            rows,
-        })
+        let joints =
+            single.zip(1..).map(|((single, whole), joint)| row(format!("joint {joint}"), single, whole));
+        let all = row("all".to_owned(), &accuracy.single, &accuracy.whole);
+        let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(number);
+        let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
+        Some(Table::new(
+            "Absolute errors in Nm, joint by joint: single cells where the joint carries them, and the whole skin's sum",
+            ["", "single cells: mean", "greatest", "torques", "whole skin: mean", "greatest", "epochs"],
+            joints.chain([all, papers]),
+        ))
     }
 
     /// The paper's Fig. 7, and the positions.
     pub(super) fn motion(&self) -> Section {
-        let joints = |series: &[Thinned]| {
-            let named = series.iter().enumerate();
-            named.map(|(joint, series)| self.line(format!("joint {}", joint + 1), series)).collect::<Vec<_>>()
-        };
-        let figure = |name: &str, title: &str, y: Axis, series: &[Thinned]| Figure {
-            name: name.to_owned(),
-            title: title.to_owned(),
-            size: Size::Wide,
-            x: self.time(),
-            y,
-            series: joints(series),
-            marks: self.marks(),
+        let figure = |name: &str, title: &str, y: Axis, series: &[Thinned]| {
+            let joints = (1..).zip(series).map(|(joint, series)| self.line(format!("joint {joint}"), series));
+            self.figure(name, title, y).series(joints).marks(self.marks())
         };
         let motion = &self.run.motion;
-        let figures = vec![
+        Section::new("motion", "The arm").figures([
             figure("positions", "Joint positions", Axis::new("position", "rad"), &motion.position),
             figure("velocities", "Joint velocities", Axis::new("velocity", "rad/s"), &motion.velocity),
-        ];
-        Section { name: "motion".to_owned(), title: "The arm".to_owned(), figures, ..Section::default() }
+        ])
     }
 
     pub(super) fn cells(&self) -> Section {
         let motion = &self.run.motion;
-        let in_torque = Series::new("in the torque", Shape::Steps, self.points(&motion.contributing));
-        let active =
-            Series::new("in contact, by the central computation", Shape::Steps, self.points(&motion.active));
-        let figure = Figure {
-            name: "active-cells".to_owned(),
-            title: "Active cells: those whose torque is in the sum, and those that are in contact".to_owned(),
-            size: Size::Wide,
-            x: self.time(),
-            y: Axis::new("cells", ""),
-            series: vec![in_torque, active],
-            marks: self.marks(),
-        };
-        Section {
-            name: "cells".to_owned(),
-            title: "Active cells".to_owned(),
-            figures: vec![figure],
-            ..Section::default()
-        }
+        let title = "Active cells: those whose torque is in the sum, and those that are in contact";
+        let figure = self
+            .figure("active-cells", title, Axis::new("cells", ""))
+            .draw("in the torque", Shape::Steps, self.points(&motion.contributing))
+            .draw("in contact, by the central computation", Shape::Steps, self.points(&motion.active))
+            .marks(self.marks());
+        Section::new("cells", "Active cells").figures([figure])
     }
 
     /// The paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
-        let figure = |name: &str, title: &str, series: Vec<Series>| Figure {
-            name: name.to_owned(),
-            title: title.to_owned(),
-            size: Size::Wide,
-            x: self.time(),
-            y: Axis::new("time", "µs").log(),
-            series,
-            marks: self.marks(),
+        let figure = |name: &str, title: &str, series: &[(&str, &Thinned)]| {
+            let series = series.iter().map(|(label, thinned)| self.line(*label, thinned));
+            self.figure(name, title, Axis::new("time", "µs").log()).series(series).marks(self.marks())
         };
-        let figures = vec![
-            figure(
-                "cycle",
-                "How long each tick took, and the central computation in it",
-                vec![
-                    self.line("tick", &motion.took),
-                    self.line("central computation in it", &motion.central_took),
-                ],
-            ),
-            figure("lateness", "How late each tick began", vec![self.line("", &motion.late)]),
+        let took = [("tick", &motion.took), ("central computation in it", &motion.central_took)];
+        let figures = [
+            figure("cycle", "How long each tick took, and the central computation in it", &took),
+            figure("lateness", "How late each tick began", &[("", &motion.late)]),
         ];
         let rows = [
             ("tick began late", &motion.late_ns),
@@ -184,18 +120,10 @@ impl Draft<'_> {
             let cells = ["the idle machine's thread woke late", p50, "", p99, max, ""];
             rows.push(cells.map(str::to_owned).into());
         }
-        let head = ["µs", "median", "90 %", "99 %", "greatest", "values"].map(str::to_owned).into();
-        let table = Table { title: "The control loop".to_owned(), head, rows };
-        Section {
-            name: "cycle".to_owned(),
-            title: "Cycle times".to_owned(),
-            text: vec![
-                "The distributed computation has no part in a tick: the sum is kept while replies come."
-                    .to_owned(),
-            ],
-            figures,
-            tables: vec![table],
-            ..Section::default()
-        }
+        let head = ["µs", "median", "90 %", "99 %", "greatest", "values"];
+        Section::new("cycle", "Cycle times")
+            .text("The distributed computation has no part in a tick: the sum is kept while replies come.")
+            .figures(figures)
+            .tables([Table::new("The control loop", head, rows)])
     }
 }

@@ -3,9 +3,8 @@
 use super::super::lane::{Lane, Latency};
 use super::Draft;
 use crate::fit::verdict::{Answer, percent};
-use crate::report::figure::{
-    Axis, Figure, Finding, Mark, On, Quantity, Section, Series, Shape, Size, Table, number,
-};
+use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number};
+use crate::report::svg::stairs;
 use crate::report::thin::{Binned, Thinned};
 use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
@@ -16,54 +15,37 @@ const WORST: usize = 12;
 
 impl Draft<'_> {
     pub(super) fn replies(&self) -> Section {
-        let mut figures = Vec::new();
-        for lane in self.run.lanes.iter().filter(|lane| lane.account().due > 0) {
-            let name = &lane.name;
-            let steps =
-                |label: &str, thinned: &Thinned| Series::new(label, Shape::Steps, self.points(thinned));
-            let unit = if lane.sums { "cells in sums" } else { "replies" };
-            figures.push(Figure {
-                name: format!("replies-{name}"),
-                title: format!("{name}: {unit} due and in time, epoch by epoch"),
-                size: Size::Half,
-                x: self.time(),
-                y: Axis::new(unit, ""),
-                series: vec![steps("due", &lane.due), steps("in time", &lane.in_time)],
-                marks: Vec::new(),
-            });
-            let lost = lane.account().late + lane.account().missing;
-            let y = Axis::new(unit, "");
-            figures.push(Figure {
-                name: format!("late-{name}"),
-                title: format!("{name}: {unit} late and missing, when that was settled"),
-                size: Size::Half,
-                x: self.time(),
-                y: if lost == 0 { y.between(0.0, 1.0) } else { y },
-                series: vec![steps("late", &lane.late), steps("missing", &lane.missing)],
-                marks: Vec::new(),
-            });
-            figures.push(Figure {
-                name: format!("slowest-{name}"),
-                title: format!("{name}: from joints to the last reply for them, epoch by epoch"),
-                size: Size::Wide,
-                x: self.time(),
-                y: Axis::new("time", "ms"),
-                series: vec![self.line("", &lane.slowest)],
-                marks: Vec::new(),
-            });
-        }
-        Section {
-            name: "replies".to_owned(),
-            title: "Replies".to_owned(),
-            text: vec![
+        let due = self.run.lanes.iter().filter(|lane| lane.account().due > 0);
+        Section::new("replies", "Replies")
+            .text(
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
-                 joints, late within three more."
-                    .to_owned(),
-            ],
-            figures,
-            tables: vec![self.accounts(), self.worst()],
-            ..Section::default()
-        }
+                 joints, late within three more.",
+            )
+            .figures(due.flat_map(|lane| self.replies_of(lane)))
+            .tables([self.accounts(), self.worst()])
+    }
+
+    fn replies_of(&self, lane: &Lane) -> [Figure; 3] {
+        let name = &lane.name;
+        let unit = if lane.sums { "cells in sums" } else { "replies" };
+        let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &Thinned); 2]| {
+            let of = of.map(|(label, thinned)| Series::new(label, Shape::Steps, self.points(thinned)));
+            self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y).half().series(of)
+        };
+        let y = Axis::new(unit, "");
+        let lost = lane.account().late + lane.account().missing;
+        let y_lost = if lost == 0 { y.clone().between(0.0, 1.0) } else { y.clone() };
+        let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
+        let [due, late] = [
+            [("due", &lane.due), ("in time", &lane.in_time)],
+            [("late", &lane.late), ("missing", &lane.missing)],
+        ];
+        [
+            steps("replies", "due and in time, epoch by epoch", y, due),
+            steps("late", "late and missing, when that was settled", y_lost, late),
+            self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"))
+                .series([self.line("", &lane.slowest)]),
+        ]
     }
 
     fn accounts(&self) -> Table {
@@ -83,6 +65,7 @@ impl Draft<'_> {
             let times = [reply.p50, reply.p99, reply.max].map(|micros| number(micros * 1e-3));
             [lane.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
         };
+        let rows = self.run.lanes.iter().map(row);
         let head = [
             "bus",
             "due",
@@ -95,11 +78,7 @@ impl Draft<'_> {
             "99 %",
             "greatest",
         ];
-        Table {
-            title: "Replies by bus".to_owned(),
-            head: head.map(str::to_owned).into(),
-            rows: self.run.lanes.iter().map(row).collect(),
-        }
+        Table::new("Replies by bus", head, rows)
     }
 
     /// Cells by what went wrong with them, and then by how slow they were.
@@ -124,9 +103,11 @@ impl Draft<'_> {
             ))
         });
         let row = |(lane, cell, joint, latency): &(&Lane, &Cell, u8, &Latency)| {
-            let mean =
-                if latency.count == 0 { f64::NAN } else { latency.sum as f64 / latency.count as f64 * 1e-3 };
-            let slowest = if latency.count == 0 { f64::NAN } else { latency.greatest as f64 * 1e-3 };
+            let (mean, slowest) = if latency.count == 0 {
+                (f64::NAN, f64::NAN)
+            } else {
+                (latency.sum as f64 / latency.count as f64 * 1e-3, latency.greatest as f64 * 1e-3)
+            };
             let replies = &cell.replies;
             let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink.lost];
             let counts = counts.map(|count| count.to_string());
@@ -152,11 +133,11 @@ impl Draft<'_> {
         let of = self.run.skin.cells.len();
         let title =
             if rows.len() < of { format!("The {WORST} worst of {of} cells") } else { "All cells".to_owned() };
-        Table {
-            title: format!("{title}: by replies late or missing, then losses, then the slowest reply"),
-            head: head.map(str::to_owned).into(),
+        Table::new(
+            format!("{title}: by replies late or missing, then losses, then the slowest reply"),
+            head,
             rows,
-        }
+        )
     }
 
     /// A load in % from the first tick on: before it cells start, all at once.
@@ -180,12 +161,11 @@ impl Draft<'_> {
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
                 let Answer { load, rates, cells, verdict } = answer;
                 let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
-                let finding = Finding::told(what, Quantity::new(tenths(100.0 * load), "%"));
-                findings.push(if is_chosen {
-                    finding.must("within all limits", verdict.fits())
-                } else {
-                    finding
-                });
+                let mut finding = Finding::told(what, (tenths(100.0 * load), "%"));
+                if is_chosen {
+                    finding = finding.must("within all limits", verdict.fits());
+                }
+                findings.push(finding);
             }
         }
         findings
@@ -193,43 +173,26 @@ impl Draft<'_> {
 
     /// What a real bus would carry.
     pub(super) fn load(&self) -> Section {
-        let figure = |lane: &Lane| Figure {
-            name: format!("load-{}", lane.name),
-            title: format!(
-                "{}: load of a real bus at {}, over {} s each",
-                lane.name,
-                lane.rates.rates,
-                number(lane.load.width())
-            ),
-            size: Size::Wide,
-            x: self.time(),
-            y: Axis::new("load", "%"),
-            series: vec![
-                Series::new("what a real bus would carry", Shape::Steps, self.percent(&lane.load)),
-                Series::new(
-                    "with what only a bench sends",
-                    Shape::Dashed,
-                    stairs(&self.percent(&lane.load_of_all)),
-                ),
-            ],
-            marks: vec![Mark { on: On::Y, at: 100.0, label: "all that it can".to_owned() }],
+        let figure = |lane: &Lane| {
+            let Lane { name, load, load_of_all, rates, .. } = lane;
+            let (rates, width) = (rates.rates, number(load.width()));
+            let title = format!("{name}: load of a real bus at {rates}, over {width} s each");
+            self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
+                .draw("what a real bus would carry", Shape::Steps, self.percent(load))
+                .draw("with what only a bench sends", Shape::Dashed, stairs(&self.percent(load_of_all)))
+                .marks([Mark::y(100.0, "all that it can")])
         };
         let text = "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
                     own bits make. This run is judged by the second in which most is asked of the bus; in the worst case all cells \
                     answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
                     wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
         let assumed = self.run.lanes.iter().any(|lane| !lane.rates.is_chosen);
-        let assumed = assumed.then(|| {
-            "The skin has no bit rates for every bus, so common ones are shown, for information.".to_owned()
-        });
-        Section {
-            name: "load".to_owned(),
-            title: "Load of the buses".to_owned(),
-            text: [text.to_owned()].into_iter().chain(assumed).collect(),
-            figures: self.run.lanes.iter().map(figure).collect(),
-            tables: self.shadows().map(|bus| carried(&bus)).collect(),
-            ..Section::default()
+        let mut section = Section::new("load", "Load of the buses").text(text);
+        if assumed {
+            section = section
+                .text("The skin has no bit rates for every bus, so common ones are shown, for information.");
         }
+        section.figures(self.run.lanes.iter().map(figure)).tables(self.shadows().map(|bus| carried(&bus)))
     }
 
     pub(super) fn losses(&self) -> Section {
@@ -265,22 +228,17 @@ impl Draft<'_> {
         row("packets of any network in the kernel's backlog".to_owned(), run.backlog, false);
         row("frames of buses that the skin does not have".to_owned(), run.others, false);
         row("messages that cannot be read".to_owned(), run.unreadable, false);
-        let table = Table { title: String::new(), head: vec!["what".to_owned(), "count".to_owned()], rows };
-        Section {
-            name: "losses".to_owned(),
-            title: "Losses".to_owned(),
-            text: vec!["What can be lost and was not has a 0; other rows are there only when there is something to say.".to_owned()],
-            tables: vec![table],
-            ..Section::default()
-        }
+        Section::new("losses", "Losses")
+            .text("What can be lost and was not has a 0; other rows are there only when there is something to say.")
+            .tables([Table::new("", ["what", "count"], rows)])
     }
 }
 
 /// What a bus would carry in operation and in start-up.
 fn carried(bus: &BusShadow) -> Table {
     let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
-    let mut rows: Vec<Vec<String>> = Vec::new();
-    let mut row = |cells: [&str; 6]| rows.push(cells.map(str::to_owned).into());
+    let mut rows = Vec::new();
+    let mut row = |cells: [&str; 6]| rows.push(cells.map(str::to_owned));
     if let Some(worst) = &bus.worst_case {
         let (verdict, load, cells) =
             (worst.verdict.to_string(), percent(worst.load), worst.cells.to_string());
@@ -301,19 +259,10 @@ fn carried(bus: &BusShadow) -> Table {
         row(["left out", "", "", "", "", &format!("{} frames that only a bench sends", bus.bench.total())]);
     }
     let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
-    let title = format!("{} at {}: does it fit", bus.bus, bus.name);
-    Table { title, head: head.map(str::to_owned).into(), rows }
+    Table::new(format!("{} at {}: does it fit", bus.bus, bus.name), head, rows)
 }
 
 /// With one decimal.
 fn tenths(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
-}
-
-/// A line that holds each value until the next one.
-fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let held = points.windows(2).filter_map(|pair| Some((pair.get(1)?.0, pair.first()?.1)));
-    let mut stairs: Vec<_> = points.iter().copied().zip(held).flat_map(|(from, to)| [from, to]).collect();
-    stairs.extend(points.last());
-    stairs
 }
