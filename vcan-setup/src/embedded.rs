@@ -9,7 +9,6 @@
 //! passed on in the order in which they are read, so all clients see the same order. It is private to the
 //! user and it is not `AF_CAN`: `candump` cannot attach to it.
 
-pub mod cases;
 pub mod parcel;
 pub mod place;
 pub mod queue;
@@ -18,3 +17,7 @@ pub mod server;
 
 pub use place::PlaceError;
 pub use server::{ServeError, Served, Server, Totals};
+
+#[cfg(test)]
+#[path = "../tests/cases/mod.rs"]
+mod cases;
