@@ -11,6 +11,7 @@ use std::collections::BTreeSet;
 use protocol::bus::{BusKind, Choice};
 use protocol::can::Format;
 use protocol::id::CellId;
+use serde::Serialize;
 
 use crate::kernel::Kernel;
 use crate::plan::Wanted;
@@ -26,7 +27,8 @@ const FRAME: usize = 1_024;
 const TIMES: usize = 4;
 
 /// How much a finding matters.
-#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Level {
     /// As it should be.
     Ok,
@@ -49,7 +51,7 @@ impl Level {
 }
 
 /// One thing that was found.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
     /// How much it matters.
     pub level: Level,

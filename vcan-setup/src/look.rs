@@ -17,6 +17,7 @@ use protocol::skin::{Reply, Skin};
 use rustix::fs::Access;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
+use serde::Serialize;
 
 use crate::doctor::{self, Facts, Heard, Program, User};
 use crate::kernel::Kernel;
@@ -198,12 +199,12 @@ fn embedded() -> Result<PathBuf, String> {
 }
 
 /// An embedded bus of this user.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Embedded {
     /// Its name.
     pub name: String,
     /// Its socket.
-    pub path: PathBuf,
+    pub path: String,
     /// Whether somebody serves it: a killed server leaves its socket behind.
     pub served: bool,
 }
@@ -221,7 +222,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
     });
     let mut buses: Vec<_> = names
         .map(|name| Embedded {
-            path: directory.join(socket_name(&name)),
+            path: directory.join(socket_name(&name)).display().to_string(),
             served: is_served(&directory, &name),
             name,
         })

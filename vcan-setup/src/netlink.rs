@@ -19,9 +19,9 @@ use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{FD_MTU, Interface, Kind, MARK, Peer, Place};
+use crate::link::{FD_MTU, Interface, Kind, MARK, Peer, Rates};
 use crate::namespace::NAMED;
-use crate::plan::{Rates, Step};
+use crate::plan::{Action, Step};
 
 mod exchange;
 mod reading;
@@ -76,12 +76,12 @@ impl Netlink {
         let mut namespaces = None;
         for interface in &mut interfaces {
             match &mut interface.kind {
-                Kind::Vxcan(Some(Peer { index, name, place: Place::Here })) => {
+                Kind::Vxcan(Some(Peer { index, name, namespace_id: None, .. })) => {
                     *name = names.get(index).cloned();
                 }
-                Kind::Vxcan(Some(Peer { index, name, place: Place::Namespace { id, name: space } })) => {
+                Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
-                    *space = known.get(id).cloned();
+                    *namespace = known.get(id).cloned();
                     // Only who may look into that namespace is told.
                     *name = self.name_in(*id, *index).ok().flatten();
                 }
@@ -272,8 +272,8 @@ impl Netlink {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(link(index)), 0)?;
         let interface = answers.iter().find_map(|answer| interface(answer));
         match interface.map(|interface| interface.kind) {
-            Some(Kind::Hardware(hardware)) if !Rates::of(&hardware).meet(wanted) => {
-                let nearest = Rates::of(&hardware);
+            Some(Kind::Hardware(hardware)) if !hardware.rates().meet(wanted) => {
+                let nearest = hardware.rates();
                 Err(io::Error::other(format!("the nearest that its clock gives is {nearest}")))
             }
             Some(_) | None => Ok(()),
@@ -294,13 +294,14 @@ impl Netlink {
     /// What the kernel says; then what the step has done so far was undone.
     pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
         let back = |index, mtu, up| Some(Undo::Restore { index, mtu, rates: None, up });
-        match *step {
-            Step::MakeVcan { ref name } => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
-            Step::MakePair { ref name, ref peer, .. } => {
+        let Step { name, action } = step;
+        match *action {
+            Action::MakeVcan => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
+            Action::MakePair { ref peer, .. } => {
                 self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
             }
-            Step::BringUp { index, .. } => self.set_up(index, true).map(|()| back(index, None, false)),
-            Step::Widen { index, from, was_up, .. } => {
+            Action::BringUp { index } => self.set_up(index, true).map(|()| back(index, None, false)),
+            Action::Widen { index, from, was_up } => {
                 let undo = back(index, Some(from), was_up);
                 let done = self
                     .set_up(index, false)
@@ -308,7 +309,7 @@ impl Netlink {
                     .and_then(|()| self.set_up(index, true));
                 self.or_undo(done, undo)
             }
-            Step::SetRates { index, rates, before, was_up, .. } => {
+            Action::SetRates { index, rates, before, was_up } => {
                 let undo = Some(Undo::Restore { index, mtu: None, rates: Some(before), up: was_up });
                 let down = if was_up { self.set_up(index, false) } else { Ok(()) };
                 let done = down
@@ -317,7 +318,7 @@ impl Netlink {
                     .and_then(|()| self.set_up(index, true));
                 self.or_undo(done, undo)
             }
-            Step::Remove { index, .. } => self.remove(index).map(|()| None),
+            Action::Remove { index } => self.remove(index).map(|()| None),
         }
     }
 

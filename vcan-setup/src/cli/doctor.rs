@@ -7,7 +7,7 @@ use serde::Serialize;
 use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
 use vcan_setup::look::{self, Asked};
 
-use super::{Word, ask, word};
+use super::{Word, ask, json, word};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///
@@ -57,7 +57,8 @@ impl Doctor {
         let findings = judge(&facts);
         let runs = would_run(&findings);
         if self.json {
-            print(&json(&facts, &findings, runs)?)?;
+            let bus_kind = facts.bus_kind().name();
+            print(&json(&Report { would_run: runs, bus_kind, findings: &findings })?)?;
         } else {
             print(&text(&facts, &findings, runs))?;
         }
@@ -92,22 +93,5 @@ const fn words(kind: BusKind) -> &'static str {
 struct Report<'a> {
     would_run: bool,
     bus_kind: &'static str,
-    findings: Vec<Found<'a>>,
-}
-
-#[derive(Serialize)]
-struct Found<'a> {
-    level: &'static str,
-    text: &'a str,
-    remedies: &'a [String],
-}
-
-fn json(facts: &Facts, findings: &[Finding], would_run: bool) -> Result<String, Failure> {
-    let found = findings.iter().map(|finding| Found {
-        level: finding.level.name(),
-        text: &finding.text,
-        remedies: &finding.remedies,
-    });
-    let report = Report { would_run, bus_kind: facts.bus_kind().name(), findings: found.collect() };
-    serde_json::to_string_pretty(&report).map(|text| text + "\n").map_err(Failure::run)
+    findings: &'a [Finding],
 }

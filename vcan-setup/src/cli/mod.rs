@@ -15,6 +15,7 @@ use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
 use protocol::usage::{Failure, end, one_line};
+use serde::Serialize;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Wanted;
@@ -66,6 +67,11 @@ pub(crate) fn main() -> ExitCode {
         Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
     };
     end("vcan-setup", done)
+}
+
+/// What `--json` prints.
+fn json(report: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
 }
 
 /// A bus' name, as the command line gives it.

@@ -11,7 +11,7 @@ use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
 use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
+use vcan_setup::plan::{self, Action, Plan, Step, There, WantedPair};
 
 use super::{Word, ask, unreadable, wanted, word};
 
@@ -214,10 +214,12 @@ impl Worker<'_> {
 
 /// Why a step fails, and what mends it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
-    let kind = match step {
-        Step::MakeVcan { .. } => Some("vcan"),
-        Step::MakePair { .. } => Some("vxcan"),
-        Step::BringUp { .. } | Step::Widen { .. } | Step::SetRates { .. } | Step::Remove { .. } => None,
+    let kind = match step.action {
+        Action::MakeVcan => Some("vcan"),
+        Action::MakePair { .. } => Some("vxcan"),
+        Action::BringUp { .. } | Action::Widen { .. } | Action::SetRates { .. } | Action::Remove { .. } => {
+            None
+        }
     };
     let doing = step.doing();
     let unknown = |kind: &str, kernel: &Kernel| {
@@ -237,7 +239,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
              needs none"
         ))
     };
-    let data = if let Step::SetRates { rates, .. } = step { rates.data_bitrate } else { None };
+    let data = if let Action::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
         (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run(format!(
             "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"

@@ -5,12 +5,12 @@ use protocol::can::Format;
 use super::{Bus, Facts, Finding, User, would_run};
 use crate::kernel::Module;
 use crate::link::{FD_MTU, Hardware, Interface, Kind, State};
-use crate::plan::{SkinBus, agrees, set_rates, wanted_rates};
+use crate::plan::widen;
 
 impl Facts {
     /// Whether interfaces that are missing can be made.
     pub(super) fn making(&self) -> Vec<Finding> {
-        let missing = |bus: &&Bus| bus.interface.is_none() && !bus.wanted.is_hardware();
+        let missing = |bus: &&Bus| bus.interface.is_none() && bus.wanted.hardware().is_none();
         let mut findings = Vec::new();
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
             return findings;
@@ -61,7 +61,7 @@ impl Facts {
     pub(super) fn interface(&self, bus: &Bus) -> Vec<Finding> {
         let name = &bus.wanted.name;
         let Some(interface) = &bus.interface else {
-            return vec![if bus.wanted.is_hardware() {
+            return vec![if bus.wanted.hardware().is_some() {
                 Finding::fault(
                     format!(
                         "there is no interface {name}, and the skin gives it a bitrate, so it is hardware"
@@ -92,7 +92,7 @@ impl Facts {
                 0,
                 Finding::ok(format!("{name} is {what}, up, and carries {}", carries(interface.mtu))),
             );
-            if interface.is_virtual() && bus.wanted.is_hardware() {
+            if interface.is_virtual() && bus.wanted.hardware().is_some() {
                 let command = if interface.ours { self.own("down") } else { self.sudo("ip link del") };
                 findings.push(Finding::note(
                     format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has"),
@@ -113,7 +113,7 @@ impl Facts {
         if !bus.wanted.carried_by(*mtu) {
             return vec![Finding::fault(
                 format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}"),
-                mend(format!("ip link set {name} down && ip link set {name} mtu {FD_MTU} up")),
+                mend(widen("ip", name)),
             )];
         }
         if !up {
@@ -128,9 +128,9 @@ impl Facts {
         let what = interface.what();
         let skin = bus.wanted.skin.as_ref();
         // What sets the bit rates, or would if they were known.
-        let set = || match skin {
-            Some(SkinBus { file, bitrate: Some(_), .. }) => self.own(&format!("up {file} --set-bit-rates")),
-            Some(_) | None => {
+        let set = || match bus.wanted.hardware() {
+            Some(skin) => self.own(&format!("up {} --set-bit-rates", skin.file)),
+            None => {
                 let rates = match bus.wanted.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
                     Format::Classic => "bitrate 1000000",
@@ -141,9 +141,9 @@ impl Facts {
             }
         };
         let mut findings = Vec::new();
-        if let Some(skin) = skin.filter(|skin| !agrees(skin, hardware)) {
-            let (has, wants) = (set_rates(hardware), wanted_rates(skin));
-            let text = format!("{name} is {what} at {has}, and the skin says {wants}");
+        let has = hardware.rates();
+        if let Some(skin) = skin.filter(|skin| !has.meet(skin.rates)) {
+            let text = format!("{name} is {what} at {has}, and the skin says {}", skin.rates);
             findings.push(Finding::fault(text, [set()]));
         } else if !bus.wanted.carried_by(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
@@ -170,15 +170,17 @@ impl Facts {
             )),
             Some(State::ErrorActive | State::Stopped | State::Sleeping) | None => {}
         }
-        if would_run(&findings) && skin.is_some_and(|skin| skin.bitrate.is_some()) {
-            findings.push(Finding::ok(format!("{name} is at {}, as the skin says", set_rates(hardware))));
-        } else if would_run(&findings) && skin.is_none() {
-            findings.push(Finding::ok(format!("{name} is at {}", set_rates(hardware))));
-        } else if would_run(&findings) {
-            findings.push(Finding::note(
-                format!("{name} is at {}; the skin does not say whether that is right", set_rates(hardware)),
-                ["bitrate = ...  # under its [[bus]] in the skin".to_owned()],
-            ));
+        if would_run(&findings) {
+            findings.push(match skin {
+                Some(skin) if skin.rates.bitrate.is_some() => {
+                    Finding::ok(format!("{name} is at {has}, as the skin says"))
+                }
+                Some(_) => Finding::note(
+                    format!("{name} is at {has}; the skin does not say whether that is right"),
+                    ["bitrate = ...  # under its [[bus]] in the skin".to_owned()],
+                ),
+                None => Finding::ok(format!("{name} is at {has}")),
+            });
         }
         findings
     }

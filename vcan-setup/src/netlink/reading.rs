@@ -9,7 +9,7 @@ use netlink_packet_route::link::{
     LinkInfo, LinkLayerType,
 };
 
-use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, Place, State};
+use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, State};
 
 /// Bytes of the header before the attributes begin.
 const HEADER: usize = 16;
@@ -59,9 +59,11 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     interface.kind = match (is_can, kind) {
         (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
         (true, Some(InfoKind::Vcan)) => Kind::Vcan,
-        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| {
-            let place = namespace.map_or(Place::Here, |id| Place::Namespace { id, name: None });
-            Peer { index, name: None, place }
+        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| Peer {
+            index,
+            name: None,
+            namespace: None,
+            namespace_id: namespace,
         })),
         (true, _) => {
             let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
