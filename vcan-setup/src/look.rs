@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::embedded::{DirectoryError, address, open_directory, socket_name, usual_directory};
+use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, usual_directory};
 use protocol::bus::{
     Bus, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options, set_receive_buffer,
 };
@@ -186,7 +186,7 @@ fn embedded() -> Result<PathBuf, String> {
     match open_directory(&directory) {
         Ok(_) => {}
         // It is made when a bus is served.
-        Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+        Err(error) if error.is_absent() => {
             let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
             rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
                 let (directory, why) = (directory.display(), io::Error::from(errno));
@@ -233,8 +233,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
 
 /// Only a socket that nobody listens on refuses.
 fn is_served(directory: &Path, name: &str) -> bool {
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None);
+    let socket = seqpacket(SocketFlags::NONBLOCK);
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };
     matches!(rustix::net::connect(&socket, &address), Ok(()) | Err(rustix::io::Errno::AGAIN))
 }

@@ -16,6 +16,7 @@ use netlink_packet_route::link::{
     LinkFlags, LinkHeader, LinkInfo, LinkMessage,
 };
 use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
+use protocol::bus::netlink::Exchange;
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
@@ -23,10 +24,8 @@ use crate::link::{FD_MTU, Interface, Kind, MARK, Peer, Rates};
 use crate::namespace::NAMED;
 use crate::plan::{Action, Step};
 
-mod exchange;
 mod reading;
 
-use exchange::Exchange;
 use reading::{driver, interface};
 
 /// Bytes of the header before a namespace's attributes begin.

@@ -76,16 +76,9 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     }
     let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
     text + &match (runs, faults) {
-        (true, _) => format!("\nA bench would run, on {}.\n", words(facts.bus_kind())),
+        (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().words()),
         (false, 1) => "\nNo bench would run: mend the fault first.\n".to_owned(),
         (false, faults) => format!("\nNo bench would run: mend the {faults} faults first.\n"),
-    }
-}
-
-const fn words(kind: BusKind) -> &'static str {
-    match kind {
-        BusKind::SocketCan => "SocketCAN",
-        BusKind::Embedded => "the embedded bus",
     }
 }
 
