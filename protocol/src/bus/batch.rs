@@ -202,8 +202,11 @@ impl Outgoing {
     }
 }
 
-/// Sends one datagram without waiting; that it is one.
-pub(super) fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
+/// Sends one datagram, without waiting: one when the socket took it.
+///
+/// # Errors
+/// What `send` says; [`io::ErrorKind::WouldBlock`] when the socket is full.
+pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     rustix::net::send(fd, bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
     Ok(1)
 }
