@@ -376,6 +376,14 @@ pub fn check_name(name: &str) -> Result<(), BusError> {
     if fits && !name.contains(bad) { Ok(()) } else { Err(BusError::Name(name.to_owned())) }
 }
 
+/// Whether a name has 1 to 15 characters that the kernel takes in every interface's name, and a shell as they are:
+/// ASCII letters and digits, `-`, `_` and `.`.
+#[must_use]
+pub fn is_plain(name: &str) -> bool {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    (1..=15).contains(&name.len()) && name.chars().all(plain)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

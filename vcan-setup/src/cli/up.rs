@@ -5,6 +5,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
+use protocol::bus::is_plain;
 use protocol::usage::{Failure, print, quoted};
 use rustix::io::Errno;
 use vcan_setup::kernel::{Kernel, Module};
@@ -115,9 +116,8 @@ impl Down {
 
 /// Names that the kernel takes as they are, and a shell too.
 fn plain(name: &str) -> Result<(), Failure> {
-    let odd = |c: char| !(c.is_ascii_alphanumeric() || "-_.".contains(c));
     super::bus_name(name).map_err(Failure::usage)?;
-    if name.contains(odd) || name.starts_with(['-', '.']) {
+    if !is_plain(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
             "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
         )));
