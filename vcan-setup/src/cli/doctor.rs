@@ -4,10 +4,10 @@ use clap::Args;
 use protocol::bus::{BusKind, Choice};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
-use vcan_setup::look::{self, Asked};
+use vcan_setup::doctor::{Bus, Facts, Finding, Level, judge, would_run};
+use vcan_setup::look;
 
-use super::{Word, ask, json, word};
+use super::{ask, json, named};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///
@@ -37,23 +37,17 @@ pub(crate) struct Doctor {
 
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let mut asked = Vec::new();
-        for given in &self.what {
-            match word(given)? {
-                Word::File(skin) => asked.extend(Asked::of_skin(given, &skin)),
-                Word::Name(name) => asked.push(Asked::named(&name)),
-            }
-        }
+        let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
         let present = match (ask(), self.bus_kind.resolve()) {
             (Ok((_, present)), _) => present,
             // Which needs none of them.
             (Err(_), BusKind::Embedded) => Vec::new(),
             (Err(failure), BusKind::SocketCan) => return Err(failure),
         };
-        for Asked { wanted, .. } in asked.iter_mut().filter(|asked| asked.cells.is_none()) {
+        for Bus { wanted, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
             wanted.take_format_of_hardware(&present);
         }
-        let facts = look::facts(asked, self.bus_kind, self.no_spawn, &present);
+        let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
         let findings = judge(&facts);
         let runs = would_run(&findings);
         if self.json {

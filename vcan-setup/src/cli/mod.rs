@@ -93,16 +93,25 @@ fn word(word: &str) -> Result<Word, Failure> {
     bus_name(word).map(Word::Name).map_err(Failure::usage)
 }
 
-/// The interfaces that words on the command line name.
-fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
+/// What words on the command line name.
+fn named<T>(
+    words: &[String],
+    of_skin: impl Fn(&str, &Skin) -> Vec<T>,
+    named: impl Fn(&str) -> T,
+) -> Result<Vec<T>, Failure> {
     let mut all = Vec::new();
     for given in words {
         match word(given)? {
-            Word::File(skin) => all.extend(Wanted::of_skin(given, &skin)),
-            Word::Name(name) => all.push(Wanted::named(&name)),
+            Word::File(skin) => all.extend(of_skin(given, &skin)),
+            Word::Name(name) => all.push(named(&name)),
         }
     }
     Ok(all)
+}
+
+/// The interfaces that words on the command line name.
+fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
+    named(words, Wanted::of_skin, Wanted::named)
 }
 
 /// The interfaces that there are, and who told.
