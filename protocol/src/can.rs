@@ -56,6 +56,23 @@ pub enum Format {
     Fd,
 }
 
+impl Format {
+    /// How many data bytes a frame has at most: 8 or 64.
+    #[must_use]
+    pub const fn max_len(self) -> usize {
+        match self {
+            Self::Classic => 8,
+            Self::Fd => 64,
+        }
+    }
+
+    /// How many bytes the kernel's struct of a frame has: 16 or 72.
+    #[must_use]
+    pub const fn byte_len(self) -> usize {
+        8 + self.max_len()
+    }
+}
+
 /// A CAN frame: data, remote or error; classic or FD.
 // In this order and at multiples of 8, or else copies of it wait for the bytes that have just been written.
 #[derive(Clone, Copy, Eq, Hash, PartialEq)]
@@ -131,10 +148,7 @@ impl Frame {
         data: [u8; 64],
         len: usize,
     ) -> Result<Self, FrameError> {
-        let max = match format {
-            Format::Classic => 8,
-            Format::Fd => 64,
-        };
+        let max = format.max_len();
         let short = u8::try_from(len).ok().filter(|_| len <= max);
         let len = short.ok_or(FrameError::Length { got: len, max })?;
         Ok(Self { id, format, flags, raw_dlc: 0, len, data })
@@ -256,10 +270,7 @@ impl Frame {
     /// How many bytes the kernel's struct has: 16 or 72.
     #[must_use]
     pub const fn byte_len(&self) -> usize {
-        match self.format {
-            Format::Classic => CLASSIC_BYTES,
-            Format::Fd => FD_BYTES,
-        }
+        self.format.byte_len()
     }
 
     /// Reads the kernel's struct. Never panics.

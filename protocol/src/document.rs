@@ -6,6 +6,7 @@
 //! when something is wrong is it read again with them.
 
 use core::fmt;
+use core::ops::RangeInclusive;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
@@ -14,6 +15,8 @@ use serde::de::DeserializeOwned;
 use thiserror::Error;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
+
+use crate::fixed::{OutOfRange, Q};
 
 /// One step from the file's root to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -39,6 +42,103 @@ impl Fault {
         Self { path: path.to_vec(), value: value.to_string(), why: why.to_string() }
     }
 }
+
+/// Where a value stands in a file, or a table of them; what is wrong there, and what is not.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Place(Vec<Step>);
+
+impl Place {
+    /// A key of the file itself.
+    #[must_use]
+    pub fn named(key: &'static str) -> Self {
+        Self(vec![Step::Key(key)])
+    }
+
+    /// A key of the table that stands here.
+    #[must_use]
+    pub fn key(&self, key: &'static str) -> Self {
+        Self([&self.0[..], &[Step::Key(key)]].concat())
+    }
+
+    /// One of the values that stand here, counted from 0.
+    #[must_use]
+    pub fn nth(&self, index: usize) -> Self {
+        Self([&self.0[..], &[Step::Index(index)]].concat())
+    }
+
+    /// What stands here cannot be, and why; an empty value is not printed.
+    #[must_use]
+    pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> Fault {
+        Fault::new(&self.0, value, why)
+    }
+
+    /// What a word means, one of a few.
+    ///
+    /// # Errors
+    /// When it is none of them.
+    pub fn word<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, Fault> {
+        let found = words.iter().find(|(word, _)| *word == got);
+        found.map(|&(_, meaning)| meaning).ok_or_else(|| {
+            let mut words = words.iter().map(|(word, _)| format!("{word:?}")).collect::<Vec<_>>();
+            let last = words.pop().unwrap_or_default();
+            self.fault(format_args!("{got:?}"), format_args!("{} or {last}", words.join(", ")))
+        })
+    }
+
+    /// A whole number within a range; `unit` is printed behind the range.
+    ///
+    /// # Errors
+    /// When it is outside.
+    pub fn within(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, Fault> {
+        u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
+            let (least, greatest) = range.into_inner();
+            self.fault(got, format_args!("{least} to {greatest}{unit} are possible"))
+        })
+    }
+
+    /// A number that is neither infinite nor none at all.
+    ///
+    /// # Errors
+    /// When it is.
+    pub fn finite(&self, value: f64) -> Result<f64, Fault> {
+        if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
+    }
+
+    /// A finite number above 0.
+    ///
+    /// # Errors
+    /// When it is not.
+    pub fn positive(&self, value: f64) -> Result<f64, Fault> {
+        let positive = value.is_finite() && value > 0.0;
+        if positive { Ok(value) } else { Err(self.fault(value, "must be above 0")) }
+    }
+
+    /// The word that holds a number, as `fit` rounds it.
+    ///
+    /// # Errors
+    /// When it is outside the word's range.
+    pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
+        fit(value).map_err(|OutOfRange { least, bound, .. }| {
+            self.fault(value, format_args!("its word holds [{least}, {bound})"))
+        })
+    }
+
+    /// Sets a word that must not be negative, when a number is given for it.
+    ///
+    /// # Errors
+    /// When it is negative, or outside the word's range.
+    pub fn set<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: Fit<F>) -> Result<(), Fault> {
+        match given {
+            None => {}
+            Some(value) if value < 0.0 => return Err(self.fault(value, "must not be negative")),
+            Some(value) => *word = self.fit(value, fit)?,
+        }
+        Ok(())
+    }
+}
+
+/// How a number is rounded to a word.
+pub type Fit<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
 
 impl fmt::Display for Fault {
     /// `cell[3].joint = 9: the robot has joints 1 to 6`.

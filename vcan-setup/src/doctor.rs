@@ -11,6 +11,7 @@ use std::collections::BTreeSet;
 use protocol::bus::{BusKind, Choice};
 use protocol::can::Format;
 use protocol::id::CellId;
+use serde::Serialize;
 
 use crate::kernel::Kernel;
 use crate::plan::Wanted;
@@ -26,7 +27,8 @@ const FRAME: usize = 1_024;
 const TIMES: usize = 4;
 
 /// How much a finding matters.
-#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Level {
     /// As it should be.
     Ok,
@@ -49,7 +51,7 @@ impl Level {
 }
 
 /// One thing that was found.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
     /// How much it matters.
     pub level: Level,
@@ -64,12 +66,23 @@ impl Finding {
         Self { level: Level::Ok, text: text.into(), remedies: Vec::new() }
     }
 
-    fn note(text: impl Into<String>, remedies: impl IntoIterator<Item = String>) -> Self {
-        Self { level: Level::Note, text: text.into(), remedies: remedies.into_iter().collect() }
+    fn note(text: impl Into<String>) -> Self {
+        Self { level: Level::Note, text: text.into(), remedies: Vec::new() }
     }
 
-    fn fault(text: impl Into<String>, remedies: impl IntoIterator<Item = String>) -> Self {
-        Self { level: Level::Fault, text: text.into(), remedies: remedies.into_iter().collect() }
+    fn fault(text: impl Into<String>) -> Self {
+        Self { level: Level::Fault, text: text.into(), remedies: Vec::new() }
+    }
+
+    /// And what mends it.
+    fn remedy(mut self, remedy: impl Into<String>) -> Self {
+        self.remedies.push(remedy.into());
+        self
+    }
+
+    fn remedies(mut self, remedies: Vec<String>) -> Self {
+        self.remedies.extend(remedies);
+        self
     }
 }
 
@@ -98,7 +111,6 @@ pub fn judge(facts: &Facts) -> Vec<Finding> {
             findings.extend(facts.buses.iter().flat_map(|bus| facts.traffic(bus, "the embedded bus")));
         }
     }
-    findings.extend(facts.skin());
     findings.extend(facts.cell_node());
     findings
 }
@@ -139,20 +151,16 @@ impl Facts {
             (Choice::Auto | Choice::Only(BusKind::SocketCan), true) => {
                 Finding::ok(format!("the kernel ({release}) has CAN"))
             }
-            (Choice::Auto, false) => Finding::note(
-                format!(
-                    "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no \
-                     real cell; for a kernel with CAN:"
-                ),
-                remedies(),
-            ),
-            (Choice::Only(BusKind::SocketCan), false) => Finding::fault(
-                format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"),
-                remedies()
-                    .into_iter()
-                    .chain(["# leave out --bus-kind socketcan: the bench then runs on the embedded bus"
-                        .to_owned()]),
-            ),
+            (Choice::Auto, false) => Finding::note(format!(
+                "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
+                 for a kernel with CAN:"
+            ))
+            .remedies(remedies()),
+            (Choice::Only(BusKind::SocketCan), false) => {
+                Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
+                    .remedies(remedies())
+                    .remedy("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
+            }
         }
     }
 
@@ -162,139 +170,106 @@ impl Facts {
         let heard = match &bus.heard {
             Ok(Some(heard)) => heard,
             Ok(None) => return Vec::new(),
-            Err(why) => return vec![Finding::fault(why.clone(), [])],
+            Err(why) => return vec![Finding::fault(why)],
         };
-        let mut findings = Vec::new();
-        let on = if on == name { String::new() } else { format!("{on} ") };
-        if heard.gateway {
-            findings.push(Finding::fault(
-                format!("another gateway sends joints on {on}{name}"),
-                ["pgrep -a gateway  # and stop it, or take another bus".to_owned()],
-            ));
-        }
-        let count = heard.cells.len();
-        match (self.no_spawn, count) {
-            (false, 0) | (true, 1..) => {}
-            (false, _) => findings.push(Finding::fault(
-                format!("cells are on {on}{name} already: {}", nodes(&heard.cells)),
-                ["gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them"
-                    .to_owned()],
+        let on = if on == name { name.clone() } else { format!("{on} {name}") };
+        let (all, count) = (nodes(&heard.cells), heard.cells.len());
+        let gateway = heard.gateway.then(|| {
+            Finding::fault(format!("another gateway sends joints on {on}"))
+                .remedy("pgrep -a gateway  # and stop it, or take another bus")
+        });
+        let absent = || {
+            let missing = |cells: &BTreeSet<_>| cells.difference(&heard.cells).copied().collect();
+            bus.cells.as_ref().map_or_else(BTreeSet::new, missing)
+        };
+        let cells = match (self.no_spawn, count) {
+            (false, 0) => None,
+            (false, 1..) => Some(Finding::fault(format!("cells are on {on} already: {all}")).remedy(
+                "gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
             )),
-            (true, 0) => findings.push(Finding::fault(
-                format!("no cell is heard on {on}{name}, and with --no-spawn they have to be there"),
-                [format!(
+            (true, 0) => Some(
+                Finding::fault(format!(
+                    "no cell is heard on {on}, and with --no-spawn they have to be there"
+                ))
+                .remedy(format!(
                     "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
-                )],
-            )),
-        }
-        if self.no_spawn && count > 0 {
-            let absent: BTreeSet<_> =
-                bus.cells.iter().flat_map(|cells| cells.difference(&heard.cells)).copied().collect();
-            findings.push(if absent.is_empty() {
-                Finding::ok(format!("{count} cells are on {on}{name}"))
-            } else {
-                Finding::note(
-                    format!(
-                        "{count} cells are on {on}{name}; of the skin's these were not heard: {}",
-                        nodes(&absent)
-                    ),
-                    [],
-                )
-            });
-        }
-        findings
+                )),
+            ),
+            (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
+            (true, 1..) => {
+                let absent = nodes(&absent());
+                let text = format!("{count} cells are on {on}; of the skin's these were not heard: {absent}");
+                Some(Finding::note(text))
+            }
+        };
+        gateway.into_iter().chain(cells).collect()
     }
 
     /// Whether a burst of answers fits into a socket.
     fn receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
-        let most = self.buses.iter().map(|bus| match &bus.cells {
-            Some(cells) => cells.len() * frames_of(&bus.wanted),
-            None => usize::from(CellId::MAX.get()) * frames_of(&bus.wanted),
-        });
-        let frames = most.max().unwrap_or_else(|| usize::from(CellId::MAX.get()));
-        let (once, needed) = (frames * FRAME, TIMES * frames * FRAME);
+        let all = usize::from(CellId::MAX.get());
+        let frames = |bus: &Bus| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.wanted);
+        let frames = self.buses.iter().map(frames).max().unwrap_or(all);
+        let needed = TIMES * frames * FRAME;
         let (has, wants) = (granted >> 10, needed >> 10);
-        let remedy = || [self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"))];
+        let remedy = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
                 "receive buffers of {has} KiB hold all answers, {frames} frames, {TIMES} times over"
             ))
-        } else if granted >= once {
-            Finding::note(
-                format!(
-                    "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {TIMES} times over takes {wants} KiB, and a gateway that is held up loses some"
-                ),
-                remedy(),
-            )
+        } else if granted >= frames * FRAME {
+            Finding::note(format!(
+                "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {TIMES} times over \
+                 takes {wants} KiB, and a gateway that is held up loses some"
+            ))
+            .remedy(remedy)
         } else {
-            Finding::fault(
-                format!(
-                    "receive buffers are limited to {has} KiB and do not hold all answers, {frames} frames, even once; {wants} KiB are right"
-                ),
-                remedy(),
-            )
+            Finding::fault(format!(
+                "receive buffers are limited to {has} KiB and do not hold all answers, {frames} frames, even once; \
+                 {wants} KiB are right"
+            ))
+            .remedy(remedy)
         })
     }
 
     /// Whether one answer of every cell fits into the kernel's queue between sender and receiver.
     fn backlog(&self) -> Option<Finding> {
-        let frames: usize = self
-            .buses
-            .iter()
-            .map(|bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.wanted))
-            .sum();
+        let frames = |bus: &Bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.wanted);
+        let frames: usize = self.buses.iter().map(frames).sum();
         if frames == 0 {
             return None;
         }
-        let Some(backlog) = self.backlog else {
-            return Some(Finding::note(
-                "the kernel's backlog cannot be seen from this network namespace",
-                ["sysctl net.core.netdev_max_backlog  # in the first one".to_owned()],
-            ));
-        };
-        Some(if backlog >= frames {
-            Finding::ok(format!(
+        Some(match self.backlog {
+            None => Finding::note("the kernel's backlog cannot be seen from this network namespace")
+                .remedy("sysctl net.core.netdev_max_backlog  # in the first one"),
+            Some(backlog) if backlog >= frames => Finding::ok(format!(
                 "the kernel's backlog of {backlog} holds an answer of all cells, {frames} frames"
+            )),
+            Some(backlog) => Finding::fault(format!(
+                "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
+                 be lost without a word"
             ))
-        } else {
-            Finding::fault(
-                format!(
-                    "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would be lost without a word"
-                ),
-                [self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))],
-            )
+            .remedy(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
     }
 
     fn embedded(&self) -> Finding {
         match &self.embedded {
             Ok(directory) => Finding::ok(format!("embedded buses can be served in {}", directory.display())),
-            Err(why) => Finding::fault(why.clone(), []),
+            Err(why) => Finding::fault(why),
         }
-    }
-
-    /// What the skin says and the gateway cannot do.
-    fn skin(&self) -> Vec<Finding> {
-        let sums = self.buses.iter().filter(|bus| bus.sums).map(|bus| &bus.wanted.name);
-        let fault = |name| {
-            Finding::fault(
-                format!("bus {name} has reply = \"sum\", which this version cannot run"),
-                ["reply = \"torque\"  # in the skin".to_owned()],
-            )
-        };
-        sums.map(fault).collect()
     }
 
     fn cell_node(&self) -> Option<Finding> {
         let Program { path, there } = &self.cell_node;
+        let absent =
+            format!("cell-node is not at {}: the gateway starts it from beside itself", path.display());
         match (self.no_spawn, there) {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
-            (false, false) => Some(Finding::fault(
-                format!("cell-node is not at {}: the gateway starts it from beside itself", path.display()),
-                ["cargo build --release  # in the project's folder; or name it with gateway run --cell-node"
-                    .to_owned()],
+            (false, false) => Some(Finding::fault(absent).remedy(
+                "cargo build --release  # in the project's folder; or name it with gateway run --cell-node",
             )),
         }
     }

@@ -9,12 +9,18 @@
 //! passed on in the order in which they are read, so all clients see the same order. It is private to the
 //! user and it is not `AF_CAN`: `candump` cannot attach to it.
 
-pub mod cases;
+mod client;
 pub mod parcel;
 pub mod place;
 pub mod queue;
 pub mod routing;
+mod served;
 pub mod server;
 
 pub use place::PlaceError;
-pub use server::{ServeError, Served, Server, Totals};
+pub use served::Served;
+pub use server::{ServeError, Server, Totals};
+
+#[cfg(test)]
+#[path = "../tests/cases/mod.rs"]
+mod cases;

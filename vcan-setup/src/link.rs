@@ -1,5 +1,9 @@
 //! What an interface of the kernel is, as far as a CAN bus is concerned.
 
+use core::fmt;
+
+use serde::Serialize;
+
 /// The alias (`ip link show` prints it) that marks what this program has made, and nothing else.
 pub const MARK: &str = "skinbus";
 /// The largest frame of an interface that carries classic CAN only.
@@ -39,36 +43,39 @@ pub enum Kind {
     Other(String),
 }
 
+impl Kind {
+    /// In one word.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Vcan => "vcan",
+            Self::Vxcan(_) => "vxcan",
+            Self::Hardware(_) => "hardware",
+            Self::Other(_) => "other",
+        }
+    }
+}
+
 /// The other end of a pair.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Peer {
     /// Its number, in its own namespace.
     pub index: u32,
     /// Its name, if it may be known.
     pub name: Option<String>,
-    /// Where it is.
-    pub place: Place,
-}
-
-/// Where the other end of a pair is.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Place {
-    /// In the same network namespace.
-    Here,
-    /// In the one that has this number here, and perhaps a name.
-    Namespace {
-        /// The number.
-        id: i32,
-        /// The name under /run/netns.
-        name: Option<String>,
-    },
+    /// The name of its network namespace under /run/netns, if that is another one and has a name.
+    pub namespace: Option<String>,
+    /// The number that its network namespace has in this one; `None` when it is this one.
+    pub namespace_id: Option<i32>,
 }
 
 /// A CAN controller.
-#[derive(Clone, Debug, Default, Eq, PartialEq)]
+#[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Hardware {
     /// Its driver.
     pub driver: Option<String>,
+    /// What its error counters have come to.
+    pub state: Option<State>,
     /// Bits in a second; `None` while none are set.
     pub bitrate: Option<u32>,
     /// Bits in a second of CAN FD data; `None` while none are set.
@@ -77,12 +84,60 @@ pub struct Hardware {
     pub fd: bool,
     /// Whether it only listens: it cannot send, nor acknowledge.
     pub listen_only: bool,
-    /// What its error counters have come to.
-    pub state: Option<State>,
+}
+
+/// Bit rates of CAN hardware.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Rates {
+    /// Bits in a second; `None`: none are set.
+    pub bitrate: Option<u32>,
+    /// Bits in a second of CAN FD data; `None`: classic CAN.
+    pub data_bitrate: Option<u32>,
+}
+
+impl Hardware {
+    /// The bit rates that it has; in classic mode it has none for data.
+    #[must_use]
+    pub fn rates(&self) -> Rates {
+        Rates { bitrate: self.bitrate, data_bitrate: self.data_bitrate.filter(|_| self.fd) }
+    }
+}
+
+impl Rates {
+    /// Whether these are what was wanted, but for half a percent; what was not wanted may be anything.
+    #[must_use]
+    pub fn meet(self, wanted: Self) -> bool {
+        // A controller's clock is divided by whole numbers: it may miss what was asked for, by less than the
+        // nodes of a bus may differ.
+        let near = |wanted: Option<u32>, has: Option<u32>| {
+            let near = |wanted: u32, has: u32| u64::from(wanted.abs_diff(has)) * 200 <= wanted.into();
+            wanted.is_none_or(|wanted| has.is_some_and(|has| near(wanted, has)))
+        };
+        near(wanted.bitrate, self.bitrate) && near(wanted.data_bitrate, self.data_bitrate)
+    }
+}
+
+/// For people: `500 kbit/s, data 83333 bit/s`.
+impl fmt::Display for Rates {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let words = |rate: u32| {
+            if rate.is_multiple_of(1_000) {
+                format!("{} kbit/s", rate / 1_000)
+            } else {
+                format!("{rate} bit/s")
+            }
+        };
+        match (self.bitrate, self.data_bitrate) {
+            (None, _) => f.write_str("no bit rate"),
+            (Some(rate), None) => f.write_str(&words(rate)),
+            (Some(rate), Some(data)) => write!(f, "{}, data {}", words(rate), words(data)),
+        }
+    }
 }
 
 /// How far a controller's error counters have brought it.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "SCREAMING-KEBAB-CASE")]
 pub enum State {
     /// All is well.
     ErrorActive,
@@ -102,15 +157,15 @@ impl State {
     /// The state by the number that the kernel gives it.
     #[must_use]
     pub const fn from_number(number: u32) -> Option<Self> {
-        match number {
-            0 => Some(Self::ErrorActive),
-            1 => Some(Self::ErrorWarning),
-            2 => Some(Self::ErrorPassive),
-            3 => Some(Self::BusOff),
-            4 => Some(Self::Stopped),
-            5 => Some(Self::Sleeping),
-            _ => None,
-        }
+        Some(match number {
+            0 => Self::ErrorActive,
+            1 => Self::ErrorWarning,
+            2 => Self::ErrorPassive,
+            3 => Self::BusOff,
+            4 => Self::Stopped,
+            5 => Self::Sleeping,
+            _ => return None,
+        })
     }
 
     /// The state's name, as `ip -details link` prints it.
@@ -128,7 +183,7 @@ impl State {
 }
 
 /// What went through an interface since it was made.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Counters {
     /// Frames received.
     pub received: u64,
@@ -145,6 +200,18 @@ impl Interface {
     #[must_use]
     pub const fn is_virtual(&self) -> bool {
         matches!(self.kind, Kind::Vcan | Kind::Vxcan(_))
+    }
+
+    /// The other end, of a pair.
+    #[must_use]
+    pub const fn peer(&self) -> Option<&Peer> {
+        if let Kind::Vxcan(Some(peer)) = &self.kind { Some(peer) } else { None }
+    }
+
+    /// The controller, of hardware.
+    #[must_use]
+    pub const fn hardware(&self) -> Option<&Hardware> {
+        if let Kind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
     }
 
     /// Whether it carries CAN frames.
@@ -164,10 +231,4 @@ impl Interface {
             Kind::Other(what) => what.clone(),
         }
     }
-}
-
-/// A bit rate for people: `500 kbit/s`, `83333 bit/s`.
-#[must_use]
-pub fn bit_rate(rate: u32) -> String {
-    if rate.is_multiple_of(1_000) { format!("{} kbit/s", rate / 1_000) } else { format!("{rate} bit/s") }
 }

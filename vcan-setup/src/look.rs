@@ -1,24 +1,21 @@
 //! Looks at this machine for the [`doctor`], and changes nothing.
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::embedded::{DirectoryError, address, open_directory, socket_name, usual_directory};
-use protocol::bus::{
-    Bus, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options, set_receive_buffer,
-};
+use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, usual_directory};
+use protocol::bus::{self, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
-use protocol::skin::{Reply, Skin};
 use rustix::fs::Access;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
+use serde::Serialize;
 
-use crate::doctor::{self, Facts, Heard, Program, User};
+use crate::doctor::{Bus, Facts, Heard, Program, User};
 use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::Wanted;
@@ -27,61 +24,19 @@ use crate::plan::Wanted;
 /// least every half second.
 const LISTEN: Duration = Duration::from_millis(600);
 
-/// A bus that is to be judged.
-#[derive(Clone, Debug)]
-pub struct Asked {
-    /// What is wanted of it.
-    pub wanted: Wanted,
-    /// Its cells; `None` when no skin says.
-    pub cells: Option<BTreeSet<CellId>>,
-    /// Whether its cells are to answer with sums.
-    pub sums: bool,
-}
-
-impl Asked {
-    /// The buses of a skin.
-    #[must_use]
-    pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
-        let of = |(index, wanted): (usize, Wanted)| Self {
-            wanted,
-            cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
-            sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),
-        };
-        Wanted::of_skin(file, skin).into_iter().enumerate().map(of).collect()
-    }
-
-    /// A bus that was named.
-    #[must_use]
-    pub fn named(name: &str) -> Self {
-        Self { wanted: Wanted::named(name), cells: None, sums: false }
-    }
-}
-
 /// Looks at everything that a bench on these buses would meet.
 #[must_use]
-pub fn facts(asked: Vec<Asked>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
+pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
     let kind = choice.resolve();
-    let heard = thread::scope(|scope| {
-        let listening: Vec<_> = asked
-            .iter()
-            .map(|bus| {
-                let there = present.iter().find(|interface| interface.name == bus.wanted.name);
-                let open = kind == BusKind::Embedded || there.is_some_and(|it| usable(&bus.wanted, it));
-                open.then(|| scope.spawn(|| listen(&bus.wanted, kind)))
-            })
-            .collect();
-        listening.into_iter().map(|thread| thread.map(thread::ScopedJoinHandle::join)).collect::<Vec<_>>()
-    });
-    let buses = asked.into_iter().zip(heard).map(|(asked, heard)| doctor::Bus {
-        interface: present.iter().find(|interface| interface.name == asked.wanted.name).cloned(),
-        heard: match heard {
-            None => Ok(None),
-            Some(Ok(heard)) => heard,
-            Some(Err(_)) => Err(format!("cannot listen on {}", asked.wanted.name)),
-        },
-        wanted: asked.wanted,
-        cells: asked.cells,
-        sums: asked.sums,
+    for bus in &mut buses {
+        bus.interface = present.iter().find(|interface| interface.name == bus.wanted.name).cloned();
+    }
+    thread::scope(|scope| {
+        for Bus { wanted, interface, heard, .. } in &mut buses {
+            if kind == BusKind::Embedded || interface.as_ref().is_some_and(|it| usable(wanted, it)) {
+                scope.spawn(|| *heard = listen(wanted, kind));
+            }
+        }
     });
     Facts {
         choice,
@@ -95,7 +50,7 @@ pub fn facts(asked: Vec<Asked>, choice: Choice, no_spawn: bool, present: &[Inter
             .and_then(|text| text.trim().parse().ok()),
         cell_node: beside("cell-node"),
         embedded: embedded(),
-        buses: buses.collect(),
+        buses,
         present: present.iter().filter(|interface| interface.is_can()).cloned().collect(),
     }
 }
@@ -109,7 +64,7 @@ fn listen(wanted: &Wanted, kind: BusKind) -> Result<Option<Heard>, String> {
     let options = Options { fd: wanted.format == Format::Fd, ..Options::default() };
     let until = Instant::now() + LISTEN;
     let hear = || {
-        let bus = Bus::open(&wanted.name, Choice::Only(kind), &options)?;
+        let bus = bus::Bus::open(&wanted.name, Choice::Only(kind), &options)?;
         let (mut inbox, mut heard) = (Inbox::new(), Heard::default());
         while let Some(left) = until.checked_duration_since(Instant::now()) {
             if bus.wait(Some(left))? {
@@ -149,7 +104,7 @@ impl Heard {
 fn receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
-    set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
+    bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
 }
 
 /// How this program is called so that `sudo`, which looks in the system's own directories only, finds it.
@@ -185,7 +140,7 @@ fn embedded() -> Result<PathBuf, String> {
     match open_directory(&directory) {
         Ok(_) => {}
         // It is made when a bus is served.
-        Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+        Err(error) if error.is_absent() => {
             let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
             rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
                 let (directory, why) = (directory.display(), io::Error::from(errno));
@@ -198,12 +153,12 @@ fn embedded() -> Result<PathBuf, String> {
 }
 
 /// An embedded bus of this user.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Embedded {
     /// Its name.
     pub name: String,
     /// Its socket.
-    pub path: PathBuf,
+    pub path: String,
     /// Whether somebody serves it: a killed server leaves its socket behind.
     pub served: bool,
 }
@@ -221,7 +176,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
     });
     let mut buses: Vec<_> = names
         .map(|name| Embedded {
-            path: directory.join(socket_name(&name)),
+            path: directory.join(socket_name(&name)).display().to_string(),
             served: is_served(&directory, &name),
             name,
         })
@@ -232,8 +187,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
 
 /// Only a socket that nobody listens on refuses.
 fn is_served(directory: &Path, name: &str) -> bool {
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None);
+    let socket = seqpacket(SocketFlags::NONBLOCK);
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };
     matches!(rustix::net::connect(&socket, &address), Ok(()) | Err(rustix::io::Errno::AGAIN))
 }

@@ -16,17 +16,16 @@ use netlink_packet_route::link::{
     LinkFlags, LinkHeader, LinkInfo, LinkMessage,
 };
 use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
+use protocol::bus::netlink::Exchange;
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{FD_MTU, Interface, Kind, MARK, Peer, Place};
+use crate::link::{FD_MTU, Hardware, Interface, Kind, MARK, Peer, Rates};
 use crate::namespace::NAMED;
-use crate::plan::{Rates, Step};
+use crate::plan::{Action, Step};
 
-mod exchange;
 mod reading;
 
-use exchange::Exchange;
 use reading::{driver, interface};
 
 /// Bytes of the header before a namespace's attributes begin.
@@ -67,21 +66,19 @@ impl Netlink {
     /// # Errors
     /// When the kernel does not answer.
     pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
-        let links =
-            self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
-        let mut interfaces: Vec<_> = links.iter().filter_map(|link| interface(link)).collect();
+        let mut interfaces: Vec<_> = self.all()?.iter().filter_map(|link| interface(link)).collect();
         interfaces.sort_by_key(|interface| interface.index);
         let names: HashMap<_, _> =
             interfaces.iter().map(|interface| (interface.index, interface.name.clone())).collect();
         let mut namespaces = None;
         for interface in &mut interfaces {
             match &mut interface.kind {
-                Kind::Vxcan(Some(Peer { index, name, place: Place::Here })) => {
+                Kind::Vxcan(Some(Peer { index, name, namespace_id: None, .. })) => {
                     *name = names.get(index).cloned();
                 }
-                Kind::Vxcan(Some(Peer { index, name, place: Place::Namespace { id, name: space } })) => {
+                Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
-                    *space = known.get(id).cloned();
+                    *namespace = known.get(id).cloned();
                     // Only who may look into that namespace is told.
                     *name = self.name_in(*id, *index).ok().flatten();
                 }
@@ -90,6 +87,11 @@ impl Netlink {
             }
         }
         Ok(interfaces)
+    }
+
+    /// What the kernel says of each interface.
+    fn all(&mut self) -> io::Result<Vec<Vec<u8>>> {
+        self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
 
     /// The number that another namespace has in this one, if it has one.
@@ -122,10 +124,14 @@ impl Netlink {
     }
 
     fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
-        let mut message = link(index);
-        message.attributes.push(LinkAttribute::IfNetnsId(namespace));
-        let answers = self.exchange.request(RouteNetlinkMessage::GetLink(message), 0)?;
-        Ok(answers.iter().find_map(|answer| interface(answer)).map(|interface| interface.name))
+        let asked = link(index, [LinkAttribute::IfNetnsId(namespace)]);
+        Ok(self.ask(asked)?.map(|interface| interface.name))
+    }
+
+    /// The interface that a message is about.
+    fn ask(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
+        let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
+        Ok(answers.iter().find_map(|answer| interface(answer)))
     }
 
     /// Makes a vcan of this name, marks it and brings it up; its number.
@@ -135,7 +141,7 @@ impl Netlink {
     pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
         let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
         let marked = self.mark(index);
-        self.or_remove(index, marked)
+        self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
     /// Makes a pair, marks both ends and brings them up; the number of the end that is here.
@@ -150,8 +156,7 @@ impl Netlink {
     ) -> io::Result<u32> {
         let mut peer_index = 0;
         let index = self.add(name, |attempt| {
-            let mut end = LinkMessage::default();
-            end.attributes = vec![LinkAttribute::IfName(peer.to_owned()), LinkAttribute::Mtu(FD_MTU)];
+            let mut end = link(0, [LinkAttribute::IfName(peer.to_owned()), LinkAttribute::Mtu(FD_MTU)]);
             if let Some((namespace, there)) = &mut there {
                 end.attributes.push(LinkAttribute::NetNsFd(namespace.as_raw_fd()));
                 peer_index = there.free_index()? + attempt.number;
@@ -166,13 +171,12 @@ impl Netlink {
             Some((_, there)) => there.mark(peer_index),
             None => self.mark(peer_index),
         });
-        self.or_remove(index, marked)
+        self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
     /// A number that no interface has, one above all.
     fn free_index(&mut self) -> io::Result<u32> {
-        let links =
-            self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)?;
+        let links = self.all()?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
@@ -188,12 +192,9 @@ impl Netlink {
         let mut number = 0;
         loop {
             let index = first + number;
-            let mut message = link(index);
-            message.attributes = vec![
-                LinkAttribute::IfName(name.to_owned()),
-                LinkAttribute::Mtu(FD_MTU),
-                LinkAttribute::LinkInfo(info(Attempt { index, number })?),
-            ];
+            let info = LinkAttribute::LinkInfo(info(Attempt { index, number })?);
+            let message =
+                link(index, [LinkAttribute::IfName(name.to_owned()), LinkAttribute::Mtu(FD_MTU), info]);
             let flags = NLM_F_CREATE | NLM_F_EXCL;
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
@@ -210,21 +211,8 @@ impl Netlink {
 
     fn mark(&mut self, index: u32) -> io::Result<()> {
         // First the mark: a link that bears it can be removed by whoever comes next.
-        let mut message = link(index);
-        message.attributes.push(LinkAttribute::IfAlias(MARK.to_owned()));
-        self.change(message)?;
+        self.change(link(index, [LinkAttribute::IfAlias(MARK.to_owned())]))?;
         self.set_up(index, true)
-    }
-
-    fn or_remove(&mut self, index: u32, done: io::Result<()>) -> io::Result<u32> {
-        match done {
-            Ok(()) => Ok(index),
-            Err(error) => {
-                // The first error is the one to tell.
-                let _ = self.remove(index);
-                Err(error)
-            }
-        }
     }
 
     fn change(&mut self, message: LinkMessage) -> io::Result<()> {
@@ -236,7 +224,7 @@ impl Netlink {
     /// # Errors
     /// What the kernel says.
     pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
-        let mut message = link(index);
+        let mut message = link(index, []);
         message.header.change_mask = LinkFlags::Up;
         message.header.flags = if up { LinkFlags::Up } else { LinkFlags::empty() };
         self.change(message)
@@ -247,9 +235,7 @@ impl Netlink {
     /// # Errors
     /// What the kernel says.
     pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
-        let mut message = link(index);
-        message.attributes.push(LinkAttribute::Mtu(mtu));
-        self.change(message)
+        self.change(link(index, [LinkAttribute::Mtu(mtu)]))
     }
 
     /// Sets the bit rates of CAN hardware, which has to be down. Without a rate for data it is classic.
@@ -261,22 +247,16 @@ impl Netlink {
         let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
         data.extend(rates.bitrate.map(|rate| InfoCan::BitTiming(CanBitTiming::new(rate))));
         data.extend(rates.data_bitrate.map(|rate| InfoCan::DataBitTiming(CanBitTiming::new(rate))));
-        let mut message = link(index);
         let info = vec![LinkInfo::Kind(InfoKind::Can), LinkInfo::Data(InfoData::Can(data))];
-        message.attributes.push(LinkAttribute::LinkInfo(info));
-        self.change(message)
+        self.change(link(index, [LinkAttribute::LinkInfo(info)]))
     }
 
     /// Sees that a clock comes near enough to what was asked for: a driver takes what is five percent away.
     fn see_rates(&mut self, index: u32, wanted: Rates) -> io::Result<()> {
-        let answers = self.exchange.request(RouteNetlinkMessage::GetLink(link(index)), 0)?;
-        let interface = answers.iter().find_map(|answer| interface(answer));
-        match interface.map(|interface| interface.kind) {
-            Some(Kind::Hardware(hardware)) if !Rates::of(&hardware).meet(wanted) => {
-                let nearest = Rates::of(&hardware);
-                Err(io::Error::other(format!("the nearest that its clock gives is {nearest}")))
-            }
-            Some(_) | None => Ok(()),
+        let nearest = self.ask(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
+        match nearest.filter(|nearest| !nearest.meet(wanted)) {
+            Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
+            None => Ok(()),
         }
     }
 
@@ -285,7 +265,7 @@ impl Netlink {
     /// # Errors
     /// What the kernel says.
     pub fn remove(&mut self, index: u32) -> io::Result<()> {
-        self.exchange.request(RouteNetlinkMessage::DelLink(link(index)), 0).map(|_| ())
+        self.exchange.request(RouteNetlinkMessage::DelLink(link(index, [])), 0).map(|_| ())
     }
 
     /// Does one step; what undoes it, if there is anything to be undone.
@@ -293,38 +273,36 @@ impl Netlink {
     /// # Errors
     /// What the kernel says; then what the step has done so far was undone.
     pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
-        let back = |index, mtu, up| Some(Undo::Restore { index, mtu, rates: None, up });
-        match *step {
-            Step::MakeVcan { ref name } => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
-            Step::MakePair { ref name, ref peer, .. } => {
+        let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
+        let Step { name, action } = step;
+        match *action {
+            Action::MakeVcan => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
+            Action::MakePair { ref peer, .. } => {
                 self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
             }
-            Step::BringUp { index, .. } => self.set_up(index, true).map(|()| back(index, None, false)),
-            Step::Widen { index, from, was_up, .. } => {
-                let undo = back(index, Some(from), was_up);
-                let done = self
-                    .set_up(index, false)
-                    .and_then(|()| self.set_mtu(index, FD_MTU))
-                    .and_then(|()| self.set_up(index, true));
-                self.or_undo(done, undo)
+            Action::BringUp { index } => self.set_up(index, true).map(|()| Some(restore(index, None, false))),
+            Action::Widen { index, from, was_up } => {
+                let done = self.set_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
+                let done = done.and_then(|()| self.set_up(index, true));
+                self.or_undo(done, restore(index, Some(from), was_up)).map(Some)
             }
-            Step::SetRates { index, rates, before, was_up, .. } => {
-                let undo = Some(Undo::Restore { index, mtu: None, rates: Some(before), up: was_up });
+            Action::SetRates { index, rates, before, was_up } => {
+                let undo = Undo::Restore { index, mtu: None, rates: Some(before), up: was_up };
                 let down = if was_up { self.set_up(index, false) } else { Ok(()) };
                 let done = down
                     .and_then(|()| self.set_rates(index, rates))
                     .and_then(|()| self.see_rates(index, rates))
                     .and_then(|()| self.set_up(index, true));
-                self.or_undo(done, undo)
+                self.or_undo(done, undo).map(Some)
             }
-            Step::Remove { index, .. } => self.remove(index).map(|()| None),
+            Action::Remove { index } => self.remove(index).map(|()| None),
         }
     }
 
-    fn or_undo(&mut self, done: io::Result<()>, undo: Option<Undo>) -> io::Result<Option<Undo>> {
-        if let (Err(_), Some(undo)) = (&done, &undo) {
+    fn or_undo(&mut self, done: io::Result<()>, undo: Undo) -> io::Result<Undo> {
+        if done.is_err() {
             // The first error is the one to tell.
-            let _ = self.undo(undo);
+            let _ = self.undo(&undo);
         }
         done.map(|()| undo)
     }
@@ -383,9 +361,10 @@ fn is(error: &io::Error, errno: Errno) -> bool {
     error.raw_os_error() == Some(errno.raw_os_error())
 }
 
-/// The beginning of a message about the interface of this number.
-fn link(index: u32) -> LinkMessage {
+/// A message about the interface of this number.
+fn link(index: u32, attributes: impl IntoIterator<Item = LinkAttribute>) -> LinkMessage {
     let mut message = LinkMessage::default();
     message.header.index = index;
+    message.attributes.extend(attributes);
     message
 }

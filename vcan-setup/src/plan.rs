@@ -8,20 +8,21 @@
 //! ```
 //!
 //! A step makes an interface, or changes or removes one that this program has made. The one exception is
-//! [`Step::SetRates`], which is planned only when it was asked for, and only for CAN hardware.
+//! [`Action::SetRates`], which is planned only when it was asked for, and only for CAN hardware.
 
 use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::quoted;
 
-use crate::link::{FD_MTU, Hardware, Interface, Kind, Peer, Place};
+use crate::link::{FD_MTU, Hardware, Interface, Kind, Rates};
 use crate::namespace::Namespace;
 
 mod refusal;
 mod step;
 
 pub use refusal::Refusal;
-pub use step::{Rates, Step};
+pub(crate) use step::widen;
+pub use step::{Action, Step};
 
 /// An interface that somebody wants.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -39,10 +40,8 @@ pub struct Wanted {
 pub struct SkinBus {
     /// The skin's file, as a shell takes it.
     pub file: String,
-    /// `bitrate`.
-    pub bitrate: Option<u32>,
-    /// `data_bitrate`.
-    pub data_bitrate: Option<u32>,
+    /// Its bit rates, those that the skin gives.
+    pub rates: Rates,
 }
 
 impl Wanted {
@@ -60,8 +59,7 @@ impl Wanted {
             format: bus.format,
             skin: Some(SkinBus {
                 file: quoted(file).into_owned(),
-                bitrate: bus.bitrate,
-                data_bitrate: bus.data_bitrate,
+                rates: Rates { bitrate: bus.bitrate, data_bitrate: bus.data_bitrate },
             }),
         };
         skin.buses.iter().map(wanted).collect()
@@ -69,25 +67,24 @@ impl Wanted {
 
     /// Of hardware that was named nobody knows which frames are wanted: those that it carries.
     pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
-        let there = find(present, &self.name).filter(|it| matches!(it.kind, Kind::Hardware(_)));
+        let there = find(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
             self.format = Format::Classic;
         }
     }
 
-    /// Whether it can only be hardware: a skin gives it a bit rate.
+    /// The skin that gives it a bit rate, so that it can only be hardware.
     #[must_use]
-    pub fn is_hardware(&self) -> bool {
-        self.skin.as_ref().is_some_and(|skin| skin.bitrate.is_some())
+    pub fn hardware(&self) -> Option<&SkinBus> {
+        self.skin.as_ref().filter(|skin| skin.rates.bitrate.is_some())
     }
 
     /// Why it cannot be had together with others, if it cannot: two skins give one bus two bit rates.
     fn at_odds(&self, others: &[Self]) -> Option<Refusal> {
-        let own = self.skin.as_ref().filter(|skin| skin.bitrate.is_some())?;
-        let skins = others.iter().filter(|other| other.name == self.name).filter_map(|it| it.skin.as_ref());
-        let rates = |skin: &SkinBus| (skin.bitrate, skin.data_bitrate);
-        let other = skins.filter(|skin| skin.bitrate.is_some()).find(|skin| rates(skin) != rates(own))?;
-        let says = |skin: &SkinBus| format!("{} says {}", skin.file, wanted_rates(skin));
+        let own = self.hardware()?;
+        let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
+        let other = skins.find(|skin| skin.rates != own.rates)?;
+        let says = |skin: &SkinBus| format!("{} says {}", skin.file, skin.rates);
         Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
@@ -142,15 +139,14 @@ pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Resu
         return Err(refusal);
     }
     for wanted in wanted {
-        if plan.steps.iter().any(|step| step.name() == wanted.name) {
+        if plan.changes(&wanted.name) {
             continue;
         }
         let Some(interface) = find(present, &wanted.name) else {
-            let hardware = wanted.skin.as_ref().filter(|skin| skin.bitrate.is_some());
-            if let Some(SkinBus { file, .. }) = hardware {
+            if let Some(SkinBus { file, .. }) = wanted.hardware() {
                 return Err(Refusal::Absent { name: wanted.name.clone(), file: file.clone() });
             }
-            plan.steps.push(Step::MakeVcan { name: wanted.name.clone() });
+            plan.steps.push(Step { name: wanted.name.clone(), action: Action::MakeVcan });
             continue;
         };
         match (&interface.kind, &wanted.skin) {
@@ -158,12 +154,7 @@ pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Resu
             (Kind::Hardware(hardware), Some(skin)) => {
                 plan.hardware(wanted, skin, interface, hardware, set_bit_rates)?;
             }
-            (Kind::Hardware(_), None) => {
-                return Err(Refusal::Hardware { name: wanted.name.clone(), what: interface.what() });
-            }
-            (Kind::Other(what), _) => {
-                return Err(Refusal::NotCan { name: wanted.name.clone(), what: what.clone() });
-            }
+            (Kind::Hardware(_), None) | (Kind::Other(_), _) => return Err(Refusal::real(interface)),
         }
     }
     Ok(plan)
@@ -176,18 +167,16 @@ pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Resu
 pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
     let WantedPair { name, peer, there } = *wanted;
     if there.is_none() && name == peer {
-        return Err(Refusal::OneName { name: name.to_owned() });
+        return Err(Refusal::OneName(name.to_owned()));
     }
     let present_there = there.map_or(present, |there| &there.present);
     let ends = (find(present, name), find(present_there, peer));
     let mut plan = Plan::default();
     let (here, other) = match ends {
         (None, None) => {
-            plan.steps.push(Step::MakePair {
-                name: name.to_owned(),
-                peer: peer.to_owned(),
-                namespace: there.map(|there| there.name.clone()),
-            });
+            let namespace = there.map(|there| there.name.clone());
+            let action = Action::MakePair { peer: peer.to_owned(), namespace };
+            plan.steps.push(Step { name: name.to_owned(), action });
             return Ok(plan);
         }
         (Some(here), Some(other)) if are_a_pair(here, other, there) => (here, other),
@@ -204,32 +193,25 @@ pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, R
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
         (false, true) => ("down".to_owned(), format!("{ip} link set {peer} up")),
-        (_, false) => (
-            format!("of MTU {}", other.mtu),
-            format!("sh -c '{ip} link set {peer} down && {ip} link set {peer} mtu {FD_MTU} up'"),
-        ),
+        (_, false) => (format!("of MTU {}", other.mtu), format!("sh -c '{}'", widen(&ip, peer))),
     };
     let end = format!("{peer} in {}, is {what}", there.name);
     Err(Refusal::OtherEnd { name: name.to_owned(), end, command })
 }
 
 fn are_a_pair(here: &Interface, other: &Interface, there: Option<&There>) -> bool {
-    let Kind::Vxcan(Some(Peer { index, place, .. })) = &here.kind else { return false };
-    let same_place = match (place, there) {
-        (Place::Here, None) => true,
-        (Place::Namespace { id, .. }, Some(there)) => there.id == Some(*id),
-        (Place::Here, Some(_)) | (Place::Namespace { .. }, None) => false,
+    let Some(peer) = here.peer() else { return false };
+    let same_place = match there {
+        None => peer.namespace_id.is_none(),
+        Some(there) => peer.namespace_id.is_some() && there.id == peer.namespace_id,
     };
-    same_place && *index == other.index && matches!(other.kind, Kind::Vxcan(_))
+    same_place && peer.index == other.index && matches!(other.kind, Kind::Vxcan(_))
 }
 
 fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refusal {
     let Interface { name, .. } = in_the_way;
     if !in_the_way.is_virtual() {
-        return match in_the_way.is_can() {
-            true => Refusal::Hardware { name: name.clone(), what: in_the_way.what() },
-            false => Refusal::NotCan { name: name.clone(), what: in_the_way.what() },
-        };
+        return Refusal::real(in_the_way);
     }
     let remedy = match (in_the_way.ours, there) {
         (true, None) => format!("`sudo vcan-setup down {name}` removes it, or choose another name"),
@@ -244,6 +226,11 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refu
 }
 
 impl Plan {
+    /// Whether a step is about an interface of this name already.
+    fn changes(&self, name: &str) -> bool {
+        self.steps.iter().any(|step| step.name == name)
+    }
+
     /// Says of an interface, once, that it is left as it is.
     fn leave(&mut self, line: String) {
         if !self.left.contains(&line) {
@@ -256,16 +243,18 @@ impl Plan {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
         let wide = wanted.carried_by(mtu);
-        match (wide, interface.up, interface.ours) {
+        let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by somebody else" };
                 self.leave(format!("{name} is there already, and fits ({}{whose})", interface.what()));
+                return Ok(());
             }
             (false, _, false) => return Err(Refusal::Narrow { name, mtu }),
-            (true, false, false) => return Err(Refusal::Down { name }),
-            (false, was_up, true) => self.steps.push(Step::Widen { name, index, from: mtu, was_up }),
-            (true, false, true) => self.steps.push(Step::BringUp { name, index }),
-        }
+            (true, false, false) => return Err(Refusal::Down(name)),
+            (false, was_up, true) => Action::Widen { index, from: mtu, was_up },
+            (true, false, true) => Action::BringUp { index },
+        };
+        self.steps.push(Step { name, action });
         Ok(())
     }
 
@@ -279,16 +268,16 @@ impl Plan {
         set: bool,
     ) -> Result<(), Refusal> {
         let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.what());
-        let before = Rates::of(hardware);
-        let agrees = agrees(skin, hardware);
+        let (before, rates) = (hardware.rates(), skin.rates);
+        let agrees = before.meet(rates);
         let wide = wanted.carried_by(interface.mtu);
         if agrees && wide && interface.up {
-            let checked = if skin.bitrate.is_some() { ", as the skin says" } else { "" };
+            let checked = if rates.bitrate.is_some() { ", as the skin says" } else { "" };
             self.leave(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }
         let needs_data = wanted.format == Format::Fd;
-        let missing = match (skin.bitrate, skin.data_bitrate) {
+        let missing = match (rates.bitrate, rates.data_bitrate) {
             (None, _) => Some(("bitrate", 1_000_000)),
             (Some(_), None) if needs_data => Some(("data_bitrate", 5_000_000)),
             (Some(_), _) => None,
@@ -297,43 +286,23 @@ impl Plan {
             if let Some((key, example)) = missing {
                 return Err(Refusal::NoRate { name, key, example, file });
             }
-            let rates = Rates { bitrate: skin.bitrate, data_bitrate: skin.data_bitrate };
             let (index, was_up) = (interface.index, interface.up);
-            self.steps.push(Step::SetRates { name, index, rates, before, was_up });
+            self.steps.push(Step { name, action: Action::SetRates { index, rates, before, was_up } });
             return Ok(());
         }
         if !agrees {
-            let wants = wanted_rates(skin);
-            return Err(Refusal::Rates { name, has: before, wants, file });
+            return Err(Refusal::Rates { name, has: before, wants: rates, file });
         }
         if !wide {
             return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
         match missing {
             // Somebody has set its rates, of which the skin says nothing.
-            Some(_) if before.bitrate.is_some() => Err(Refusal::Down { name }),
+            Some(_) if before.bitrate.is_some() => Err(Refusal::Down(name)),
             Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
             None => Err(Refusal::HardwareDown { name, what, file }),
         }
     }
-}
-
-/// Whether hardware has the bit rates that a skin names; what it does not name may be anything.
-#[must_use]
-pub fn agrees(skin: &SkinBus, hardware: &Hardware) -> bool {
-    Rates::of(hardware).meet(Rates { bitrate: skin.bitrate, data_bitrate: skin.data_bitrate })
-}
-
-/// The bit rates that hardware has, in words.
-#[must_use]
-pub fn set_rates(hardware: &Hardware) -> String {
-    Rates::of(hardware).to_string()
-}
-
-/// The bit rates that a skin names, in words.
-#[must_use]
-pub fn wanted_rates(skin: &SkinBus) -> String {
-    Rates { bitrate: skin.bitrate, data_bitrate: skin.data_bitrate }.to_string()
 }
 
 /// What has to be done so that none of the wanted interfaces is left that this program has made.
@@ -344,15 +313,14 @@ pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     for wanted in wanted {
         let name = wanted.name.clone();
-        if plan.steps.iter().any(|step| step.name() == name) {
+        if plan.changes(&name) {
             continue;
         }
         match (find(present, &name), &wanted.skin) {
             (None, _) => plan.leave(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
-                let with = removed_with(&plan, interface, present);
-                if !with {
-                    plan.steps.push(Step::Remove { name, index: interface.index });
+                if !removed_with(&plan, interface, present) {
+                    plan.steps.push(Step { name, action: Action::Remove { index: interface.index } });
                 }
             }
             (Some(interface), Some(_)) => {
@@ -374,9 +342,9 @@ pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
 
 /// Whether the other end of its pair, which takes this end with it, is removed already.
 fn removed_with(plan: &Plan, interface: &Interface, present: &[Interface]) -> bool {
-    let Kind::Vxcan(Some(Peer { index, place: Place::Here, .. })) = &interface.kind else { return false };
-    let peer = present.iter().find(|other| other.index == *index);
-    peer.is_some_and(|peer| plan.steps.iter().any(|step| step.name() == peer.name))
+    let peer = interface.peer().filter(|peer| peer.namespace_id.is_none());
+    let peer = peer.and_then(|peer| present.iter().find(|other| other.index == peer.index));
+    peer.is_some_and(|peer| plan.changes(&peer.name))
 }
 
 #[cfg(test)]

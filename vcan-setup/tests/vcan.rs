@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{FD_FORMAT, Frame};
-use vcan_setup::embedded::cases;
+
+mod cases;
 
 const LAST: u32 = 0x7FF;
 

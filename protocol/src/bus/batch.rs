@@ -7,7 +7,7 @@ use std::os::fd::AsFd;
 
 use rustix::net::SendFlags;
 
-use super::io as calls;
+use super::calls;
 use crate::can::FD_BYTES;
 
 /// How many datagrams one call moves at most.
@@ -196,14 +196,19 @@ impl Outgoing {
         let mut datagrams = datagrams.map(|(bytes, &len)| bytes.get(..len).unwrap_or(bytes));
         match self.count {
             0 => Ok(0),
-            1 => {
-                let only = datagrams.next().unwrap_or_default();
-                let sent = rustix::net::send(fd, only, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
-                sent.map(|_| 1).map_err(io::Error::from)
-            }
+            1 => send_one(fd, datagrams.next().unwrap_or_default()),
             _ => calls::send(fd.as_fd(), datagrams),
         }
     }
+}
+
+/// Sends one datagram, without waiting: one when the socket took it.
+///
+/// # Errors
+/// What `send` says; [`io::ErrorKind::WouldBlock`] when the socket is full.
+pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
+    rustix::net::send(fd, bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
+    Ok(1)
 }
 
 impl Default for Outgoing {

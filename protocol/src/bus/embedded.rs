@@ -16,20 +16,14 @@
 //! part they are in force for what the bus takes from then on, frames of this client and of others. In a frame that is given back to its sender, the reserved
 //! byte 6 is 1; the bus clears that byte in every other frame.
 
-use std::fs::DirBuilder;
-use std::io;
-use std::os::fd::OwnedFd;
-use std::os::unix::fs::DirBuilderExt;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use super::Filter;
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::fs::{Mode, OFlags};
-use rustix::io::Errno;
-use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketAddrUnix, SocketFlags, SocketType, sockopt};
-use thiserror::Error;
+pub(super) use client::Embedded;
+pub use client::seqpacket;
+pub use directory::{DirectoryError, address, make_directory, open_directory, socket_name, usual_directory};
 
-use super::{BusError, Filter, Options};
+mod client;
+mod directory;
 
 /// The version of what is said beside frames.
 pub const VERSION: u8 = 2;
@@ -41,8 +35,6 @@ pub const HELLO_MAX: usize = HELLO_HEAD + 8 * Filter::MAX;
 const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
 const ANSWER_LEN: usize = 17;
-/// How long a client waits for a server: it answers at once unless it is stopped.
-const PATIENCE: Duration = Duration::from_secs(2);
 
 /// What a client asks for when it connects.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -212,174 +204,6 @@ pub const fn decode_dropped(bytes: &[u8]) -> Option<u32> {
         _ => None,
     }
 }
-
-/// Where embedded buses live unless told otherwise: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
-/// `/tmp/skinbus-<user>`.
-#[must_use]
-pub fn usual_directory() -> PathBuf {
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    set("SKINBUS_DIR")
-        .or_else(|| set("XDG_RUNTIME_DIR").map(|path| path.join("skinbus")))
-        .unwrap_or_else(|| PathBuf::from(format!("/tmp/skinbus-{}", rustix::process::geteuid().as_raw())))
-}
-
-/// The file name of a bus's socket within its directory.
-#[must_use]
-pub fn socket_name(bus: &str) -> String {
-    format!("{bus}.bus")
-}
-
-/// The socket's address.
-///
-/// # Errors
-/// When the path is longer than a socket's can be.
-pub fn address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryError> {
-    let path = directory.join(socket_name(bus));
-    SocketAddrUnix::new(&path).map_err(|_| DirectoryError::TooLong { path })
-}
-
-/// Why a directory is not used for embedded buses.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum DirectoryError {
-    /// Somebody else's.
-    #[error("{} belongs to user {owner}, and this is user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
-    Owner {
-        /// The directory.
-        path: PathBuf,
-        /// Whose it is.
-        owner: u32,
-        /// Who asks.
-        us: u32,
-    },
-    /// Open to others.
-    #[error("{} has mode {mode:04o}, and the bus is private: `chmod 700` it, or set SKINBUS_DIR to another directory", path.display())]
-    Mode {
-        /// The directory.
-        path: PathBuf,
-        /// Its permission bits.
-        mode: u32,
-    },
-    /// No socket can have this path.
-    #[error("{} is too long for a socket, whose path has at most 107 bytes: set SKINBUS_DIR to a shorter one", path.display())]
-    TooLong {
-        /// The socket's path.
-        path: PathBuf,
-    },
-    /// It cannot be opened or made; a link is not followed.
-    #[error("cannot use {} as the directory of embedded buses: {source}", path.display())]
-    Io {
-        /// The directory.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-}
-
-/// Opens the directory and sees that it is ours alone.
-///
-/// # Errors
-/// When it is not there, not a directory (a link is none), somebody else's, or open to others.
-pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
-    let io = |errno: Errno| DirectoryError::Io { path: path.to_owned(), source: errno.into() };
-    let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
-    let directory = rustix::fs::open(path, flags, Mode::empty()).map_err(io)?;
-    let stat = rustix::fs::fstat(&directory).map_err(io)?;
-    let us = rustix::process::geteuid().as_raw();
-    if stat.st_uid != us {
-        return Err(DirectoryError::Owner { path: path.to_owned(), owner: stat.st_uid, us });
-    }
-    let mode = stat.st_mode & 0o7777;
-    if mode & 0o077 != 0 {
-        return Err(DirectoryError::Mode { path: path.to_owned(), mode });
-    }
-    Ok(directory)
-}
-
-/// Makes the directory (mode 0700) unless it is there, then opens it.
-///
-/// # Errors
-/// As [`open_directory`], or when it cannot be made.
-pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
-    match DirBuilder::new().mode(0o700).create(path) {
-        Ok(()) => open_directory(path),
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => open_directory(path),
-        Err(source) => Err(DirectoryError::Io { path: path.to_owned(), source }),
-    }
-}
-
-/// Connects to an embedded bus: the socket, and how many bytes may wait for it.
-pub(super) fn connect(name: &str, options: &Options) -> Result<(OwnedFd, usize), BusError> {
-    let directory = options.directory.clone().unwrap_or_else(usual_directory);
-    let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };
-    let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: PATIENCE };
-    let failed =
-        |errno: Errno| BusError::Io { name: name.to_owned(), doing: "connect to", source: errno.into() };
-    match open_directory(&directory) {
-        Ok(_) => {}
-        Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-            return Err(not_served());
-        }
-        Err(error) => return Err(error.into()),
-    }
-    let address = address(&directory, name)?;
-    let socket =
-        rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
-            .map_err(failed)?;
-    // A connection waits while the server's list of new clients is full; the timeout bounds that.
-    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(PATIENCE)).map_err(failed)?;
-    sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
-    match rustix::net::connect(&socket, &address) {
-        Ok(()) => {}
-        Err(Errno::NOENT | Errno::CONNREFUSED) => return Err(not_served()),
-        Err(Errno::AGAIN) => return Err(no_answer()),
-        Err(errno @ (Errno::ACCESS | Errno::PERM)) => {
-            return Err(BusError::Permission {
-                name: name.to_owned(),
-                doing: "connect to",
-                source: errno.into(),
-            });
-        }
-        Err(errno) => return Err(failed(errno)),
-    }
-    super::set_stamps(&socket).map_err(|source| BusError::Io {
-        name: name.to_owned(),
-        doing: "set up",
-        source,
-    })?;
-
-    let hello = Hello {
-        filters: options.filters.clone(),
-        own_frames: options.own_frames,
-        fd: options.fd,
-        error_mask: options.error_mask,
-        buffer: options.receive_buffer as u64,
-    };
-    let closed = || BusError::Closed { name: name.to_owned() };
-    let gone = |errno| match errno {
-        Errno::PIPE | Errno::CONNRESET => closed(),
-        errno => failed(errno),
-    };
-    rustix::net::send(&socket, &hello.encode(), SendFlags::NOSIGNAL).map_err(gone)?;
-    let wait = Timespec::try_from(PATIENCE).unwrap_or_default();
-    let mut polled = [PollFd::new(&socket, PollFlags::IN)];
-    if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).map_err(failed)? == 0 {
-        return Err(no_answer());
-    }
-    let mut bytes = [0; 64];
-    let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::DONTWAIT).map_err(gone)?;
-    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, None).map_err(failed)?;
-    match Answer::decode(bytes.get(..len).unwrap_or_default()) {
-        Some(Answer::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
-        Some(Answer::Refused { version }) => {
-            Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
-        }
-        None => Err(closed()),
-    }
-}
-
-/// Room for what the server has not read yet: some 700 FD frames, a whole skin's answers in one go.
-const SEND_BUFFER: usize = 1 << 18;
 
 #[cfg(test)]
 mod tests {

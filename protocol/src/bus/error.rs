@@ -14,11 +14,8 @@ use super::embedded::DirectoryError;
 #[non_exhaustive]
 pub enum BusError {
     /// No interface can have this name.
-    #[error("{name:?} is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'")]
-    Name {
-        /// The name that was asked for.
-        name: String,
-    },
+    #[error("{0:?} is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'")]
+    Name(String),
     /// The kernel takes only so many filters.
     #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX)]
     Filters {
@@ -29,29 +26,18 @@ pub enum BusError {
     },
     /// SocketCAN was asked for and the kernel has none.
     #[error(
-        "{name}: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
+        "{0}: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
          (--bus-kind embedded)"
     )]
-    NoSocketCan {
-        /// The bus.
-        name: String,
-    },
+    NoSocketCan(String),
     /// The kernel has SocketCAN and no such interface.
-    #[error(
-        "there is no interface {name}: make it with `vcan-setup up {name}`, or plug it in if it is hardware"
-    )]
-    NoInterface {
-        /// The bus.
-        name: String,
-    },
+    #[error("there is no interface {0}: make it with `vcan-setup up {0}`, or plug it in if it is hardware")]
+    NoInterface(String),
     /// An interface of another sort.
     #[error(
-        "{name} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
+        "{0} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
     )]
-    NotCan {
-        /// The interface.
-        name: String,
-    },
+    NotCan(String),
     /// A classic interface where CAN FD is wanted.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
@@ -61,22 +47,16 @@ pub enum BusError {
         /// The interface.
         name: String,
         /// Its MTU in bytes.
-        mtu: i32,
+        mtu: u32,
     },
     /// The interface is down: found when it was opened, or while it was in use. It may come back.
     #[error(
-        "{name} is down: bring it up with `ip link set {name} up`; if that is refused, `vcan-setup doctor {name}` says why"
+        "{0} is down: bring it up with `ip link set {0} up`; if that is refused, `vcan-setup doctor {0}` says why"
     )]
-    Down {
-        /// The interface.
-        name: String,
-    },
+    Down(String),
     /// The interface was removed while it was in use.
-    #[error("{name} was removed while it was in use: make it again and open it again")]
-    Gone {
-        /// The interface.
-        name: String,
-    },
+    #[error("{0} was removed while it was in use: make it again and open it again")]
+    Gone(String),
     /// Not allowed.
     #[error("not allowed to {doing} {name}: {source}")]
     Permission {
@@ -122,11 +102,8 @@ pub enum BusError {
         waited: Duration,
     },
     /// The server of the embedded bus has ended. The bus has to be opened again.
-    #[error("the embedded bus {name} was closed: its server ended")]
-    Closed {
-        /// The bus.
-        name: String,
-    },
+    #[error("the embedded bus {0} was closed: its server ended")]
+    Closed(String),
     /// The queue stayed full.
     #[error("{name} took no frame for {} ms: its queue is full; send less, or ask whether anybody is on the bus", waited.as_millis())]
     Full {
@@ -136,11 +113,8 @@ pub enum BusError {
         waited: Duration,
     },
     /// An FD frame for a bus that was opened for classic frames only.
-    #[error("a CAN FD frame cannot be sent on {name}, which was opened for classic frames only")]
-    FdFrame {
-        /// The bus.
-        name: String,
-    },
+    #[error("a CAN FD frame cannot be sent on {0}, which was opened for classic frames only")]
+    FdFrame(String),
     /// Anything else that the system says.
     #[error("cannot {doing} {name}: {source}")]
     Io {
@@ -154,10 +128,19 @@ pub enum BusError {
 }
 
 impl BusError {
+    /// The system does not let a bus be opened.
+    pub(super) fn refused(name: &str, doing: &'static str, source: impl Into<io::Error>) -> Self {
+        let (name, source) = (name.to_owned(), source.into());
+        if source.kind() == io::ErrorKind::PermissionDenied {
+            return Self::Permission { name, doing, source };
+        }
+        Self::Io { name, doing, source }
+    }
+
     /// Whether the same bus may work again later without being opened again: it is down, or full.
     #[must_use]
     pub const fn may_pass(&self) -> bool {
-        matches!(self, Self::Down { .. } | Self::Full { .. })
+        matches!(self, Self::Down(_) | Self::Full { .. })
     }
 
     /// Whether to open the bus again later may succeed without anybody doing something about this process.
@@ -167,11 +150,11 @@ impl BusError {
             self,
             Self::NotServed { .. }
                 | Self::NoAnswer { .. }
-                | Self::NoInterface { .. }
+                | Self::NoInterface(_)
                 | Self::ClassicOnly { .. }
-                | Self::Down { .. }
-                | Self::Gone { .. }
-                | Self::Closed { .. }
+                | Self::Down(_)
+                | Self::Gone(_)
+                | Self::Closed(_)
                 | Self::Io { .. }
         )
     }
@@ -179,7 +162,7 @@ impl BusError {
     /// Whether the bus has ended and has to be opened again.
     #[must_use]
     pub const fn is_closed(&self) -> bool {
-        matches!(self, Self::Closed { .. } | Self::Gone { .. })
+        matches!(self, Self::Closed(_) | Self::Gone(_))
     }
 }
 

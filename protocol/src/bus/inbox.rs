@@ -1,8 +1,7 @@
 //! Where received frames land.
 
-use super::BusKind;
-use super::batch::{BATCH, Batch, Datagram};
-use super::embedded::{OWN_BYTE, decode_dropped};
+use super::batch::{BATCH, Batch};
+use super::kinds::Carrier;
 use crate::can::Frame;
 
 /// One received frame.
@@ -25,15 +24,6 @@ pub struct Inbox {
     frames: Vec<Received>,
     dropped: u32,
     unreadable: u64,
-}
-
-/// What a batch of datagrams was.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Taken {
-    /// Frames and notices.
-    Frames,
-    /// The other end is gone, after the frames that are in the inbox.
-    End,
 }
 
 impl Inbox {
@@ -67,43 +57,28 @@ impl Inbox {
         self.frames.clear();
     }
 
-    /// Reads the batch's datagrams into frames.
-    pub(super) fn take(&mut self, kind: BusKind) -> Taken {
+    /// Reads the batch's datagrams into frames; whether the other end is gone, after these.
+    pub(super) fn take(&mut self, carrier: &dyn Carrier) -> bool {
         let Self { batch, frames, dropped, unreadable } = self;
         frames.clear();
         for datagram in batch.datagrams() {
-            match datagram.bytes() {
-                Some([]) => return Taken::End,
-                Some(bytes) => match Frame::from_bytes(bytes) {
-                    Ok(frame) => frames.push(received(frame, datagram, bytes, kind, dropped)),
-                    Err(_) => match decode_dropped(bytes).filter(|_| kind == BusKind::Embedded) {
-                        Some(total) => *dropped = total,
-                        None => *unreadable += 1,
-                    },
-                },
-                None => *unreadable += 1,
+            let bytes = datagram.bytes();
+            if bytes.is_some_and(<[u8]>::is_empty) {
+                return true;
+            }
+            if let Some(Ok(frame)) = bytes.map(Frame::from_bytes) {
+                let notes = datagram.notes();
+                *dropped = notes.dropped.unwrap_or(*dropped);
+                let at_nanos = notes.at_nanos.unwrap_or(0);
+                frames.push(Received { frame, at_nanos, own: carrier.is_own(datagram) });
+            } else if let Some(total) = bytes.and_then(|bytes| carrier.dropped(bytes)) {
+                *dropped = total;
+            } else {
+                *unreadable += 1;
             }
         }
-        Taken::Frames
+        false
     }
-}
-
-fn received(
-    frame: Frame,
-    datagram: Datagram<'_>,
-    bytes: &[u8],
-    kind: BusKind,
-    dropped: &mut u32,
-) -> Received {
-    let notes = datagram.notes();
-    let own = match kind {
-        BusKind::SocketCan => datagram.is_own(),
-        BusKind::Embedded => bytes.get(OWN_BYTE) == Some(&1),
-    };
-    if let Some(total) = notes.dropped {
-        *dropped = total;
-    }
-    Received { frame, at_nanos: notes.at_nanos.unwrap_or(0), own }
 }
 
 impl Default for Inbox {

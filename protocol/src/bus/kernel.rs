@@ -1,18 +1,19 @@
-//! Opening a SocketCAN interface.
+//! Buses that are interfaces of the kernel: SocketCAN.
 
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 
 use rustix::io::Errno;
-use rustix::net::{AddressFamily, Protocol, SocketFlags, SocketType, netdevice, sockopt};
+use rustix::net::{AddressFamily, Protocol, SocketFlags, SocketType, sockopt};
 use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
-use super::batch::Batch;
-use super::io as calls;
-use super::{BusError, Filter, Options};
+use super::batch::{Batch, Datagram};
+use super::kinds::Carrier;
+use super::link::Link;
+use super::{Bus, BusError, Filter, Options};
 
 /// The MTU of an interface that carries CAN FD.
-const FD_MTU: i32 = 72;
+const FD_MTU: u32 = 72;
 
 /// Bytes that a gateway lets wait unread in its socket of each bus, unless it is told another number: all cells may
 /// answer a report at once.
@@ -29,55 +30,79 @@ fn probe() -> Result<OwnedFd, Errno> {
     rustix::net::socket_with(AddressFamily::CAN, SocketType::RAW, SocketFlags::CLOEXEC, protocol)
 }
 
-/// Opens the interface with its filters in force: the socket, and how many bytes may wait for it.
-pub(super) fn open(name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
-    let failed = |source: io::Error| match source.raw_os_error() {
-        Some(libc::EPERM | libc::EACCES) => {
-            BusError::Permission { name: name.to_owned(), doing: "open", source }
+/// Interfaces of the kernel.
+pub(super) struct SocketCan;
+
+impl Carrier for SocketCan {
+    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
+        let own = || name.to_owned();
+        let failed = |source: io::Error| match source.raw_os_error() {
+            Some(libc::ENETDOWN) => BusError::Down(own()),
+            _ => BusError::refused(name, "open", source),
+        };
+        match probe() {
+            Ok(_) => {}
+            Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT) => return Err(BusError::NoSocketCan(own())),
+            Err(errno) => return Err(failed(errno.into())),
         }
-        Some(libc::ENETDOWN) => BusError::Down { name: name.to_owned() },
-        _ => BusError::Io { name: name.to_owned(), doing: "open", source },
-    };
-    let probe = match probe() {
-        Ok(socket) => socket,
-        Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT) => {
-            return Err(BusError::NoSocketCan { name: name.to_owned() });
-        }
-        Err(errno) => return Err(failed(errno.into())),
-    };
-    let index = match netdevice::name_to_index(&probe, name) {
-        Ok(index) => index,
-        Err(Errno::NODEV | Errno::NXIO) => return Err(BusError::NoInterface { name: name.to_owned() }),
-        Err(errno) => return Err(failed(errno.into())),
-    };
-    let socket =
-        CanFdSocket::open_addr(&CanAddr::new(index)).map_err(|source| match source.raw_os_error() {
-            Some(libc::ENODEV) => BusError::NotCan { name: name.to_owned() },
+        let link = Link::named(name).map_err(|source| match source.raw_os_error() {
+            Some(libc::ENODEV | libc::ENXIO) => BusError::NoInterface(own()),
             _ => failed(source),
         })?;
-    let interface = calls::interface(probe.as_fd(), name).map_err(failed)?;
-    if !interface.up {
-        return Err(BusError::Down { name: name.to_owned() });
-    }
-    if options.fd && interface.mtu < FD_MTU {
-        return Err(BusError::ClassicOnly { name: name.to_owned(), mtu: interface.mtu });
+        let socket = CanFdSocket::open_addr(&CanAddr::new(link.index));
+        let socket = socket.map_err(|source| match source.raw_os_error() {
+            Some(libc::ENODEV) => BusError::NotCan(own()),
+            _ => failed(source),
+        })?;
+        if !link.up {
+            return Err(BusError::Down(own()));
+        }
+        if options.fd && link.mtu < FD_MTU {
+            return Err(BusError::ClassicOnly { name: own(), mtu: link.mtu });
+        }
+        let granted = set_up(&socket, options).map_err(failed)?;
+        Ok((socket, granted))
     }
 
-    set_filters(&socket, &options.filters).map_err(failed)?;
-    socket.set_error_filter(options.error_mask).map_err(failed)?;
-    socket
-        .set_socket_option_int(socketcan::socket::SOL_CAN_RAW, libc::CAN_RAW_FD_FRAMES, options.fd.into())
-        .map_err(failed)?;
-    socket.set_recv_own_msgs(options.own_frames).map_err(failed)?;
-    super::set_stamps(&socket).map_err(failed)?;
-    socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1).map_err(failed)?;
-    discard(&socket);
-    let granted = set_receive_buffer(&socket, options.receive_buffer).map_err(failed)?;
-    Ok((socket, granted))
+    fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError> {
+        set_filters(&bus.socket, filters).map_err(|error| bus.io_error("set the filters of", error))
+    }
+
+    fn is_virtual(&self, name: &str) -> io::Result<bool> {
+        Link::named(name).map(|link| link.is_virtual)
+    }
+
+    fn is_own(&self, frame: Datagram<'_>) -> bool {
+        frame.is_own()
+    }
+
+    fn dropped(&self, _notice: &[u8]) -> Option<u32> {
+        None
+    }
+
+    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError> {
+        match errno {
+            Errno::NETDOWN | Errno::NETUNREACH => Some(BusError::Down),
+            Errno::NODEV | Errno::NXIO => Some(BusError::Gone),
+            _ => None,
+        }
+    }
 }
 
-/// Puts filters in force, in place of those that were.
-pub(super) fn set_filters(socket: &CanFdSocket, filters: &[Filter]) -> io::Result<()> {
+/// Sets a fresh socket as the options say; how many bytes may wait for it.
+fn set_up(socket: &CanFdSocket, options: &Options) -> io::Result<usize> {
+    set_filters(socket, &options.filters)?;
+    socket.set_error_filter(options.error_mask)?;
+    let fd = libc::c_int::from(options.fd);
+    socket.set_socket_option_int(socketcan::socket::SOL_CAN_RAW, libc::CAN_RAW_FD_FRAMES, fd)?;
+    socket.set_recv_own_msgs(options.own_frames)?;
+    socket.set_recv_timestamp(true)?;
+    socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1)?;
+    discard(socket);
+    set_receive_buffer(socket, options.receive_buffer)
+}
+
+fn set_filters(socket: &CanFdSocket, filters: &[Filter]) -> io::Result<()> {
     let filters: Vec<_> = filters.iter().map(|filter| CanFilter::from((filter.id, filter.mask))).collect();
     socket.set_filters(&filters)
 }

@@ -1,11 +1,141 @@
-//! Which kind each of several buses is: `--bus-kind embedded --bus-kind can0=socketcan`.
+//! Which kinds of buses there are, and which kind each of several is: `--bus-kind embedded --bus-kind
+//! can0=socketcan`.
+//!
+//! A further kind is named here, and does in its own way what [`Carrier`] asks for.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::io;
 use std::str::FromStr;
 
+use rustix::io::Errno;
+use socketcan::CanFdSocket;
 use thiserror::Error;
 
-use super::{BusKind, Choice, UnknownKind, check_name};
+use super::batch::Datagram;
+use super::embedded::Embedded;
+use super::kernel::SocketCan;
+use super::{Bus, BusError, Filter, Options, check_name};
+
+/// What each kind of bus does in its own way; the rest of [`Bus`] is the same for all.
+pub(super) trait Carrier {
+    /// Opens a bus with its filters in force and stamps on what arrives: the socket, and how many bytes may wait for
+    /// it, as the kernel counts them.
+    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError>;
+
+    /// Puts filters in force, in place of those that were.
+    fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError>;
+
+    /// Whether nothing real hangs on the bus of this name.
+    fn is_virtual(&self, name: &str) -> io::Result<bool>;
+
+    /// Whether a frame came back to the very socket that sent it.
+    fn is_own(&self, frame: Datagram<'_>) -> bool;
+
+    /// How many frames were dropped so far, from a datagram that is no frame and says so.
+    fn dropped(&self, notice: &[u8]) -> Option<u32>;
+
+    /// What an error of an open socket says of the bus, when it says more than that something failed.
+    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError>;
+}
+
+/// What carries the frames.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub enum BusKind {
+    /// An interface of the kernel: `can0`, `vcan0`.
+    SocketCan,
+    /// A process that serves a socket, for this user on this machine.
+    Embedded,
+}
+
+impl BusKind {
+    /// All that there are.
+    pub const ALL: [Self; 2] = [Self::SocketCan, Self::Embedded];
+
+    /// What it does in its own way.
+    pub(super) const fn carrier(self) -> &'static dyn Carrier {
+        match self {
+            Self::SocketCan => &SocketCan,
+            Self::Embedded => &Embedded,
+        }
+    }
+
+    /// The kind in words, as it is printed in sentences.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::SocketCan => "SocketCAN",
+            Self::Embedded => "the embedded bus",
+        }
+    }
+
+    /// The kind's name, as it is printed and as `--bus-kind` takes it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::SocketCan => "socketcan",
+            Self::Embedded => "embedded",
+        }
+    }
+}
+
+impl fmt::Display for BusKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+/// Which kind of bus is wanted.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub enum Choice {
+    /// SocketCAN where the kernel has it, else the embedded bus.
+    #[default]
+    Auto,
+    /// This one and no other.
+    Only(BusKind),
+}
+
+impl Choice {
+    /// The kind that this choice comes to on this machine.
+    ///
+    /// A kernel with `CAN_RAW` sockets means SocketCAN, also when the interface is missing: that is an error
+    /// with its remedy, never a silent change of bus.
+    #[must_use]
+    pub fn resolve(self) -> BusKind {
+        match self {
+            Self::Only(kind) => kind,
+            Self::Auto if super::kernel::has_socketcan() => BusKind::SocketCan,
+            Self::Auto => BusKind::Embedded,
+        }
+    }
+}
+
+impl fmt::Display for Choice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => f.pad("auto"),
+            Self::Only(kind) => kind.fmt(f),
+        }
+    }
+}
+
+/// A word that is no kind of bus.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[error("{got:?} is no kind of bus: auto, socketcan and embedded are")]
+pub struct UnknownKind {
+    /// The word.
+    pub got: String,
+}
+
+impl FromStr for Choice {
+    type Err = UnknownKind;
+
+    fn from_str(word: &str) -> Result<Self, UnknownKind> {
+        let mut all = [Self::Auto].into_iter().chain(BusKind::ALL.map(Self::Only));
+        let found = all.find(|choice| choice.to_string() == word);
+        found.ok_or_else(|| UnknownKind { got: word.to_owned() })
+    }
+}
 
 /// One `--bus-kind`: of a bus that is named, or of all that are not.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -21,11 +151,9 @@ impl FromStr for OneKind {
 
     fn from_str(word: &str) -> Result<Self, UnknownKind> {
         let (bus, kind) = word.split_once('=').map_or((None, word), |(bus, kind)| (Some(bus), kind));
-        let wrong = |_| UnknownKind { got: word.to_owned() };
-        if bus.is_some_and(|bus| check_name(bus).is_err()) {
-            return Err(UnknownKind { got: word.to_owned() });
-        }
-        Ok(Self { bus: bus.map(str::to_owned), kind: kind.parse().map_err(wrong)? })
+        let kind = kind.parse().ok().filter(|_| bus.is_none_or(|bus| check_name(bus).is_ok()));
+        let kind = kind.ok_or_else(|| UnknownKind { got: word.to_owned() })?;
+        Ok(Self { bus: bus.map(str::to_owned), kind })
     }
 }
 
@@ -124,6 +252,15 @@ mod tests {
     fn kinds(words: &[&str]) -> Result<Kinds, KindsError> {
         let words: Vec<_> = words.iter().map(|word| word.parse().unwrap()).collect();
         Kinds::of_words(&words, Choice::Auto)
+    }
+
+    #[test]
+    fn a_choice_is_read_as_it_is_printed() {
+        for word in ["auto", "socketcan", "embedded"] {
+            assert_eq!(word.parse::<Choice>().unwrap().to_string(), word);
+        }
+        let error = "vcan".parse::<Choice>().unwrap_err().to_string();
+        assert_eq!(error, "\"vcan\" is no kind of bus: auto, socketcan and embedded are");
     }
 
     #[test]

@@ -70,9 +70,6 @@ pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     (digits.wrapping_mul(10_000).wrapping_add(digits >> 32) & 0xFFFF_FFFF, (bits >> 3) as usize)
 }
 
-/// Powers of ten.
-const TENS: [u64; 9] = [1, 10, 100, 1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000];
-
 pub(super) struct Cursor<'a> {
     text: &'a [u8],
     at: usize,
@@ -131,17 +128,6 @@ impl<'a> Cursor<'a> {
     fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
         let start = self.at;
         let mut value = 0_u64;
-        // Sixteen digits fit whatever they are.
-        for _ in 0..2 {
-            let Some((more, count)) = self.rest().first_chunk().map(|&text| eight_digits(text)) else {
-                break;
-            };
-            value = value * TENS.get(count).copied().unwrap_or(0) + more;
-            self.at += count;
-            if count < 8 {
-                break;
-            }
-        }
         while let Some(digit @ b'0'..=b'9') = self.peek() {
             let next = value.checked_mul(10).and_then(|value| value.checked_add(u64::from(digit - b'0')));
             value = next.ok_or_else(|| self.error(expected))?;
@@ -210,16 +196,6 @@ impl<'a> Cursor<'a> {
     fn data(&mut self, id: u32, format: Format, flags: u8) -> Result<Frame, LineError> {
         let mut data = [0; 64];
         let mut len = 0;
-        // Bytes without dots between them, as they nearly always are; four at once, then one by one.
-        let rest = self.rest();
-        while let Some(four) =
-            rest.get(2 * len..).and_then(<[u8]>::first_chunk).and_then(|&digits| four_bytes(digits))
-        {
-            let Some(place) = data.get_mut(len..).and_then(<[u8]>::first_chunk_mut) else { break };
-            *place = four;
-            len += 4;
-        }
-        self.at += 2 * len;
         loop {
             self.take(b'.');
             let Some(high) = self.peek().and_then(nibble) else {

@@ -3,12 +3,16 @@
 //! A [`Skin`] exists only when everything in its file has been checked. Every error names the line, the key, the value and what is
 //! allowed, in one line.
 
+mod buses;
+mod cells;
 mod check;
 mod raw;
 pub mod sensing;
 mod wires;
 
 use std::path::Path;
+
+use serde::Deserialize;
 
 use crate::can::Format;
 use crate::document::{self, DocumentError};
@@ -51,7 +55,8 @@ pub struct Robot {
 }
 
 /// One row of the robot's table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq)]
+#[serde(deny_unknown_fields)]
 pub struct DenavitHartenberg {
     /// Length of the link in m.
     pub a: f64,

@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use super::{DenavitHartenberg, LostBus};
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Skin {
@@ -24,17 +26,8 @@ pub(super) struct Skin {
 #[serde(deny_unknown_fields)]
 pub(super) struct Robot {
     pub(super) name: String,
-    pub(super) joints: Vec<Joint>,
+    pub(super) joints: Vec<DenavitHartenberg>,
     pub(super) limits_rad: Option<Vec<[f64; 2]>>,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Joint {
-    pub(super) a: f64,
-    pub(super) alpha: f64,
-    pub(super) d: f64,
-    pub(super) theta_offset: f64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -102,7 +95,7 @@ pub(super) struct Safety {
 impl Default for Safety {
     /// Two missed replies are forgotten, four more let go; a twentieth of a second of bad cycles halts.
     fn default() -> Self {
-        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: "go-on".to_owned() }
+        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::GoOn.name().to_owned() }
     }
 }
 

@@ -1,8 +1,7 @@
 //! When cells say what they measure, as a skin's file has it.
 
 use super::raw;
-use crate::document::Fault;
-use crate::document::Step::{Index, Key};
+use crate::document::{Fault, Place};
 use crate::fixed::{OutOfRange, Q};
 use crate::parameters::{Events, Sensing};
 
@@ -27,51 +26,46 @@ pub fn continuous(hz: f64) -> Result<Sensing, String> {
 }
 
 /// When the cells of a bus say what they measure.
-pub(super) fn of_bus(index: usize, bus: &raw::Bus) -> Result<Sensing, Fault> {
-    let at = |key| [Key("bus"), Index(index), Key(key)];
-    match (bus.sensing.as_deref(), bus.sensing_hz) {
-        (Some("continuous"), Some(hz)) => {
-            continuous(hz).map_err(|why| Fault::new(&at("sensing_hz"), hz, why))
+pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
+    /// What the word alone says.
+    #[derive(Clone, Copy)]
+    enum Mode {
+        Off,
+        Continuous,
+        Event,
+    }
+    let words = [("off", Mode::Off), ("continuous", Mode::Continuous), ("event", Mode::Event)];
+    let mode = at.key("sensing").word(bus.sensing.as_deref().unwrap_or("off"), &words)?;
+    match (mode, bus.sensing_hz) {
+        (Mode::Continuous, Some(hz)) => continuous(hz).map_err(|why| at.key("sensing_hz").fault(hz, why)),
+        (Mode::Continuous, None) => {
+            Err(at.key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
         }
-        (Some("continuous"), None) => {
-            Err(Fault::new(&at("sensing"), "\"continuous\"", "sensing_hz is needed with it"))
+        (Mode::Off | Mode::Event, Some(hz)) => {
+            Err(at.key("sensing_hz").fault(hz, "only with sensing = \"continuous\""))
         }
-        (None | Some("off" | "event"), Some(hz)) => {
-            Err(Fault::new(&at("sensing_hz"), hz, "only with sensing = \"continuous\""))
-        }
-        (None | Some("off"), None) => Ok(Sensing::Off),
-        (Some("event"), None) => Ok(Sensing::Event),
-        (Some(got), _) => {
-            Err(Fault::new(&at("sensing"), format!("{got:?}"), "\"off\", \"continuous\" or \"event\""))
-        }
+        (Mode::Off, None) => Ok(Sensing::Off),
+        (Mode::Event, None) => Ok(Sensing::Event),
     }
 }
 
 /// Which changes are events; what is not said is as a cell has it from its start.
 pub(super) fn events(raw: raw::Events) -> Result<Events, Fault> {
-    fn threshold<const F: u32>(key: &'static str, given: Option<f64>, plain: Q<F>) -> Result<Q<F>, Fault> {
-        let Some(value) = given else { return Ok(plain) };
-        let path = [Key("events"), Key(key)];
-        if value < 0.0 {
-            return Err(Fault::new(&path, value, "must not be negative"));
-        }
-        Q::try_nearest(value).map_err(|OutOfRange { bound, .. }| {
-            Fault::new(&path, value, format_args!("its word holds [0, {bound})"))
-        })
+    /// As an error says it, a threshold's range begins with 0.
+    fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
+        Q::try_nearest(value).map_err(|error| OutOfRange { least: 0.0, ..error })
     }
-    let plain = Events::default();
-    let hysteresis = threshold("hysteresis", raw.hysteresis, plain.hysteresis)?;
+    let at = Place::named("events");
+    let mut events = Events::default();
+    at.key("hysteresis").set(raw.hysteresis, &mut events.hysteresis, magnitude)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
-        let why = "a part of a threshold: 0 to 1 is possible";
-        return Err(Fault::new(&[Key("events"), Key("hysteresis")], got, why));
+        return Err(at.key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
     }
-    Ok(Events {
-        contact: threshold("contact_n", raw.contact_n, plain.contact)?,
-        proximity: threshold("proximity", raw.proximity, plain.proximity)?,
-        temperature: threshold("temperature_c", raw.temperature_c, plain.temperature)?,
-        acceleration: threshold("acceleration_g", raw.acceleration_g, plain.acceleration)?,
-        hysteresis,
-    })
+    at.key("contact_n").set(raw.contact_n, &mut events.contact, magnitude)?;
+    at.key("proximity").set(raw.proximity, &mut events.proximity, magnitude)?;
+    at.key("temperature_c").set(raw.temperature_c, &mut events.temperature, magnitude)?;
+    at.key("acceleration_g").set(raw.acceleration_g, &mut events.acceleration, magnitude)?;
+    Ok(events)
 }
 
 #[cfg(test)]

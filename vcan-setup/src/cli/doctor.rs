@@ -4,10 +4,10 @@ use clap::Args;
 use protocol::bus::{BusKind, Choice};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use vcan_setup::doctor::{Facts, Finding, Level, judge, would_run};
-use vcan_setup::look::{self, Asked};
+use vcan_setup::doctor::{Bus, Facts, Finding, Level, judge, would_run};
+use vcan_setup::look;
 
-use super::{Word, ask, word};
+use super::{ask, json, named};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///
@@ -37,27 +37,22 @@ pub(crate) struct Doctor {
 
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let mut asked = Vec::new();
-        for given in &self.what {
-            match word(given)? {
-                Word::File(skin) => asked.extend(Asked::of_skin(given, &skin)),
-                Word::Name(name) => asked.push(Asked::named(&name)),
-            }
-        }
+        let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
         let present = match (ask(), self.bus_kind.resolve()) {
             (Ok((_, present)), _) => present,
             // Which needs none of them.
             (Err(_), BusKind::Embedded) => Vec::new(),
             (Err(failure), BusKind::SocketCan) => return Err(failure),
         };
-        for Asked { wanted, .. } in asked.iter_mut().filter(|asked| asked.cells.is_none()) {
+        for Bus { wanted, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
             wanted.take_format_of_hardware(&present);
         }
-        let facts = look::facts(asked, self.bus_kind, self.no_spawn, &present);
+        let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
         let findings = judge(&facts);
         let runs = would_run(&findings);
         if self.json {
-            print(&json(&facts, &findings, runs)?)?;
+            let bus_kind = facts.bus_kind().name();
+            print(&json(&Report { would_run: runs, bus_kind, findings: &findings })?)?;
         } else {
             print(&text(&facts, &findings, runs))?;
         }
@@ -75,16 +70,9 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     }
     let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
     text + &match (runs, faults) {
-        (true, _) => format!("\nA bench would run, on {}.\n", words(facts.bus_kind())),
+        (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().words()),
         (false, 1) => "\nNo bench would run: mend the fault first.\n".to_owned(),
         (false, faults) => format!("\nNo bench would run: mend the {faults} faults first.\n"),
-    }
-}
-
-const fn words(kind: BusKind) -> &'static str {
-    match kind {
-        BusKind::SocketCan => "SocketCAN",
-        BusKind::Embedded => "the embedded bus",
     }
 }
 
@@ -92,22 +80,5 @@ const fn words(kind: BusKind) -> &'static str {
 struct Report<'a> {
     would_run: bool,
     bus_kind: &'static str,
-    findings: Vec<Found<'a>>,
-}
-
-#[derive(Serialize)]
-struct Found<'a> {
-    level: &'static str,
-    text: &'a str,
-    remedies: &'a [String],
-}
-
-fn json(facts: &Facts, findings: &[Finding], would_run: bool) -> Result<String, Failure> {
-    let found = findings.iter().map(|finding| Found {
-        level: finding.level.name(),
-        text: &finding.text,
-        remedies: &finding.remedies,
-    });
-    let report = Report { would_run, bus_kind: facts.bus_kind().name(), findings: found.collect() };
-    serde_json::to_string_pretty(&report).map(|text| text + "\n").map_err(Failure::run)
+    findings: &'a [Finding],
 }

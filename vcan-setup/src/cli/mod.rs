@@ -15,6 +15,7 @@ use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
 use protocol::usage::{Failure, end, one_line};
+use serde::Serialize;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Wanted;
@@ -68,6 +69,11 @@ pub(crate) fn main() -> ExitCode {
     end("vcan-setup", done)
 }
 
+/// What `--json` prints.
+fn json(report: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
+}
+
 /// A bus' name, as the command line gives it.
 fn bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
@@ -87,16 +93,25 @@ fn word(word: &str) -> Result<Word, Failure> {
     bus_name(word).map(Word::Name).map_err(Failure::usage)
 }
 
-/// The interfaces that words on the command line name.
-fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
+/// What words on the command line name.
+fn named<T>(
+    words: &[String],
+    of_skin: impl Fn(&str, &Skin) -> Vec<T>,
+    named: impl Fn(&str) -> T,
+) -> Result<Vec<T>, Failure> {
     let mut all = Vec::new();
     for given in words {
         match word(given)? {
-            Word::File(skin) => all.extend(Wanted::of_skin(given, &skin)),
-            Word::Name(name) => all.push(Wanted::named(&name)),
+            Word::File(skin) => all.extend(of_skin(given, &skin)),
+            Word::Name(name) => all.push(named(&name)),
         }
     }
     Ok(all)
+}
+
+/// The interfaces that words on the command line name.
+fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
+    named(words, Wanted::of_skin, Wanted::named)
 }
 
 /// The interfaces that there are, and who told.

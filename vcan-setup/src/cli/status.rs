@@ -4,10 +4,10 @@ use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use vcan_setup::link::{CLASSIC_MTU, FD_MTU, Hardware, Interface, Kind, Peer, Place, bit_rate};
+use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, Peer, Rates};
 use vcan_setup::look::{Embedded, embedded_buses};
 
-use super::{ask, wanted};
+use super::{ask, json, wanted};
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
@@ -36,7 +36,10 @@ impl Status {
         let interfaces: Vec<_> = present.iter().filter(named).collect();
         let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_wanted(&bus.name)).collect();
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
-            (true, _) => json(&interfaces, &embedded)?,
+            (true, _) => {
+                let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
+                json(&Report { interfaces, embedded: &embedded })?
+            }
             (false, false) => table(&interfaces, &embedded),
             (false, true) if wanted.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
             // What was named and is not there is said below.
@@ -59,32 +62,15 @@ impl Status {
 fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
-    table.set_header([
-        "bus",
-        "kind",
-        "made by",
-        "state",
-        "frames",
-        "bit rates",
-        "received",
-        "sent",
-        "dropped",
-        "errors",
-    ]);
+    let right = ["received", "sent", "dropped", "errors"];
+    table.set_header(["bus", "kind", "made by", "state", "frames", "bit rates"].into_iter().chain(right));
     for interface in interfaces {
-        let counters = interface.counters;
-        table.add_row([
-            interface.name.clone(),
-            kind(interface),
-            made_by(interface).to_owned(),
-            state(interface),
-            frames(interface),
-            rates(interface),
-            counters.received.to_string(),
-            counters.sent.to_string(),
-            counters.dropped.to_string(),
-            counters.errors.to_string(),
-        ]);
+        let Counters { received, sent, dropped, errors } = interface.counters;
+        let (made_by, frames) = (made_by(interface).to_owned(), frames(interface));
+        let words =
+            [interface.name.clone(), kind(interface), made_by, state(interface), frames, rates(interface)];
+        let counts = [received, sent, dropped, errors].map(|count| count.to_string());
+        table.add_row(words.into_iter().chain(counts));
     }
     for Embedded { name, served, .. } in embedded {
         let state = if *served { "served" } else { "left by a server that was killed" };
@@ -102,18 +88,17 @@ fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
 
 fn kind(interface: &Interface) -> String {
     match &interface.kind {
-        Kind::Vcan => "vcan".to_owned(),
-        Kind::Vxcan(None) => "vxcan".to_owned(),
-        Kind::Vxcan(Some(Peer { index, name, place })) => {
+        Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id })) => {
             let peer = name.clone().unwrap_or_else(|| format!("interface {index}"));
-            match place {
-                Place::Here => format!("vxcan to {peer}"),
-                Place::Namespace { name: Some(space), .. } => format!("vxcan to {peer} in {space}"),
-                Place::Namespace { id, name: None } => format!("vxcan to {peer} in namespace {id}"),
+            match (namespace, namespace_id) {
+                (Some(space), _) => format!("vxcan to {peer} in {space}"),
+                (None, Some(id)) => format!("vxcan to {peer} in namespace {id}"),
+                (None, None) => format!("vxcan to {peer}"),
             }
         }
-        Kind::Hardware(Hardware { driver, .. }) => driver.clone().unwrap_or_else(|| "hardware".to_owned()),
+        Kind::Hardware(Hardware { driver: Some(driver), .. }) => driver.clone(),
         Kind::Other(what) => format!("no CAN: {what}"),
+        kind @ (Kind::Vcan | Kind::Vxcan(None) | Kind::Hardware(_)) => kind.name().to_owned(),
     }
 }
 
@@ -127,11 +112,9 @@ const fn made_by(interface: &Interface) -> &'static str {
 
 fn state(interface: &Interface) -> String {
     let up = if interface.up { "up" } else { "down" };
-    match &interface.kind {
-        Kind::Hardware(Hardware { state: Some(state), .. }) if interface.up => {
-            format!("{up}, {}", state.name())
-        }
-        Kind::Vcan | Kind::Vxcan(_) | Kind::Hardware(_) | Kind::Other(_) => up.to_owned(),
+    match interface.hardware().and_then(|hardware| hardware.state) {
+        Some(state) if interface.up => format!("{up}, {}", state.name()),
+        Some(_) | None => up.to_owned(),
     }
 }
 
@@ -150,18 +133,17 @@ fn frames(interface: &Interface) -> String {
 }
 
 fn rates(interface: &Interface) -> String {
-    let Kind::Hardware(Hardware { bitrate, data_bitrate, .. }) = interface.kind else { return String::new() };
-    match (bitrate, data_bitrate) {
-        (None, _) => "none set".to_owned(),
-        (Some(rate), None) => bit_rate(rate),
-        (Some(rate), Some(data)) => format!("{}, data {}", bit_rate(rate), bit_rate(data)),
+    match interface.kind {
+        Kind::Hardware(Hardware { bitrate: None, .. }) => "none set".to_owned(),
+        Kind::Hardware(Hardware { bitrate, data_bitrate, .. }) => Rates { bitrate, data_bitrate }.to_string(),
+        Kind::Vcan | Kind::Vxcan(_) | Kind::Other(_) => String::new(),
     }
 }
 
 #[derive(Serialize)]
 struct Report<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
-    embedded: Vec<EmbeddedReport<'a>>,
+    embedded: &'a [Embedded],
 }
 
 #[derive(Serialize)]
@@ -174,96 +156,25 @@ struct InterfaceReport<'a> {
     mtu: u32,
     format: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
-    peer: Option<PeerReport<'a>>,
+    peer: Option<&'a Peer>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    hardware: Option<HardwareReport<'a>>,
-    received: u64,
-    sent: u64,
-    dropped: u64,
-    errors: u64,
-}
-
-#[derive(Serialize)]
-struct PeerReport<'a> {
-    index: u32,
-    name: Option<&'a str>,
-    namespace: Option<&'a str>,
-    namespace_id: Option<i32>,
-}
-
-#[derive(Serialize)]
-struct HardwareReport<'a> {
-    driver: Option<&'a str>,
-    state: Option<&'static str>,
-    bitrate: Option<u32>,
-    data_bitrate: Option<u32>,
-    fd: bool,
-    listen_only: bool,
-}
-
-#[derive(Serialize)]
-struct EmbeddedReport<'a> {
-    name: &'a str,
-    path: String,
-    served: bool,
-}
-
-fn json(interfaces: &[&Interface], embedded: &[Embedded]) -> Result<String, Failure> {
-    let embedded = embedded.iter().map(|Embedded { name, path, served }| EmbeddedReport {
-        name,
-        path: path.display().to_string(),
-        served: *served,
-    });
-    let report = Report {
-        interfaces: interfaces.iter().map(|interface| report(interface)).collect(),
-        embedded: embedded.collect(),
-    };
-    serde_json::to_string_pretty(&report).map(|text| text + "\n").map_err(Failure::run)
+    hardware: Option<&'a Hardware>,
+    #[serde(flatten)]
+    counters: Counters,
 }
 
 fn report(interface: &Interface) -> InterfaceReport<'_> {
     let Interface { index, ref name, ref kind, ours, up, mtu, counters } = *interface;
-    let peer = |peer: &'_ Peer| -> (u32, Option<i32>) {
-        let id = if let Place::Namespace { id, .. } = peer.place { Some(id) } else { None };
-        (peer.index, id)
-    };
-    let (kind_name, peer, hardware) = match kind {
-        Kind::Vcan => ("vcan", None, None),
-        Kind::Vxcan(None) => ("vxcan", None, None),
-        Kind::Vxcan(Some(end)) => {
-            let (index, namespace_id) = peer(end);
-            let namespace =
-                if let Place::Namespace { name, .. } = &end.place { name.as_deref() } else { None };
-            let report = PeerReport { index, name: end.name.as_deref(), namespace, namespace_id };
-            ("vxcan", Some(report), None)
-        }
-        Kind::Hardware(hardware) => {
-            let Hardware { driver, bitrate, data_bitrate, fd, listen_only, state } = hardware;
-            let report = HardwareReport {
-                driver: driver.as_deref(),
-                state: state.map(vcan_setup::link::State::name),
-                bitrate: *bitrate,
-                data_bitrate: *data_bitrate,
-                fd: *fd,
-                listen_only: *listen_only,
-            };
-            ("hardware", None, Some(report))
-        }
-        Kind::Other(_) => ("other", None, None),
-    };
     InterfaceReport {
         name,
         index,
-        kind: kind_name,
+        kind: kind.name(),
         made_by_skinbus: ours,
         up,
         mtu,
         format: format(interface),
-        peer,
-        hardware,
-        received: counters.received,
-        sent: counters.sent,
-        dropped: counters.dropped,
-        errors: counters.errors,
+        peer: interface.peer(),
+        hardware: interface.hardware(),
+        counters,
     }
 }

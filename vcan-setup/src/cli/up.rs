@@ -5,13 +5,14 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
+use protocol::bus::is_plain;
 use protocol::usage::{Failure, print, quoted};
 use rustix::io::Errno;
 use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
 use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{self, Plan, Step, There, WantedPair};
+use vcan_setup::plan::{self, Action, Plan, Step, There, WantedPair};
 
 use super::{Word, ask, unreadable, wanted, word};
 
@@ -115,9 +116,8 @@ impl Down {
 
 /// Names that the kernel takes as they are, and a shell too.
 fn plain(name: &str) -> Result<(), Failure> {
-    let odd = |c: char| !(c.is_ascii_alphanumeric() || "-_.".contains(c));
     super::bus_name(name).map_err(Failure::usage)?;
-    if name.contains(odd) || name.starts_with(['-', '.']) {
+    if !is_plain(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
             "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
         )));
@@ -214,10 +214,12 @@ impl Worker<'_> {
 
 /// Why a step fails, and what mends it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
-    let kind = match step {
-        Step::MakeVcan { .. } => Some("vcan"),
-        Step::MakePair { .. } => Some("vxcan"),
-        Step::BringUp { .. } | Step::Widen { .. } | Step::SetRates { .. } | Step::Remove { .. } => None,
+    let kind = match step.action {
+        Action::MakeVcan => Some("vcan"),
+        Action::MakePair { .. } => Some("vxcan"),
+        Action::BringUp { .. } | Action::Widen { .. } | Action::SetRates { .. } | Action::Remove { .. } => {
+            None
+        }
     };
     let doing = step.doing();
     let unknown = |kind: &str, kernel: &Kernel| {
@@ -237,7 +239,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
              needs none"
         ))
     };
-    let data = if let Step::SetRates { rates, .. } = step { rates.data_bitrate } else { None };
+    let data = if let Action::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
         (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run(format!(
             "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"

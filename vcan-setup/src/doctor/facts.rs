@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use protocol::bus::Choice;
 use protocol::id::CellId;
+use protocol::skin::{Reply, Skin};
 
 use crate::kernel::Kernel;
 use crate::link::Interface;
@@ -68,6 +69,30 @@ pub struct Bus {
     pub interface: Option<Interface>,
     /// What was heard on it; `None` when it was not opened, or why it could not be.
     pub heard: Result<Option<Heard>, String>,
+}
+
+impl Bus {
+    /// The buses of a skin.
+    #[must_use]
+    pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
+        let of = |(index, wanted): (usize, Wanted)| Self {
+            cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
+            sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),
+            ..Self::of(wanted)
+        };
+        Wanted::of_skin(file, skin).into_iter().enumerate().map(of).collect()
+    }
+
+    /// A bus that was named.
+    #[must_use]
+    pub fn named(name: &str) -> Self {
+        Self::of(Wanted::named(name))
+    }
+
+    /// One that nobody has looked at yet.
+    const fn of(wanted: Wanted) -> Self {
+        Self { wanted, cells: None, sums: false, interface: None, heard: Ok(None) }
+    }
 }
 
 /// What was heard on a bus.

@@ -5,42 +5,46 @@ use protocol::can::Format;
 use super::{Bus, Facts, Finding, User, would_run};
 use crate::kernel::Module;
 use crate::link::{FD_MTU, Hardware, Interface, Kind, State};
-use crate::plan::{SkinBus, agrees, set_rates, wanted_rates};
+use crate::plan::widen;
 
 impl Facts {
     /// Whether interfaces that are missing can be made.
     pub(super) fn making(&self) -> Vec<Finding> {
-        let missing = |bus: &&Bus| bus.interface.is_none() && !bus.wanted.is_hardware();
+        let missing = |bus: &&Bus| bus.interface.is_none() && bus.wanted.hardware().is_none();
         let mut findings = Vec::new();
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
             return findings;
         }
-        match self.kernel.vcan {
-            Module::There => {}
-            Module::Unknown => findings.push(Finding::note(
-                "whether the kernel has vcan is not to be seen; should it have none:",
-                self.kernel.remedies(Module::Unknown),
-            )),
-            Module::Loadable => findings.push(Finding::note(
-                "the kernel's module vcan is not loaded; making an interface loads it",
-                [self.sudo("modprobe vcan")],
-            )),
-            Module::Missing => findings.push(Finding::fault(
-                format!("the kernel ({}) has CAN and no vcan", self.kernel.release),
-                self.kernel.remedies(Module::Missing),
-            )),
-        }
-        match self.user {
-            User { admin: true, .. } => {}
-            User { root: false, .. } => {
-                findings.push(Finding::note("this user may not make interfaces, hence the sudo below", []));
+        let remedies = self.kernel.remedies(self.kernel.vcan);
+        findings.extend(match self.kernel.vcan {
+            Module::There => None,
+            Module::Unknown => {
+                let text = "whether the kernel has vcan is not to be seen; should it have none:";
+                Some(Finding::note(text).remedies(remedies))
             }
-            User { root: true, .. } => findings.push(Finding::fault(
-                "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
-                ["docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network"
-                    .to_owned()],
-            )),
-        }
+            Module::Loadable => {
+                let text = "the kernel's module vcan is not loaded; making an interface loads it";
+                Some(Finding::note(text).remedy(self.sudo("modprobe vcan")))
+            }
+            Module::Missing => {
+                let text = format!("the kernel ({}) has CAN and no vcan", self.kernel.release);
+                Some(Finding::fault(text).remedies(remedies))
+            }
+        });
+        findings.extend(match self.user {
+            User { admin: true, .. } => None,
+            User { root: false, .. } => {
+                Some(Finding::note("this user may not make interfaces, hence the sudo below"))
+            }
+            User { root: true, .. } => Some(
+                Finding::fault(
+                    "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
+                )
+                .remedy(
+                    "docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network",
+                ),
+            ),
+        });
         findings
     }
 
@@ -54,50 +58,40 @@ impl Facts {
             Some(Interface { name, mtu, .. }) => {
                 Finding::ok(format!("{name} is up and carries {}", carries(*mtu)))
             }
-            None => Finding::fault("no CAN interface is up", [self.own("up vcan0")]),
+            None => Finding::fault("no CAN interface is up").remedy(self.own("up vcan0")),
         })
     }
 
     pub(super) fn interface(&self, bus: &Bus) -> Vec<Finding> {
         let name = &bus.wanted.name;
         let Some(interface) = &bus.interface else {
-            return vec![if bus.wanted.is_hardware() {
-                Finding::fault(
-                    format!(
-                        "there is no interface {name}, and the skin gives it a bitrate, so it is hardware"
-                    ),
-                    [
-                        "# plug it in and load its driver; `vcan-setup status` shows when it is there"
-                            .to_owned(),
-                        format!("{}  # once bitrate is taken out of the skin: a vcan", self.up(&bus.wanted)),
-                    ],
-                )
+            let (text, up) = (format!("there is no interface {name}"), self.up(&bus.wanted));
+            return vec![if bus.wanted.hardware().is_some() {
+                Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")
+                    .remedy("# plug it in and load its driver; `vcan-setup status` shows when it is there")
+                    .remedy(up + "  # once bitrate is taken out of the skin: a vcan")
             } else {
-                Finding::fault(format!("there is no interface {name}"), [self.up(&bus.wanted)])
+                Finding::fault(text).remedy(up)
             }];
         };
         let mut findings = match &interface.kind {
             Kind::Other(what) => {
-                return vec![Finding::fault(
-                    format!("{name} is {what}, which carries no CAN"),
-                    ["# name another bus".to_owned()],
-                )];
+                let text = format!("{name} is {what}, which carries no CAN");
+                return vec![Finding::fault(text).remedy("# name another bus")];
             }
             Kind::Vcan | Kind::Vxcan(_) => self.virtual_faults(bus, interface),
             Kind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
         };
         if would_run(&findings) {
             let what = interface.what();
-            findings.insert(
-                0,
-                Finding::ok(format!("{name} is {what}, up, and carries {}", carries(interface.mtu))),
-            );
-            if interface.is_virtual() && bus.wanted.is_hardware() {
+            let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
+            findings.insert(0, Finding::ok(text));
+            if interface.is_virtual() && bus.wanted.hardware().is_some() {
                 let command = if interface.ours { self.own("down") } else { self.sudo("ip link del") };
-                findings.push(Finding::note(
-                    format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has"),
-                    [format!("{command} {name}  # if hardware is to have this name")],
-                ));
+                let text =
+                    format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
+                let remedy = format!("{command} {name}  # if hardware is to have this name");
+                findings.push(Finding::note(text).remedy(remedy));
             }
             findings.extend(self.traffic(bus, name));
         }
@@ -108,17 +102,15 @@ impl Facts {
         let Interface { name, mtu, ours, up, .. } = interface;
         let mend = |command: String| {
             let command = if self.user.admin { command } else { format!("sudo sh -c '{command}'") };
-            [if *ours { self.up(&bus.wanted) } else { command }]
+            if *ours { self.up(&bus.wanted) } else { command }
         };
         if !bus.wanted.carried_by(*mtu) {
-            return vec![Finding::fault(
-                format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}"),
-                mend(format!("ip link set {name} down && ip link set {name} mtu {FD_MTU} up")),
-            )];
+            let text = format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}");
+            return vec![Finding::fault(text).remedy(mend(widen("ip", name)))];
         }
         if !up {
-            let fault = Finding::fault(format!("{name} is down"), mend(format!("ip link set {name} up")));
-            return vec![fault];
+            let remedy = mend(format!("ip link set {name} up"));
+            return vec![Finding::fault(format!("{name} is down")).remedy(remedy)];
         }
         Vec::new()
     }
@@ -128,9 +120,9 @@ impl Facts {
         let what = interface.what();
         let skin = bus.wanted.skin.as_ref();
         // What sets the bit rates, or would if they were known.
-        let set = || match skin {
-            Some(SkinBus { file, bitrate: Some(_), .. }) => self.own(&format!("up {file} --set-bit-rates")),
-            Some(_) | None => {
+        let set = || match bus.wanted.hardware() {
+            Some(skin) => self.own(&format!("up {} --set-bit-rates", skin.file)),
+            None => {
                 let rates = match bus.wanted.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
                     Format::Classic => "bitrate 1000000",
@@ -141,44 +133,59 @@ impl Facts {
             }
         };
         let mut findings = Vec::new();
-        if let Some(skin) = skin.filter(|skin| !agrees(skin, hardware)) {
-            let (has, wants) = (set_rates(hardware), wanted_rates(skin));
-            let text = format!("{name} is {what} at {has}, and the skin says {wants}");
-            findings.push(Finding::fault(text, [set()]));
+        let has = hardware.rates();
+        if let Some(skin) = skin.filter(|skin| !has.meet(skin.rates)) {
+            let text = format!("{name} is {what} at {has}, and the skin says {}", skin.rates);
+            findings.push(Finding::fault(text).remedy(set()));
         } else if !bus.wanted.carried_by(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
-            findings.push(Finding::fault(text, [set(), "format = \"classic\"  # in the skin".to_owned()]));
+            let classic = "format = \"classic\"  # in the skin";
+            findings.push(Finding::fault(text).remedy(set()).remedy(classic));
         } else if !up {
-            findings.push(Finding::fault(format!("{name} is {what}, and down"), [set()]));
+            findings.push(Finding::fault(format!("{name} is {what}, and down")).remedy(set()));
+        }
+        if bus.sums {
+            let text = format!(
+                "{name} is {what}, and the wires between cells that answer with sums are simulated by frames that may \
+                 not go there"
+            );
+            let remedy = "reply = \"torque\"  # in the skin; or name a vcan or the embedded bus";
+            findings.push(Finding::fault(text).remedy(remedy));
         }
         if hardware.listen_only {
-            findings.push(Finding::fault(
-                format!("{name} only listens: it can neither send nor acknowledge"),
-                [self.sudo(&format!(
-                    "sh -c 'ip link set {name} down; ip link set {name} up type can listen-only off'"
-                ))],
-            ));
+            let off = "type can listen-only off";
+            let remedy = self.sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
+            let text = format!("{name} only listens: it can neither send nor acknowledge");
+            findings.push(Finding::fault(text).remedy(remedy));
         }
-        match hardware.state.filter(|_| *up) {
-            Some(State::BusOff) => findings.push(Finding::fault(
-                format!("{name} is BUS-OFF: after too many errors it takes no part any more; wiring, termination or bit rates are wrong"),
-                [self.sudo(&format!("ip link set {name} type can restart"))],
-            )),
-            Some(state @ (State::ErrorPassive | State::ErrorWarning)) => findings.push(Finding::note(
-                format!("{name} is {}: it sees errors; is anybody else on the bus, terminated, at the same bit rates?", state.name()),
-                [format!("ip -details -statistics link show {name}")],
-            )),
-            Some(State::ErrorActive | State::Stopped | State::Sleeping) | None => {}
-        }
-        if would_run(&findings) && skin.is_some_and(|skin| skin.bitrate.is_some()) {
-            findings.push(Finding::ok(format!("{name} is at {}, as the skin says", set_rates(hardware))));
-        } else if would_run(&findings) && skin.is_none() {
-            findings.push(Finding::ok(format!("{name} is at {}", set_rates(hardware))));
-        } else if would_run(&findings) {
-            findings.push(Finding::note(
-                format!("{name} is at {}; the skin does not say whether that is right", set_rates(hardware)),
-                ["bitrate = ...  # under its [[bus]] in the skin".to_owned()],
-            ));
+        findings.extend(match hardware.state.filter(|_| *up) {
+            Some(State::BusOff) => Some(
+                Finding::fault(format!(
+                    "{name} is BUS-OFF: after too many errors it takes no part any more; wiring, termination or bit \
+                     rates are wrong"
+                ))
+                .remedy(self.sudo(&format!("ip link set {name} type can restart"))),
+            ),
+            Some(state @ (State::ErrorPassive | State::ErrorWarning)) => Some(
+                Finding::note(format!(
+                    "{name} is {}: it sees errors; is anybody else on the bus, terminated, at the same bit rates?",
+                    state.name()
+                ))
+                .remedy(format!("ip -details -statistics link show {name}")),
+            ),
+            Some(State::ErrorActive | State::Stopped | State::Sleeping) | None => None,
+        });
+        if would_run(&findings) {
+            findings.push(match skin {
+                Some(skin) if skin.rates.bitrate.is_some() => {
+                    Finding::ok(format!("{name} is at {has}, as the skin says"))
+                }
+                Some(_) => {
+                    Finding::note(format!("{name} is at {has}; the skin does not say whether that is right"))
+                        .remedy("bitrate = ...  # under its [[bus]] in the skin")
+                }
+                None => Finding::ok(format!("{name} is at {has}")),
+            });
         }
         findings
     }

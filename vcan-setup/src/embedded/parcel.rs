@@ -1,7 +1,7 @@
 //! A frame's datagram on its way through the bus.
 
 use protocol::bus::embedded::OWN_BYTE;
-use protocol::can::{CLASSIC_BYTES, FD_BYTES, FD_FORMAT, Format, Frame};
+use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
 
 /// Which byte holds the FD flags.
 const FLAGS_BYTE: usize = 5;
@@ -65,10 +65,7 @@ impl Parcel {
     /// 16 or 72.
     #[must_use]
     pub const fn byte_len(&self) -> usize {
-        match self.format {
-            Format::Classic => CLASSIC_BYTES,
-            Format::Fd => FD_BYTES,
-        }
+        self.format.byte_len()
     }
 }
 

@@ -8,10 +8,12 @@ use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 
 use protocol::bus::BusError;
-use protocol::bus::embedded::{DirectoryError, address, make_directory, open_directory, socket_name};
+use protocol::bus::embedded::{
+    DirectoryError, address, make_directory, open_directory, seqpacket, socket_name,
+};
 use rustix::fs::{AtFlags, FileType, FlockOperation};
 use rustix::io::Errno;
-use rustix::net::{AddressFamily, SocketFlags, SocketType};
+use rustix::net::SocketFlags;
 use thiserror::Error;
 
 /// Why a bus cannot be served under a name.
@@ -33,11 +35,8 @@ pub enum PlaceError {
         path: PathBuf,
     },
     /// A file that is no socket.
-    #[error("{} is in the way and is no socket: move it away", path.display())]
-    InTheWay {
-        /// The file.
-        path: PathBuf,
-    },
+    #[error("{} is in the way and is no socket: move it away", .0.display())]
+    InTheWay(PathBuf),
     /// Anything else that the system says.
     #[error("cannot {doing} {}: {source}", path.display())]
     Io {
@@ -77,12 +76,10 @@ impl Place {
         let lock = lock(directory)?;
         match rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) if FileType::from_raw_mode(stat.st_mode) != FileType::Socket => {
-                return Err(PlaceError::InTheWay { path });
+                return Err(PlaceError::InTheWay(path));
             }
             Ok(_) => {
-                let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-                let probe = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
-                    .map_err(failed("ask for"))?;
+                let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
                 // Only a socket that nobody listens on refuses; a full list of waiting clients does not.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(PlaceError::Served { name: name.to_owned(), path });
@@ -92,9 +89,7 @@ impl Place {
             Err(Errno::NOENT) => {}
             Err(errno) => return Err(failed("look at")(errno)),
         }
-        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-        let listener = rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
-            .map_err(failed("make"))?;
+        let listener = seqpacket(SocketFlags::NONBLOCK).map_err(failed("make"))?;
         rustix::net::bind(&listener, &address).map_err(failed("make"))?;
         rustix::net::listen(&listener, BACKLOG).map_err(failed("listen on"))?;
         let stat = rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW).map_err(failed("look at"))?;
@@ -128,11 +123,7 @@ fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
         let directory = match make_directory(path) {
             Ok(directory) => directory,
             // A server that ended removed it between the two looks; but a missing parent stays missing.
-            Err(DirectoryError::Io { source, .. })
-                if source.kind() == io::ErrorKind::NotFound && path.parent().is_some_and(Path::exists) =>
-            {
-                continue;
-            }
+            Err(error) if error.is_absent() && path.parent().is_some_and(Path::exists) => continue,
             Err(error) => return Err(error.into()),
         };
         rustix::io::retry_on_intr(|| rustix::fs::flock(&directory, FlockOperation::LockExclusive))

@@ -19,16 +19,10 @@ pub struct ClientId(pub usize);
 enum Class {
     /// Error frames of the classes in this mask.
     Errors(u32),
-    /// Everything but error frames.
-    All,
-    /// Frames that match.
-    Masked(Filter),
-    /// Frames that do not match.
-    Inverted(Filter),
-    /// Data frames with this 11-bit identifier.
-    Standard(u16),
-    /// Data frames with this 29-bit identifier; the word has the flag set.
-    Extended(u32),
+    /// Frames that match, or with `false` those that do not; never error frames.
+    Masked(Filter, bool),
+    /// Data frames with this identifier, of 11 bits or with the flag of 29.
+    Exact(u32),
 }
 
 impl Class {
@@ -42,21 +36,21 @@ impl Class {
             mask &= Filter::EXACT_MASK;
         }
         let matched = Filter { id: id & mask, mask };
-        if id & Filter::INVERTED != 0 {
-            return Self::Inverted(matched);
+        let whole = if id & EXTENDED == 0 { Filter::EXACT_MASK } else { EXTENDED_MASK | EXTENDED | REMOTE };
+        match id & (Filter::INVERTED | REMOTE) {
+            0 if mask == whole => Self::Exact(matched.id),
+            flags => Self::Masked(matched, flags & Filter::INVERTED == 0),
         }
-        if mask == 0 {
-            return Self::All;
+    }
+
+    /// Whether a frame with this identifier and these flags passes.
+    const fn passes(self, frame: u32) -> bool {
+        let error = frame & ERROR != 0;
+        match self {
+            Self::Errors(mask) => error && frame & mask != 0,
+            Self::Masked(Filter { id, mask }, matched) => !error && (frame & mask == id) == matched,
+            Self::Exact(id) => frame == id,
         }
-        if matched.id & REMOTE == 0 {
-            if matched.id & EXTENDED != 0 && mask == EXTENDED_MASK | EXTENDED | REMOTE {
-                return Self::Extended(matched.id);
-            }
-            if matched.id & EXTENDED == 0 && mask == Filter::EXACT_MASK {
-                return u16::try_from(matched.id).map_or(Self::Masked(matched), Self::Standard);
-            }
-        }
-        Self::Masked(matched)
     }
 }
 
@@ -79,15 +73,13 @@ impl Wants {
 }
 
 /// Who wants what.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Router {
     clients: Vec<Option<Wants>>,
-    errors: Vec<(u32, ClientId)>,
-    all: Vec<ClientId>,
-    masked: Vec<(Filter, ClientId)>,
-    inverted: Vec<(Filter, ClientId)>,
-    standard: Vec<Vec<ClientId>>,
-    extended: HashMap<u32, Vec<ClientId>>,
+    /// Who wants exactly a data frame with this identifier.
+    exact: HashMap<u32, Vec<ClientId>>,
+    /// What every frame is held against.
+    walked: Vec<(Class, ClientId)>,
     frames: u64,
 }
 
@@ -95,16 +87,7 @@ impl Router {
     /// Nobody wants anything.
     #[must_use]
     pub fn new() -> Self {
-        Self {
-            clients: Vec::new(),
-            errors: Vec::new(),
-            all: Vec::new(),
-            masked: Vec::new(),
-            inverted: Vec::new(),
-            standard: vec![Vec::new(); 1 + STANDARD_MASK as usize],
-            extended: HashMap::new(),
-            frames: 0,
-        }
+        Self::default()
     }
 
     /// Puts a client's wishes in force, in place of those that it had.
@@ -135,16 +118,8 @@ impl Router {
     fn list(&mut self, client: ClientId, wants: &Wants) {
         for class in wants.classes() {
             match class {
-                Class::Errors(mask) => self.errors.push((mask, client)),
-                Class::All => self.all.push(client),
-                Class::Masked(filter) => self.masked.push((filter, client)),
-                Class::Inverted(filter) => self.inverted.push((filter, client)),
-                Class::Standard(id) => {
-                    if let Some(list) = self.standard.get_mut(usize::from(id)) {
-                        list.push(client);
-                    }
-                }
-                Class::Extended(id) => self.extended.entry(id).or_default().push(client),
+                Class::Exact(id) => self.exact.entry(id).or_default().push(client),
+                Class::Errors(_) | Class::Masked(..) => self.walked.push((class, client)),
             }
         }
     }
@@ -160,23 +135,15 @@ impl Router {
     fn unlist(&mut self, client: ClientId, wants: &Wants) {
         for class in wants.classes() {
             match class {
-                Class::Errors(_) => self.errors.retain(|&(_, other)| other != client),
-                Class::All => self.all.retain(|&other| other != client),
-                Class::Masked(_) => self.masked.retain(|&(_, other)| other != client),
-                Class::Inverted(_) => self.inverted.retain(|&(_, other)| other != client),
-                Class::Standard(id) => {
-                    if let Some(list) = self.standard.get_mut(usize::from(id)) {
-                        list.retain(|&other| other != client);
-                    }
-                }
-                Class::Extended(id) => {
-                    if let Entry::Occupied(mut list) = self.extended.entry(id) {
+                Class::Exact(id) => {
+                    if let Entry::Occupied(mut list) = self.exact.entry(id) {
                         list.get_mut().retain(|&other| other != client);
                         if list.get().is_empty() {
                             list.remove();
                         }
                     }
                 }
+                Class::Errors(_) | Class::Masked(..) => self.walked.retain(|&(_, other)| other != client),
             }
         }
     }
@@ -200,29 +167,11 @@ impl Router {
                 deliver(client, own);
             }
         };
-        if id & ERROR != 0 {
-            self.errors.iter().filter(|(mask, _)| id & mask != 0).for_each(|&(_, client)| offer(client));
-            return;
-        }
-        let matches = |filter: &Filter| id & filter.mask == filter.id;
-        self.all.iter().for_each(|&client| offer(client));
-        self.masked.iter().filter(|(filter, _)| matches(filter)).for_each(|&(_, client)| offer(client));
-        self.inverted.iter().filter(|(filter, _)| !matches(filter)).for_each(|&(_, client)| offer(client));
-        if id & REMOTE != 0 {
-            return;
-        }
-        let exact = if id & EXTENDED == 0 {
-            self.standard.get((id & STANDARD_MASK) as usize)
-        } else {
-            self.extended.get(&id)
-        };
+        let walked = self.walked.iter().filter(|(class, _)| class.passes(id));
+        walked.for_each(|&(_, client)| offer(client));
+        let standard = id & (EXTENDED | REMOTE | ERROR) == 0;
+        let exact = self.exact.get(&if standard { id & STANDARD_MASK } else { id });
         exact.into_iter().flatten().for_each(|&client| offer(client));
-    }
-}
-
-impl Default for Router {
-    fn default() -> Self {
-        Self::new()
     }
 }
 
@@ -284,7 +233,7 @@ mod tests {
             });
             router.insert(ClientId(client as usize), &hello(&filters));
         }
-        assert!(router.all.is_empty() && router.masked.is_empty() && router.inverted.is_empty());
+        assert!(router.walked.is_empty());
         assert_eq!(receivers(&mut router, 300, 0x001, Format::Fd).len(), 254);
         assert_eq!(receivers(&mut router, 300, 0x407, Format::Fd), [(7, false)]);
         assert_eq!(receivers(&mut router, 300, 0x8000_0007, Format::Fd), [(7, false)]);

@@ -2,20 +2,15 @@
 
 use std::path::Path;
 
-use netlink_packet_core::{NlasIterator, ParseableParametrized};
-use netlink_packet_route::AddressFamily;
 use netlink_packet_route::link::{
     CanBitTiming, CanCtrlModeFlags, InfoCan, InfoData, InfoKind, LinkAttribute, LinkFlags, LinkHeader,
     LinkInfo, LinkLayerType,
 };
+use protocol::bus::netlink::attributes;
 
-use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, Place, State};
+use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, State};
 
-/// Bytes of the header before the attributes begin.
-const HEADER: usize = 16;
-
-/// Reads what the kernel says of one interface. What is not understood is left out: a strange interface
-/// must not hide the others.
+/// Reads what the kernel says of one interface.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let header = LinkHeader::parse(bytes).ok()?;
     let is_can = header.link_layer_type == LinkLayerType::Can;
@@ -29,10 +24,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
         counters: Counters::default(),
     };
     let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
-    for attribute in NlasIterator::new(bytes.get(HEADER..)?).flatten() {
-        let Ok(attribute) = LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec) else {
-            continue;
-        };
+    for attribute in attributes(bytes) {
         if let LinkAttribute::IfName(name) = attribute {
             interface.name = name;
         } else if let LinkAttribute::IfAlias(alias) = attribute {
@@ -59,9 +51,11 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     interface.kind = match (is_can, kind) {
         (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
         (true, Some(InfoKind::Vcan)) => Kind::Vcan,
-        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| {
-            let place = namespace.map_or(Place::Here, |id| Place::Namespace { id, name: None });
-            Peer { index, name: None, place }
+        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| Peer {
+            index,
+            name: None,
+            namespace: None,
+            namespace_id: namespace,
         })),
         (true, _) => {
             let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };

@@ -3,8 +3,8 @@
 use protocol::usage::Failure;
 use thiserror::Error;
 
-use super::Rates;
-use crate::link::FD_MTU;
+use super::widen;
+use crate::link::{FD_MTU, Interface, Rates};
 
 /// Why nothing is done: one line, with the command that mends it.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
@@ -30,7 +30,8 @@ pub enum Refusal {
     },
     /// Somebody else's, with too small an MTU.
     #[error(
-        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c 'ip link set {name} down && ip link set {name} mtu {FD_MTU} up'` mends it"
+        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` mends it",
+        widen("ip", name)
     )]
     Narrow {
         /// Its name.
@@ -40,12 +41,9 @@ pub enum Refusal {
     },
     /// Somebody else's, and down.
     #[error(
-        "{name} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {name} up` mends it"
+        "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` mends it"
     )]
-    Down {
-        /// Its name.
-        name: String,
-    },
+    Down(String),
     /// A pair is wanted where there is something else.
     #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {remedy}")]
     OtherPair {
@@ -72,12 +70,9 @@ pub enum Refusal {
     },
     /// A pair of one name in one namespace.
     #[error(
-        "{name} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
+        "{0} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
     )]
-    OneName {
-        /// The name.
-        name: String,
-    },
+    OneName(String),
     /// A bus that has a bit rate and is not there.
     #[error(
         "there is no interface {name}, and {file} gives it a bitrate, so it is hardware: plug it in and load its driver, or leave out bitrate and it will be a vcan"
@@ -108,7 +103,7 @@ pub enum Refusal {
         /// What is set.
         has: Rates,
         /// What the skin wants.
-        wants: String,
+        wants: Rates,
         /// The skin's file.
         file: String,
     },
@@ -163,18 +158,24 @@ pub enum Refusal {
 }
 
 impl Refusal {
+    /// Of what is not virtual, and is left alone.
+    pub(super) fn real(interface: &Interface) -> Self {
+        let (name, what) = (interface.name.clone(), interface.what());
+        if interface.is_can() { Self::Hardware { name, what } } else { Self::NotCan { name, what } }
+    }
+
     /// Whether the command line or the skin is wrong, and not the state of the machine.
     #[must_use]
     pub const fn is_usage(&self) -> bool {
         match self {
             Self::NotCan { .. }
             | Self::Hardware { .. }
-            | Self::OneName { .. }
+            | Self::OneName(_)
             | Self::AtOdds { .. }
             | Self::NoRate { .. }
             | Self::NotOurs { .. } => true,
             Self::Narrow { .. }
-            | Self::Down { .. }
+            | Self::Down(_)
             | Self::OtherPair { .. }
             | Self::OtherEnd { .. }
             | Self::Absent { .. }

@@ -1,7 +1,9 @@
-use proptest::prelude::*;
-
 use super::*;
 use crate::link::{CLASSIC_MTU, Counters};
+
+mod world;
+
+use world::{THERE, World};
 
 fn interface(name: &str, index: u32, kind: Kind) -> Interface {
     let mtu = if matches!(kind, Kind::Other(_)) { 1_500 } else { FD_MTU };
@@ -24,7 +26,8 @@ fn can0(hardware: Hardware, up: bool) -> Interface {
 }
 
 fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> Wanted {
-    let skin = Some(SkinBus { file: "skin.toml".to_owned(), bitrate, data_bitrate });
+    let rates = Rates { bitrate, data_bitrate };
+    let skin = Some(SkinBus { file: "skin.toml".to_owned(), rates });
     Wanted { name: name.to_owned(), format, skin }
 }
 
@@ -32,105 +35,12 @@ fn refused(wanted: &Wanted, present: &[Interface]) -> String {
     up(std::slice::from_ref(wanted), present, false).unwrap_err().to_string()
 }
 
-/// What steps do, as far as the kernel is concerned. A step on what is not ours stops the test.
-#[derive(Clone, Debug, Eq, PartialEq)]
-struct World {
-    here: Vec<Interface>,
-    there: Vec<Interface>,
-}
-
-const THERE: i32 = 7;
-
-impl World {
-    fn of(here: Vec<Interface>) -> Self {
-        Self { here, there: Vec::new() }
-    }
-
-    fn named(&self, name: &str) -> &Interface {
-        find(&self.here, name).unwrap_or_else(|| panic!("{name} is there: {self:?}"))
-    }
-
-    fn by_number(&mut self, index: u32, name: &str) -> &mut Interface {
-        let found = self.here.iter_mut().find(|it| it.index == index).expect("a number that is there");
-        assert_eq!(found.name, name);
-        found
-    }
-
-    fn ours(&mut self, index: u32, name: &str) -> &mut Interface {
-        let found = self.by_number(index, name);
-        assert!(found.ours && found.is_virtual(), "not ours: {found:?}");
-        found
-    }
-
-    fn carry_out(&mut self, step: &Step) {
-        let next = |all: &[Interface]| all.iter().map(|it| it.index).max().unwrap_or(0) + 1;
-        match step {
-            Step::MakeVcan { name } => {
-                assert!(find(&self.here, name).is_none(), "{name} is there already");
-                self.here.push(ours(name, next(&self.here)));
-            }
-            Step::MakePair { name, peer, namespace } => {
-                let first = next(&self.here);
-                let (place, back, second) = match namespace {
-                    None => (Place::Here, Place::Here, first + 1),
-                    Some(_) => (elsewhere(THERE), elsewhere(0), next(&self.there)),
-                };
-                let end = |name: &str, index, peer_index, peer: &str, place| {
-                    let kind =
-                        Kind::Vxcan(Some(Peer { index: peer_index, name: Some(peer.to_owned()), place }));
-                    Interface { ours: true, ..interface(name, index, kind) }
-                };
-                assert!(find(&self.here, name).is_none(), "{name} is there already");
-                self.here.push(end(name, first, second, peer, place));
-                let others = if namespace.is_some() { &mut self.there } else { &mut self.here };
-                assert!(find(others, peer).is_none(), "{peer} is there already");
-                others.push(end(peer, second, first, name, back));
-            }
-            Step::BringUp { name, index } => self.ours(*index, name).up = true,
-            Step::Widen { name, index, from, was_up } => {
-                let found = self.ours(*index, name);
-                assert_eq!((found.mtu, found.up), (*from, *was_up));
-                (found.mtu, found.up) = (FD_MTU, true);
-            }
-            Step::SetRates { name, index, rates, before, was_up } => {
-                let found = self.by_number(*index, name);
-                assert_eq!(found.up, *was_up);
-                let Kind::Hardware(hardware) = &mut found.kind else { panic!("no hardware: {found:?}") };
-                assert_eq!(Rates::of(hardware), *before);
-                (hardware.bitrate, hardware.data_bitrate) = (rates.bitrate, rates.data_bitrate);
-                hardware.fd = rates.data_bitrate.is_some();
-                found.mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
-                found.up = true;
-            }
-            Step::Remove { name, index } => {
-                let removed = self.ours(*index, name).clone();
-                let peer = if let Kind::Vxcan(Some(Peer { index, place: Place::Here, .. })) = &removed.kind {
-                    Some(*index)
-                } else {
-                    None
-                };
-                self.here.retain(|it| it.index != *index && Some(it.index) != peer);
-            }
-        }
-    }
-
-    fn carry_out_all(&self, plan: &Plan) -> Self {
-        let mut after = self.clone();
-        plan.steps.iter().for_each(|step| after.carry_out(step));
-        after
-    }
-}
-
-fn elsewhere(id: i32) -> Place {
-    Place::Namespace { id, name: None }
-}
-
 #[test]
 fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
     let wanted = ["vcan0", "vcan1"].map(Wanted::named);
     let world = World::of(vec![interface("vcan0", 2, Kind::Vcan)]);
     let plan = up(&wanted, &world.here, false).unwrap();
-    assert_eq!(plan.steps, [Step::MakeVcan { name: "vcan1".into() }]);
+    assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: Action::MakeVcan }]);
     assert_eq!(plan.left, ["vcan0 is there already, and fits (a vcan, made by somebody else)"]);
     let again = up(&wanted, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
@@ -359,7 +269,7 @@ fn only_what_is_ours_is_removed() {
     let names = ["vcan0", "vcan1", "can0", "vcan9"];
     let skin = names.map(|name| in_skin(name, Format::Fd, None, None));
     let plan = down(&skin, &present).unwrap();
-    assert_eq!(plan.steps, [Step::Remove { name: "vcan0".into(), index: 2 }]);
+    assert_eq!(plan.steps, [Step { name: "vcan0".into(), action: Action::Remove { index: 2 } }]);
     assert_eq!(
         plan.left,
         [
@@ -391,114 +301,5 @@ fn the_mark_on_something_real_is_not_believed() {
     for name in ["can0", "eth0"] {
         assert!(up(&[Wanted::named(name)], &present, true).is_err(), "{name}");
         assert!(down(&[Wanted::named(name)], &present).is_err(), "{name}");
-    }
-}
-
-const NAMES: [&str; 5] = ["vcan0", "vcan1", "vcan2", "can0", "eth0"];
-
-/// Interfaces of distinct names, two of which may be the ends of a pair.
-fn any_world() -> impl Strategy<Value = World> {
-    let one = (0..5_u8, any::<bool>(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
-    (proptest::collection::vec(proptest::option::of(one), NAMES.len()), any::<bool>()).prop_map(
-        |(given, pair)| {
-            let mut here = Vec::new();
-            for ((name, given), index) in NAMES.into_iter().zip(given).zip(2..) {
-                let Some((kind, ours, up, wide, rate, data)) = given else { continue };
-                let kind = match kind {
-                    0 | 1 => Kind::Vcan,
-                    2 => Kind::Vxcan(None),
-                    3 => Kind::Hardware(kvaser(
-                        (rate > 0).then_some(rate * 250_000),
-                        (rate > 0 && data > 0).then_some(data * 1_000_000),
-                    )),
-                    _ => Kind::Other("a network interface (ether)".to_owned()),
-                };
-                let mtu = if wide { FD_MTU } else { CLASSIC_MTU };
-                here.push(Interface { ours, up, mtu, ..interface(name, index, kind) });
-            }
-            if let (true, [first, second, ..]) = (pair, here.as_mut_slice()) {
-                let to = |it: &Interface| Peer { index: it.index, name: None, place: Place::Here };
-                let kinds = (Kind::Vxcan(Some(to(second))), Kind::Vxcan(Some(to(first))));
-                (first.kind, second.kind) = kinds;
-            }
-            World::of(here)
-        },
-    )
-}
-
-fn any_wanted() -> impl Strategy<Value = Vec<Wanted>> {
-    let one = (0..NAMES.len(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
-    let wanted = one.prop_map(|(name, skin, fd, rate, data)| {
-        let name = NAMES[name];
-        if !skin {
-            return Wanted::named(name);
-        }
-        let format = if fd { Format::Fd } else { Format::Classic };
-        let bitrate = (rate > 0).then_some(rate * 250_000);
-        let data = (rate > 0 && data > 0 && fd).then_some(data * 1_000_000);
-        in_skin(name, format, bitrate, data)
-    });
-    // A name once: two skins may want different things of one bus.
-    proptest::collection::vec(wanted, 0..5).prop_map(|mut all| {
-        let mut seen = std::collections::HashSet::new();
-        all.retain(|wanted| seen.insert(wanted.name.clone()));
-        all
-    })
-}
-
-proptest! {
-    #[test]
-    fn a_plan_leads_to_what_is_wanted_and_touches_nothing_else(
-        world in any_world(), wanted in any_wanted(), set: bool,
-    ) {
-        let Ok(plan) = up(&wanted, &world.here, set) else {
-            let harmless = |wanted: &Wanted| find(&world.here, &wanted.name)
-                .map_or_else(|| !wanted.is_hardware(), |it| it.is_virtual() && it.ours);
-            prop_assert!(!wanted.iter().all(harmless), "refused, and all could have been had");
-            return Ok(());
-        };
-        let after = world.carry_out_all(&plan);
-        for wanted in &wanted {
-            let it = after.named(&wanted.name);
-            prop_assert!(it.is_can() && it.up && wanted.carried_by(it.mtu), "{it:?}");
-        }
-        for before in &world.here {
-            let hardware = matches!(before.kind, Kind::Hardware(_));
-            let may_change = wanted.iter().any(|it| it.name == before.name)
-                && (before.is_virtual() && before.ours || hardware && set);
-            prop_assert!(may_change || after.named(&before.name) == before, "{before:?}");
-        }
-        prop_assert_eq!(up(&wanted, &after.here, set).unwrap().steps, []);
-        prop_assert_eq!(up(&wanted, &after.here, false).unwrap().steps, []);
-    }
-
-    #[test]
-    fn down_takes_back_what_up_made(world in any_world(), wanted in any_wanted()) {
-        let Ok(plan) = up(&wanted, &world.here, false) else { return Ok(()) };
-        let after = world.carry_out_all(&plan);
-        let made: Vec<_> = plan.steps.iter().map(|step| Wanted::named(step.name())).collect();
-        let end = after.carry_out_all(&down(&made, &after.here).unwrap());
-        let kept = |it: &&Interface| plan.steps.iter().all(|step| step.name() != it.name);
-        for before in world.here.iter().filter(kept) {
-            let taken_along = matches!(&before.kind, Kind::Vxcan(Some(Peer { place: Place::Here, .. })));
-            prop_assert!(taken_along || end.named(&before.name) == before);
-        }
-        prop_assert!(made.iter().all(|wanted| find(&end.here, &wanted.name).is_none()));
-    }
-
-    #[test]
-    fn down_removes_what_is_ours_and_only_that(world in any_world(), wanted in any_wanted()) {
-        let Ok(plan) = down(&wanted, &world.here) else {
-            let foreign = |wanted: &Wanted| find(&world.here, &wanted.name)
-                .is_some_and(|it| !it.ours || !it.is_virtual());
-            prop_assert!(wanted.iter().any(|wanted| wanted.skin.is_none() && foreign(wanted)));
-            return Ok(());
-        };
-        let after = world.carry_out_all(&plan);
-        for wanted in &wanted {
-            let left = find(&after.here, &wanted.name);
-            prop_assert!(left.is_none_or(|it| !it.ours || !it.is_virtual()), "{left:?}");
-        }
-        prop_assert_eq!(down(&wanted, &after.here).unwrap().steps, []);
     }
 }

@@ -1,5 +1,4 @@
-//! The system calls that have no safe wrapper: many datagrams at once, and an interface's MTU and flags,
-//! how a process is scheduled.
+//! The system calls that have no safe wrapper: many datagrams at once, and how a process is scheduled.
 //! Decides nothing.
 
 use std::io;
@@ -79,38 +78,4 @@ pub(super) fn send<'a>(
         )
     };
     usize::try_from(count).map_err(|_| io::Error::last_os_error())
-}
-
-/// What the kernel says of an interface.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Interface {
-    /// The largest frame in bytes: 16 classic, 72 FD.
-    pub(super) mtu: i32,
-    /// Whether it is up (`IFF_UP`).
-    pub(super) up: bool,
-}
-
-/// Asks for the MTU and the flags of the interface `name`, with any socket.
-pub(super) fn interface(fd: BorrowedFd<'_>, name: &str) -> io::Result<Interface> {
-    // SAFETY: an `ifreq` of zeros is a valid one: an empty name and a union of plain numbers.
-    let mut request: libc::ifreq = unsafe { mem::zeroed() };
-    let room = request.ifr_name.len() - 1;
-    for (to, from) in request.ifr_name.iter_mut().zip(name.bytes().take(room)) {
-        *to = libc::c_char::from_ne_bytes([from]);
-    }
-    // SAFETY: both requests read the name, which ends in a zero, and write within the `ifreq`.
-    let asked = unsafe { libc::ioctl(fd.as_raw_fd(), libc::SIOCGIFMTU, &raw mut request) };
-    if asked < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: SIOCGIFMTU has filled this member of the union.
-    let mtu = unsafe { request.ifr_ifru.ifru_mtu };
-    // SAFETY: as above.
-    let asked = unsafe { libc::ioctl(fd.as_raw_fd(), libc::SIOCGIFFLAGS, &raw mut request) };
-    if asked < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: SIOCGIFFLAGS has filled this member of the union.
-    let flags = unsafe { request.ifr_ifru.ifru_flags };
-    Ok(Interface { mtu, up: i32::from(flags) & libc::IFF_UP != 0 })
 }

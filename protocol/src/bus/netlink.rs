@@ -1,4 +1,4 @@
-//! A socket to the kernel: one request, and all that answers it.
+//! A socket to the kernel that speaks of interfaces (rtnetlink): one request, and all that answers it.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -6,9 +6,10 @@ use std::time::Duration;
 
 use netlink_packet_core::{
     ErrorBuffer, NLM_F_ACK, NLM_F_DUMP_INTR, NLM_F_REQUEST, NLMSG_DONE, NLMSG_ERROR, NetlinkBuffer,
-    NetlinkHeader, NetlinkMessage, NetlinkPayload,
+    NetlinkHeader, NetlinkMessage, NetlinkPayload, NlasIterator, ParseableParametrized,
 };
-use netlink_packet_route::RouteNetlinkMessage;
+use netlink_packet_route::link::LinkAttribute;
+use netlink_packet_route::{AddressFamily, RouteNetlinkMessage};
 use rustix::net::netlink::SocketAddrNetlink;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
@@ -17,16 +18,22 @@ use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How often a list that changed while it was read is read again.
 const RETRIES: usize = 8;
+/// Bytes of `struct ifinfomsg`, after which the attributes begin.
+const HEADER: usize = 16;
 
 /// A socket of the namespace in which it was opened.
 #[derive(Debug)]
-pub(super) struct Exchange {
+pub struct Exchange {
     socket: OwnedFd,
     sequence: u32,
 }
 
 impl Exchange {
-    pub(super) fn open() -> io::Result<Self> {
+    /// A socket of the calling thread's namespace.
+    ///
+    /// # Errors
+    /// When the system gives no such socket.
+    pub fn open() -> io::Result<Self> {
         let socket = rustix::net::socket_with(
             rustix::net::AddressFamily::NETLINK,
             SocketType::RAW,
@@ -39,8 +46,11 @@ impl Exchange {
         Ok(Self { socket, sequence: 0 })
     }
 
-    /// Sends one request and takes all that answers it.
-    pub(super) fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
+    /// Sends one request and takes all that answers it: the messages, each without its netlink header.
+    ///
+    /// # Errors
+    /// What the kernel says, or that it does not answer.
+    pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
         for _ in 0..RETRIES {
             let (answers, interrupted) = self.ask(payload.clone(), flags)?;
             if !interrupted {
@@ -89,4 +99,12 @@ impl Exchange {
             }
         }
     }
+}
+
+/// What one answer about an interface says of it. What is not understood is left out: a strange interface must not
+/// hide the others.
+pub fn attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
+    NlasIterator::new(answer.get(HEADER..).unwrap_or_default())
+        .flatten()
+        .filter_map(|attribute| LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec).ok())
 }

@@ -5,34 +5,34 @@ use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 
 /// One client with these wishes, one frame, and whether the client receives it.
 #[derive(Clone, Debug)]
-pub struct Case {
+pub(crate) struct Case {
     /// What is shown, as a sentence.
-    pub what: &'static str,
+    pub(crate) what: &'static str,
     /// The client's filters.
-    pub filters: Vec<Filter>,
+    pub(crate) filters: Vec<Filter>,
     /// Whether it wants its own frames.
-    pub own_frames: bool,
+    pub(crate) own_frames: bool,
     /// Whether it wants CAN FD frames.
-    pub fd: bool,
+    pub(crate) fd: bool,
     /// Which error frames it wants.
-    pub error_mask: u32,
+    pub(crate) error_mask: u32,
     /// Whether the client itself sends the frame; else another does.
-    pub from_self: bool,
+    pub(crate) from_self: bool,
     /// What is sent.
-    pub frame: Frame,
+    pub(crate) frame: Frame,
     /// Whether the client receives it: once, whatever the number of filters that match.
-    pub received: bool,
+    pub(crate) received: bool,
 }
 
 /// A datagram that no `CAN_RAW` socket sends.
 #[derive(Clone, Debug)]
-pub struct Refused {
+pub(crate) struct Refused {
     /// What is wrong with it.
-    pub what: &'static str,
+    pub(crate) what: &'static str,
     /// Whether the sender opened the bus for CAN FD.
-    pub fd: bool,
+    pub(crate) fd: bool,
     /// The bytes.
-    pub datagram: Vec<u8>,
+    pub(crate) datagram: Vec<u8>,
 }
 
 const EXACT_EXTENDED: u32 = EXTENDED_MASK | EXTENDED | REMOTE;
@@ -54,8 +54,7 @@ fn remote(id: u32) -> Frame {
 }
 
 /// Every rule, each with what passes and what does not.
-#[must_use]
-pub fn cases() -> Vec<Case> {
+pub(crate) fn cases() -> Vec<Case> {
     let exact = |id| Filter { id, mask: Filter::EXACT_MASK };
     let masked = |id, mask| Filter { id, mask };
     let case = |what, filters: &[Filter], frame, received| Case {
@@ -330,8 +329,7 @@ pub fn cases() -> Vec<Case> {
 }
 
 /// Every datagram that is refused.
-#[must_use]
-pub fn refused() -> Vec<Refused> {
+pub(crate) fn refused() -> Vec<Refused> {
     let sized = |what, size| Refused { what, fd: true, datagram: vec![0; size] };
     let long = |what, frame: Frame, len: u8| {
         let mut datagram = frame.to_bytes().get(..frame.byte_len()).unwrap_or_default().to_vec();
@@ -353,17 +351,12 @@ pub fn refused() -> Vec<Refused> {
     ]
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_case_has_its_own_name() {
-        let mut names: Vec<_> = cases().iter().map(|case| case.what).collect();
-        names.extend(refused().iter().map(|case| case.what));
-        let count = names.len();
-        names.sort_unstable();
-        names.dedup();
-        assert_eq!(names.len(), count);
-    }
+#[test]
+fn every_case_has_its_own_name() {
+    let mut names: Vec<_> = cases().iter().map(|case| case.what).collect();
+    names.extend(refused().iter().map(|case| case.what));
+    let count = names.len();
+    names.sort_unstable();
+    names.dedup();
+    assert_eq!(names.len(), count);
 }

@@ -1,0 +1,110 @@
+//! A client of an embedded bus.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
+use socketcan::{CanFdSocket, SocketOptions};
+
+use super::{Answer, FilterPart, Hello, OWN_BYTE, VERSION, decode_dropped};
+use super::{address, open_directory, usual_directory};
+use crate::bus::batch::{self, Datagram};
+use crate::bus::kinds::Carrier;
+use crate::bus::{Bus, BusError, Filter, Options};
+
+/// How long a client waits for a server: it answers at once unless it is stopped.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// Room for what the server has not read yet: some 700 FD frames, a whole skin's answers in one go.
+const SEND_BUFFER: usize = 1 << 18;
+
+/// Buses that a process of this user serves.
+pub(in crate::bus) struct Embedded;
+
+impl Carrier for Embedded {
+    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
+        let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
+        let gone = |errno| match errno {
+            Errno::PIPE | Errno::CONNRESET => BusError::Closed(name.to_owned()),
+            errno => failed(errno),
+        };
+        let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: PATIENCE };
+        let socket = CanFdSocket::from(connect(name, options)?);
+        socket.set_recv_timestamp(true).map_err(|source| BusError::refused(name, "set up", source))?;
+        let hello = Hello {
+            filters: options.filters.clone(),
+            own_frames: options.own_frames,
+            fd: options.fd,
+            error_mask: options.error_mask,
+            buffer: options.receive_buffer as u64,
+        };
+        rustix::net::send(&socket, &hello.encode(), SendFlags::NOSIGNAL).map_err(gone)?;
+        let wait = Timespec::try_from(PATIENCE).unwrap_or_default();
+        let mut polled = [PollFd::new(&socket, PollFlags::IN)];
+        if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).map_err(failed)? == 0 {
+            return Err(no_answer());
+        }
+        let mut bytes = [0; 64];
+        let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::DONTWAIT).map_err(gone)?;
+        sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, None).map_err(failed)?;
+        match Answer::decode(bytes.get(..len).unwrap_or_default()) {
+            Some(Answer::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
+            Some(Answer::Refused { version }) => {
+                Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
+            }
+            None => Err(BusError::Closed(name.to_owned())),
+        }
+    }
+
+    fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError> {
+        let parts: Vec<_> = FilterPart::split(filters).map(|part| part.encode()).collect();
+        let send = |sent| parts.get::<usize>(sent).map_or(Ok(0), |part| batch::send_one(&bus.socket, part));
+        Ok(bus.patiently(parts.len(), send)?)
+    }
+
+    fn is_virtual(&self, _name: &str) -> io::Result<bool> {
+        Ok(true)
+    }
+
+    fn is_own(&self, frame: Datagram<'_>) -> bool {
+        frame.bytes().and_then(|bytes| bytes.get(OWN_BYTE)) == Some(&1)
+    }
+
+    fn dropped(&self, notice: &[u8]) -> Option<u32> {
+        decode_dropped(notice)
+    }
+
+    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError> {
+        matches!(errno, Errno::PIPE | Errno::CONNRESET | Errno::NOTCONN).then_some(BusError::Closed)
+    }
+}
+
+/// A socket that a server has taken, or that waits among those that it will take; it gives up sending in time.
+fn connect(name: &str, options: &Options) -> Result<OwnedFd, BusError> {
+    let directory = options.directory.clone().unwrap_or_else(usual_directory);
+    let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
+    let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };
+    open_directory(&directory)
+        .map_err(|error| if error.is_absent() { not_served() } else { error.into() })?;
+    let address = address(&directory, name)?;
+    let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
+    // A connection waits while the server's list of new clients is full; the timeout bounds that.
+    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(PATIENCE)).map_err(failed)?;
+    sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
+    match rustix::net::connect(&socket, &address) {
+        Ok(()) => Ok(socket),
+        Err(Errno::NOENT | Errno::CONNREFUSED) => Err(not_served()),
+        Err(Errno::AGAIN) => Err(BusError::NoAnswer { name: name.to_owned(), waited: PATIENCE }),
+        Err(errno) => Err(failed(errno)),
+    }
+}
+
+/// A socket as both ends of an embedded bus have it.
+///
+/// # Errors
+/// When the system gives none.
+pub fn seqpacket(flags: SocketFlags) -> rustix::io::Result<OwnedFd> {
+    rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags | SocketFlags::CLOEXEC, None)
+}

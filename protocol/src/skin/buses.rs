@@ -1,0 +1,76 @@
+//! Buses, from what a file says to what it means.
+
+use std::collections::HashSet;
+
+use super::check::Checked;
+use super::{Bus, Reply, raw, sensing};
+use crate::can::Format;
+use crate::document::Place;
+use crate::wire_time::BitRates;
+
+/// Buses of a skin.
+const BUSES: usize = 64;
+
+pub(super) fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
+    if raw.is_empty() {
+        return Err(Place::named("bus").fault("[]", "at least one bus is needed"));
+    }
+    if raw.len() > BUSES {
+        let why = format!("a skin has at most {BUSES} buses");
+        return Err(Place::named("bus").fault(format!("{} buses", raw.len()), why));
+    }
+    let mut seen = HashSet::new();
+    let bus = |(index, bus): (usize, &raw::Bus)| {
+        let at = Place::named("bus").nth(index);
+        let name = bus.name.clone();
+        if !crate::bus::is_plain(&name) || name.starts_with('.') {
+            let why = "an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`";
+            return Err(at.key("name").fault(format_args!("{name:?}"), why));
+        }
+        if !seen.insert(name.clone()) {
+            return Err(at.key("name").fault(format_args!("{name:?}"), "this bus is named twice"));
+        }
+        let reply = reply(&at, bus)?;
+        let format =
+            at.key("format").word(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
+        let (bitrate, data_bitrate) = bit_rates(&at, bus, format)?;
+        Ok(Bus { name, reply, format, bitrate, data_bitrate, sensing: sensing::of_bus(&at, bus)? })
+    };
+    raw.iter().enumerate().map(bus).collect()
+}
+
+/// What the cells of a bus answer with.
+fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
+    let sums = at.key("reply").word(&bus.reply, &[("torque", false), ("sum", true)])?;
+    let only_sum = "only with reply = \"sum\"";
+    match (sums, bus.slot_us, bus.carry) {
+        (false, None, None) => Ok(Reply::Torque),
+        (false, Some(got), _) => Err(at.key("slot_us").fault(got, only_sum)),
+        (false, None, Some(got)) => Err(at.key("carry").fault(got, only_sum)),
+        (true, Some(got), carry) => match u32::try_from(got) {
+            Ok(slot_us @ 1..) => Ok(Reply::Sum { slot_us, carry: carry.unwrap_or(true) }),
+            Ok(0) | Err(_) => Err(at.key("slot_us").fault(got, "must be above 0")),
+        },
+        (true, None, _) => Err(at.key("reply").fault("\"sum\"", "slot_us is needed with it")),
+    }
+}
+
+/// The bit rates of hardware, which need not be said.
+fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
+    let within = |key, got, least, greatest| at.key(key).within(got, least..=greatest, " bit/s");
+    let (least, greatest) = (BitRates::LEAST_NOMINAL, BitRates::GREATEST_NOMINAL);
+    let bitrate = bus.bitrate.map(|got| within("bitrate", got, least, greatest)).transpose()?;
+    let data_bitrate = match (bus.data_bitrate, format, bitrate) {
+        (None, _, _) => None,
+        (Some(got), Format::Classic, _) => {
+            return Err(at.key("data_bitrate").fault(got, "only with format = \"fd\""));
+        }
+        (Some(got), Format::Fd, None) => {
+            return Err(at.key("data_bitrate").fault(got, "only together with bitrate"));
+        }
+        (Some(got), Format::Fd, Some(least)) => {
+            Some(within("data_bitrate", got, least, BitRates::GREATEST_DATA)?)
+        }
+    };
+    Ok((bitrate, data_bitrate))
+}

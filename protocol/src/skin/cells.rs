@@ -1,0 +1,159 @@
+//! Cells, from what a file says to what it means.
+
+use std::collections::HashMap;
+
+use super::check::Checked;
+use super::{Bus, Cell, Robot, raw};
+use crate::document::Place;
+use crate::fixed::Q;
+use crate::id::CellId;
+use crate::parameters::Contact;
+
+/// How far a quaternion's length may be from one.
+const UNIT_TOLERANCE: f64 = 1e-3;
+/// Metres that words in Q1.14 can hold, less some steps for what a chain of roundings adds.
+const REACH: f64 = 2.0 - 1e-3;
+
+pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Vec<Cell>> {
+    let mut taken = HashMap::new();
+    let mut serials = HashMap::new();
+    let mut cells = Vec::with_capacity(raw.len());
+    for (index, raw) in raw.iter().enumerate() {
+        let at = Place::named("cell").nth(index);
+        let cell = cell(&at, raw, robot, buses, base)?;
+        if let Some(first) = taken.insert((cell.bus, cell.node), index) {
+            let why = format!("cell[{first}] has this node on {:?} already", raw.bus);
+            return Err(at.key("node").fault(raw.node, why));
+        }
+        if let Some(first) = serials.insert(cell.serial, index) {
+            let why = format!("cell[{first}] has this serial number already");
+            return Err(at.key("serial").fault(cell.serial, why));
+        }
+        cells.push(cell);
+    }
+    for (index, port, cell, neighbor) in mentions(&cells) {
+        if neighbor == cell.node || !taken.contains_key(&(cell.bus, neighbor)) {
+            let why = "must be the node of another cell on the same bus, or 0";
+            return Err(Place::named("cell").nth(index).key("neighbors").nth(port).fault(neighbor, why));
+        }
+    }
+    contradictions(&cells)?;
+    Ok(cells)
+}
+
+/// By cell and port, whom each cell names as its neighbors.
+fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
+    cells.iter().enumerate().flat_map(|(index, cell)| {
+        let ports = cell.neighbors.iter().enumerate();
+        ports.filter_map(move |(port, neighbor)| Some((index, port, cell, (*neighbor)?)))
+    })
+}
+
+/// Every wire has two ends: whom a cell names so often must name it as often.
+fn contradictions(cells: &[Cell]) -> Checked<()> {
+    let mut all = HashMap::new();
+    for (.., cell, neighbor) in mentions(cells) {
+        *all.entry((cell.bus, cell.node, neighbor)).or_insert(0) += 1;
+    }
+    let mut named = HashMap::new();
+    for (index, port, cell, neighbor) in mentions(cells) {
+        let node = cell.node;
+        let so_far = named.entry((cell.bus, node, neighbor)).or_insert(0);
+        *so_far += 1;
+        if *so_far > all.get(&(cell.bus, neighbor, node)).copied().unwrap_or(0) {
+            let why = format!(
+                "this wire has no other end: name node {node} in a further one of the neighbors of node {neighbor}, \
+                 or put 0 here"
+            );
+            return Err(Place::named("cell").nth(index).key("neighbors").nth(port).fault(neighbor, why));
+        }
+    }
+    Ok(())
+}
+
+fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Cell> {
+    let bus = buses.iter().position(|bus| bus.name == raw.bus).ok_or_else(|| {
+        let names = buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
+        at.key("bus").fault(format_args!("{:?}", raw.bus), format_args!("no such bus; there is {names}"))
+    })?;
+    let node = CellId::new(raw.node);
+    let why = "a cell's node is 1 to 254; further cells need another bus";
+    let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
+    let joints = robot.joints.len();
+    let joint = u8::try_from(raw.joint).ok().filter(|&joint| joint > 0 && usize::from(joint) <= joints);
+    let why = format_args!("the robot has joints 1 to {joints}");
+    let joint = joint.ok_or_else(|| at.key("joint").fault(raw.joint, why))?;
+    for (axis, &value) in raw.position.iter().enumerate() {
+        at.key("position").nth(axis).finite(value)?;
+    }
+    let reach = reach(robot, joint, raw.position);
+    if reach >= REACH {
+        let [x, y, z] = raw.position;
+        let why = format!(
+            "node {node} can come {reach:.3} m from a joint, {:.3} m more than the {REACH} m that Q1.14 holds",
+            reach - REACH
+        );
+        return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
+    }
+    let length = raw.orientation.iter().map(|part| part * part).sum::<f64>().sqrt();
+    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
+        let [x, y, z, w] = raw.orientation;
+        let why = format!("this quaternion has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
+        return Err(at.key("orientation").fault(format_args!("[{x}, {y}, {z}, {w}]"), why));
+    }
+    let orientation = raw.orientation.map(|part| part / length);
+    let mut neighbors = [None; 4];
+    for (port, (neighbor, &got)) in neighbors.iter_mut().zip(&raw.neighbors).enumerate() {
+        if got != 0 {
+            let wrong = |_| at.key("neighbors").nth(port).fault(got, "a node is 1 to 254, or 0 for none");
+            *neighbor = Some(CellId::new(got).map_err(wrong)?);
+        }
+    }
+    let serial = raw.serial.unwrap_or_else(|| default_serial(bus, node));
+    Ok(Cell {
+        bus,
+        node,
+        serial: at.key("serial").within(serial, 0..=u32::MAX, "")?,
+        joint,
+        position: raw.position,
+        orientation,
+        normal: normal(orientation),
+        neighbors,
+        root: raw.root,
+        contact: contact(at, raw.contact(), base)?,
+    })
+}
+
+/// Takes what is given, and the rest from `base`.
+pub(super) fn contact(at: &Place, raw: raw::Contact, base: Contact) -> Checked<Contact> {
+    let raw::Contact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } = raw;
+    let mut to = base;
+    at.key("alpha_c").set(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
+    at.key("alpha_p").set(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
+    at.key("contact_threshold_n").set(contact_threshold_n, &mut to.contact_threshold, Q::try_at_least)?;
+    at.key("proximity_threshold").set(proximity_threshold, &mut to.proximity_threshold, Q::try_at_least)?;
+    at.key("force_threshold_n").set(force_threshold_n, &mut to.force_threshold, Q::try_at_least)?;
+    Ok(to)
+}
+
+/// A cell that is given no serial number gets one that no other such cell gets.
+fn default_serial(bus: usize, node: CellId) -> i64 {
+    i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
+}
+
+/// The z axis of an orientation.
+fn normal([x, y, z, w]: [f64; 4]) -> [f64; 3] {
+    [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
+}
+
+/// The farthest that a cell can come from the origin of any frame below it (of the base: from its
+/// axis), whatever the joints do: the lengths of the links, added up. No moment of a unit force that a
+/// kernel meets on its way is greater.
+fn reach(robot: &Robot, joint: u8, position: [f64; 3]) -> f64 {
+    let mut reach = position.iter().map(|x| x * x).sum::<f64>().sqrt();
+    for (index, row) in robot.joints.iter().enumerate().take(usize::from(joint)).rev() {
+        // The first joint's offset lies along its own axis, to which it adds no distance.
+        reach += if index == 0 { row.a.abs() } else { row.a.hypot(row.d) };
+    }
+    reach
+}

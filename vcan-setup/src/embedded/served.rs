@@ -1,0 +1,72 @@
+//! A bus in a thread of this process.
+
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::thread::JoinHandle;
+
+use protocol::bus::embedded::usual_directory;
+
+use super::{ServeError, Server, Totals};
+
+/// A bus that is served by a thread of this process until this is dropped.
+#[derive(Debug)]
+pub struct Served {
+    path: PathBuf,
+    stop: Option<UnixStream>,
+    thread: Option<JoinHandle<Result<Totals, ServeError>>>,
+}
+
+impl Served {
+    /// Serves a bus in the usual directory.
+    ///
+    /// # Errors
+    /// As [`Server::bind`].
+    pub fn start(name: &str) -> Result<Self, ServeError> {
+        Self::start_in(&usual_directory(), name)
+    }
+
+    /// Serves a bus in another directory.
+    ///
+    /// # Errors
+    /// As [`Server::bind`].
+    pub fn start_in(directory: &Path, name: &str) -> Result<Self, ServeError> {
+        let failed = |doing| move |source| ServeError::Io { name: name.to_owned(), doing, source };
+        let server = Server::bind_in(directory, name)?;
+        let path = server.path().to_owned();
+        let (stop, stopped) = UnixStream::pair().map_err(failed("make a handle to stop it"))?;
+        let thread = std::thread::Builder::new()
+            .name(format!("bus {name}"))
+            .spawn(move || server.run(stopped))
+            .map_err(failed("start a thread"))?;
+        Ok(Self { path, stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// The socket's path.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Stops serving; what the bus has done.
+    ///
+    /// # Errors
+    /// When it had failed before.
+    ///
+    /// # Panics
+    /// When its thread did.
+    pub fn stop(mut self) -> Result<Totals, ServeError> {
+        drop(self.stop.take());
+        let thread = self.thread.take().expect("stopped once");
+        thread.join().expect("the bus's thread does not panic")
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
+            // Who wants to know the outcome calls `stop`.
+            let _ = thread.join();
+        }
+    }
+}
