@@ -12,7 +12,7 @@ use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
-use protocol::schema::PACKETS;
+use protocol::schema::packets;
 use protocol::usage::{Failure, print};
 
 use super::ack;
@@ -271,8 +271,8 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
 /// A value of a field of the sensors.
 fn felt<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let layouts =
-        PACKETS.iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| schema.layouts);
-    let field = layouts.flat_map(|layout| layout.fields).find(|field| field.name == name);
+        packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
+    let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
     let field = field.ok_or_else(|| format!("{option}: cells feel no {name}"))?;
     let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
     Ok(Q::from_bits(word))

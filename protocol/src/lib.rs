@@ -12,6 +12,7 @@ pub mod id;
 pub mod message;
 pub mod packet;
 pub mod parameters;
+#[cfg(feature = "host")]
 pub mod schema;
 #[cfg(feature = "host")]
 pub mod skin;

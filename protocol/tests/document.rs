@@ -7,51 +7,52 @@
 
 use core::fmt::Write;
 
-use protocol::id::Kind;
+use protocol::id::{Command, Kind};
 use protocol::message::State;
 use protocol::parameters::Parameter;
-use protocol::schema::{Field, Format, Layout, PACKETS, PORT_MESSAGES, PacketSchema, REASONS, Range};
+use protocol::schema::{Field, Format, Layout, PacketSchema, Range, packets, reasons, wires};
 
 const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/protocol.md");
 
 /// Every table by its name.
 fn tables() -> [(&'static str, String); 4] {
-    let of = |kind| PACKETS.iter().find(|schema| schema.kind == kind).unwrap();
+    let of = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
     [
-        ("packets", packets()),
-        ("sensors", fields("page", of(Kind::Sensors).layouts)),
-        ("network", fields("page", of(Kind::Network).layouts)),
-        ("parameters", fields("parameter", of(Kind::Configured).layouts)),
+        ("packets", kinds()),
+        ("sensors", fields("page", &of(Kind::Sensors).layouts)),
+        ("network", fields("page", &of(Kind::Network).layouts)),
+        ("parameters", fields("parameter", &of(Kind::Configured).layouts)),
     ]
 }
 
 /// One line a kind or command.
-fn packets() -> String {
+fn kinds() -> String {
     let head = "| identifier | name | from | node field | words | epoch byte | count byte |\n|---|---|---|---|---|---|---|\n";
     let mut out = head.to_owned();
-    for schema in PACKETS {
+    for schema in packets() {
         let PacketSchema { kind, command, end, layouts, .. } = schema;
-        let first = *kind as u8;
+        let digit = *kind as u8;
         let id = match (command, kind) {
-            (Some(command), _) => format!("`{first}{:02}`", *command as u8),
-            (None, Kind::Configure | Kind::Stimulus) => format!("`{first}nn`, `{first}FF`"),
-            (None, _) => format!("`{first}nn`"),
+            (Some(command), _) => format!("`{digit}{:02}`", *command as u8),
+            (None, Kind::Configure | Kind::Stimulus) => format!("`{digit}nn`, `{digit}FF`"),
+            (None, _) => format!("`{digit}nn`"),
         };
         let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
-        let words = match layouts {
-            [] => "0".to_owned(),
-            [Layout { fields: [words, ..], .. }] => {
+        let first = layouts.first().and_then(|layout| layout.fields.first());
+        let words = match first {
+            None => "0".to_owned(),
+            Some(words) if layouts.len() == 1 => {
                 format!("{}, {}, {}", words.meaning, unit(words), format_of(words))
             }
-            _ if is_parameter => "see [parameters](#parameters)".to_owned(),
-            _ => "a page".to_owned(),
+            Some(_) if is_parameter => "see [parameters](#parameters)".to_owned(),
+            Some(_) => "a page".to_owned(),
         };
-        let only = layouts.first().filter(|_| layouts.len() == 1).map_or(&[][..], |layout| layout.fields);
-        let at = |from: u8, to: u8| {
-            let there = end.iter().chain(only).filter(move |field| (from..to).contains(&field.at));
+        let only = layouts.first().filter(|_| layouts.len() == 1).map_or(&[][..], |layout| &layout.fields);
+        let at = |from: usize, to: usize| {
+            let there = end.iter().chain(only).filter(move |field| (from..to).contains(&field.at()));
             let mut there: Vec<_> = there.collect();
-            there.sort_by_key(|field| field.at);
-            let flag = |field: &Field| if field.at == 111 { "+ 0x80: " } else { "" };
+            there.sort_by_key(|field| field.at());
+            let flag = |field: &Field| if field.at() == 111 { "+ 0x80: " } else { "" };
             let all: Vec<_> = there
                 .iter()
                 .map(|field| format!("{}{}{}", flag(field), field.meaning, range(field)))
@@ -64,7 +65,7 @@ fn packets() -> String {
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => ("cell", "sender"),
             Kind::Configure | Kind::Stimulus => ("gateway", "addressee"),
         };
-        let (name, epoch, count) = (schema.name(), at(96, 104), at(104, 112));
+        let (name, epoch, count) = (command.map_or(kind.name(), Command::name), at(96, 104), at(104, 112));
         writeln!(out, "| {id} | {name} | {from} | {node} | {words} | {epoch} | {count} |").unwrap();
     }
     out
@@ -84,17 +85,14 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
             Some(parameter) if parameter.is_volatile() => ", volatile",
             _ => "",
         };
-        let name = if note.starts_with(" to") { "" } else { layout.name };
+        let name = if note.starts_with(" to") { "" } else { &layout.name };
         let mut title = format!("{} {name}", layout.number).trim_end().to_owned() + note;
-        let mut row = |field: &Field, within: u8| {
+        let mut row = |field: &Field, within: bool| {
             let choices = field.names.iter().filter(|_| field.format == Format::Choice);
             let names = choices.map(|(value, name)| format!("{value} {name}"));
             let names = names.collect::<Vec<_>>().join(", ");
-            let meaning = if names.is_empty() {
-                field.meaning.to_owned()
-            } else {
-                format!("{}: {names}", field.meaning)
-            };
+            let meaning =
+                if names.is_empty() { field.meaning.clone() } else { format!("{}: {names}", field.meaning) };
             let place = words(field, within);
             let name = if field.name.is_empty() { "" } else { field.bare_name() };
             let (format, unit, range) = (format_of(field), unit(field), range(field));
@@ -104,9 +102,9 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
             title.clear();
         };
         for field in layout.fields.iter().filter(|field| !matches!(field.format, Format::Total(_))) {
-            row(field, 0);
-            if let Format::Group(group) = field.format {
-                group.iter().for_each(|part| row(part, field.at));
+            row(field, false);
+            if let Format::Group(group) = &field.format {
+                group.iter().for_each(|part| row(part, true));
             }
         }
     }
@@ -123,26 +121,26 @@ fn range(field: &Field) -> String {
 }
 
 /// The unit on the wire, where angles are in quarter turns.
-fn unit(field: &Field) -> &'static str {
-    if matches!(field.format, Format::Angle | Format::Position) { "quarter turns" } else { field.unit }
+fn unit(field: &Field) -> &str {
+    if matches!(field.format, Format::Angle | Format::Position) { "quarter turns" } else { &field.unit }
 }
 
 /// Where a field stands: `0`, `0 to 2`, `2, bits 8 to 15`.
-fn words(field: &Field, within: u8) -> String {
-    let (word, bit, width) = (usize::from(field.at / 16), field.at % 16, field.width());
+fn words(field: &Field, within: bool) -> String {
+    let (word, bit, width) = (field.at() / 16, field.at() % 16, usize::from(field.width()));
     let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
     match (width, field.elements()) {
         (32, _) => format!("{word}, {}", word + 1),
         (16, 1) => word.to_string(),
         (16, several) => format!("{word} to {}", word + several - 1),
-        _ if within > 0 || matches!(field.signal.get(..4), Some("port")) && field.at < 16 => bits,
+        _ if within => bits,
         _ => format!("{word}, {bits}"),
     }
 }
 
 fn format_of(field: &Field) -> String {
-    match field.format {
-        Format::Unsigned(16) => "unsigned".to_owned(),
+    match &field.format {
+        Format::Word => "unsigned".to_owned(),
         Format::Unsigned(bits) | Format::Parameter(bits) | Format::Page(bits) => {
             format!("unsigned, {bits} bits")
         }
@@ -181,10 +179,10 @@ fn the_documents_tables_list_the_fields_of_the_schema() {
 #[test]
 fn the_document_names_every_reason_and_every_message_over_a_wire() {
     let document = std::fs::read_to_string(PATH).unwrap();
-    for (number, why) in REASONS {
+    for (number, why) in reasons() {
         assert!(document.contains(&format!("\n| {number} | ")), "{number}: {why}");
     }
-    for Layout { number, name, .. } in PORT_MESSAGES {
+    for Layout { number, name, .. } in wires() {
         assert!(document.contains(&format!("\n| {number} | {name} | ")), "{name}");
     }
 }

@@ -1,6 +1,7 @@
 //! One field: where its bits stand, and what they are worth.
 
-use super::ALWAYS;
+use serde::Deserialize;
+
 use crate::fixed::Q1_14;
 use crate::packet::WORDS;
 
@@ -8,8 +9,12 @@ use crate::packet::WORDS;
 const COUNT: usize = 2 * WORDS + 1;
 
 /// What a field's bits are.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, Deserialize, PartialEq)]
+#[serde(rename_all = "snake_case")]
 pub enum Format {
+    /// A word, unsigned.
+    #[default]
+    Word,
     /// So many bits, unsigned.
     Unsigned(u8),
     /// A signed word.
@@ -45,13 +50,15 @@ pub enum Format {
     /// Why something was refused, [`super::REASONS`].
     Reason,
     /// Fields within a word.
-    Group(&'static [Field]),
+    Group(Vec<Field>),
 }
 
 /// Which values mean something.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
+#[serde(rename_all = "snake_case")]
 pub enum Range {
     /// All that the bits can say.
+    #[default]
     All,
     /// None below zero.
     NotNegative,
@@ -62,114 +69,57 @@ pub enum Range {
 }
 
 /// What becomes of a field when [`Field::when`] does not hold.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
+#[serde(rename_all = "snake_case")]
 pub enum Absent {
     /// It is left out.
+    #[default]
     Omitted,
     /// It is there, without a value.
     Null,
 }
 
 /// One field of a packet, or several neighbouring words of one meaning.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, Deserialize, PartialEq)]
+#[serde(default, deny_unknown_fields)]
 pub struct Field {
     /// Its name, the unit at its end: in JSON, and where it is written. Empty: only a DBC tells of it.
-    pub name: &'static str,
+    pub name: String,
     /// What a DBC calls it when the name does not say it; `{}` stands for the label.
-    pub signal: &'static str,
-    /// The first bit, counted from the least significant one of byte 0.
-    pub at: u8,
+    pub signal: String,
+    /// Where it stands, [`Field::at`].
+    word: u8,
+    byte: u8,
+    bit: u8,
     /// What its bits are.
     pub format: Format,
     /// The unit of its values.
-    pub unit: &'static str,
+    pub unit: String,
     /// Which values mean something.
     pub range: Range,
     /// Of several words, what each is called.
-    pub labels: &'static [&'static str],
+    pub labels: Vec<String>,
     /// Values that have a name.
-    pub names: &'static [(i16, &'static str)],
-    /// It is there while the first field of its layout lies within these bounds.
-    pub when: [u16; 2],
+    pub names: Vec<(i16, String)>,
+    /// It is there while the first field of its layout lies within these bounds, which are inclusive; always without.
+    when: Option<[u16; 2]>,
     /// What becomes of it otherwise.
     pub absent: Absent,
     /// What may be written, if the format and the range do not say it.
-    pub allowed: &'static str,
+    pub allowed: String,
     /// What it means, in one line.
-    pub meaning: &'static str,
+    pub meaning: String,
 }
 
 impl Field {
-    pub(super) const fn new(name: &'static str, at: u8, format: Format, meaning: &'static str) -> Self {
-        Self {
-            name,
-            signal: "",
-            at,
-            format,
-            unit: "",
-            range: Range::All,
-            labels: &[],
-            names: &[],
-            when: ALWAYS,
-            absent: Absent::Omitted,
-            allowed: "",
-            meaning,
-        }
-    }
-
-    /// Some unsigned bits from this one on.
-    pub(super) const fn bits(name: &'static str, at: u8, bits: u8, meaning: &'static str) -> Self {
-        Self::new(name, at, Format::Unsigned(bits), meaning)
-    }
-
-    /// One of the words.
-    pub(super) const fn word(name: &'static str, index: u8, format: Format, meaning: &'static str) -> Self {
-        Self::new(name, index * 16, format, meaning)
-    }
-
-    /// One of the words, an unsigned counter.
-    pub(super) const fn counter(name: &'static str, index: u8, meaning: &'static str) -> Self {
-        Self::word(name, index, Format::Unsigned(16), meaning)
-    }
-
-    pub(super) const fn signal(self, signal: &'static str) -> Self {
-        Self { signal, ..self }
-    }
-
-    pub(super) const fn unit(self, unit: &'static str) -> Self {
-        Self { unit, ..self }
-    }
-
-    pub(super) const fn within(self, least: u16, greatest: u16) -> Self {
-        Self { range: Range::Within(least, greatest), ..self }
-    }
-
-    pub(super) const fn not_negative(self) -> Self {
-        Self { range: Range::NotNegative, ..self }
-    }
-
-    pub(super) const fn checked_at_commit(self) -> Self {
-        Self { range: Range::NotNegativeAtCommit, ..self }
-    }
-
-    pub(super) const fn each(self, labels: &'static [&'static str]) -> Self {
-        Self { labels, ..self }
-    }
-
-    pub(super) const fn names(self, names: &'static [(i16, &'static str)]) -> Self {
-        Self { names, ..self }
-    }
-
-    pub(super) const fn when(self, least: u16, greatest: u16, absent: Absent) -> Self {
-        Self { when: [least, greatest], absent, ..self }
-    }
-
-    pub(super) const fn allowed(self, allowed: &'static str) -> Self {
-        Self { allowed, ..self }
+    /// The first bit, counted from the least significant one of byte 0.
+    #[must_use]
+    pub fn at(&self) -> usize {
+        usize::from(self.word) * 16 + usize::from(self.byte) * 8 + usize::from(self.bit)
     }
 
     /// The bits of one element, how many of them are a fraction, and whether they are two's complement.
-    const fn shape(&self) -> (u8, u32, bool) {
+    fn shape(&self) -> (u8, u32, bool) {
         match self.format {
             Format::Unsigned(bits)
             | Format::Ports(bits, _)
@@ -177,7 +127,7 @@ impl Field {
             | Format::Page(bits) => (bits, 0, false),
             Format::Flag(bits) => (bits, 0, bits == 16),
             Format::Port => (8, 0, false),
-            Format::Hex | Format::State | Format::Group(_) => (16, 0, false),
+            Format::Word | Format::Hex | Format::State | Format::Group(_) => (16, 0, false),
             Format::Signed | Format::Choice | Format::Reason => (16, 0, true),
             Format::Angle | Format::Position => (16, 14, true),
             Format::Fixed(fraction)
@@ -189,32 +139,32 @@ impl Field {
 
     /// How many bits each of its elements has.
     #[must_use]
-    pub const fn width(&self) -> u8 {
+    pub fn width(&self) -> u8 {
         self.shape().0
     }
 
     /// The fraction bits of its words; 0 of whole numbers.
     #[must_use]
-    pub const fn fraction(&self) -> u32 {
+    pub fn fraction(&self) -> u32 {
         self.shape().1
     }
 
     /// Whether its bits are two's complement.
     #[must_use]
-    pub const fn is_signed(&self) -> bool {
+    pub fn is_signed(&self) -> bool {
         self.shape().2
     }
 
     /// How many elements it has: 1, or as many as it has labels.
     #[must_use]
-    pub const fn elements(&self) -> usize {
+    pub fn elements(&self) -> usize {
         if self.labels.is_empty() { 1 } else { self.labels.len() }
     }
 
     /// The bits of one element in a packet's bytes, with their sign; 0 of what is not there.
     #[must_use]
     pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
-        let (at, width) = (usize::from(self.at) + element * 16, u32::from(self.width()));
+        let (at, width) = (self.at() + element * 16, u32::from(self.width()));
         let there = bytes.get(at / 8..).unwrap_or_default();
         let all = there.iter().take(5).rev().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
         let bits = (all >> (at % 8) & ((1 << width) - 1)).cast_signed();
@@ -248,19 +198,19 @@ impl Field {
 
     /// The name of a value.
     #[must_use]
-    pub fn name_of(&self, raw: i64) -> Option<&'static str> {
-        self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| *name)
+    pub fn name_of(&self, raw: i64) -> Option<&str> {
+        self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| name.as_str())
     }
 
     /// The value of a name.
     #[must_use]
     pub fn value_of(&self, name: &str) -> Option<i16> {
-        self.names.iter().find(|(_, known)| *known == name).map(|(value, _)| *value)
+        self.names.iter().find(|(_, known)| known == name).map(|(value, _)| *value)
     }
 
     /// Whether its ends mean *saturated*.
     #[must_use]
-    pub const fn is_saturating(&self) -> bool {
+    pub fn is_saturating(&self) -> bool {
         matches!(self.format, Format::Saturating(_))
     }
 
@@ -273,18 +223,19 @@ impl Field {
     /// Whether it is there when the first field of its layout is this.
     #[must_use]
     pub fn follows(&self, first: Option<i64>) -> bool {
-        let [least, greatest] = self.when.map(i64::from);
-        self.when == ALWAYS || first.is_some_and(|first| (least..=greatest).contains(&first))
+        let within = |[least, greatest]: [u16; 2]| {
+            first.is_some_and(|first| (i64::from(least)..=i64::from(greatest)).contains(&first))
+        };
+        self.when.is_none_or(within)
     }
 
     /// What a DBC calls one element of it.
-    #[cfg(feature = "host")]
     #[must_use]
     pub fn signal_name(&self, prefix: &str, label: &str) -> String {
         let name = if self.signal.is_empty() {
             format!("{prefix}{}", self.bare_name())
         } else {
-            self.signal.to_owned()
+            self.signal.clone()
         };
         match name.split_once("{}") {
             Some((before, after)) => format!("{before}{label}{after}"),
@@ -295,21 +246,19 @@ impl Field {
 
     /// Its name without the unit.
     #[must_use]
-    pub fn bare_name(&self) -> &'static str {
+    pub fn bare_name(&self) -> &str {
         match self.name.rsplit_once('_') {
             Some((bare, _)) if !self.unit.is_empty() => bare,
-            Some(_) | None => self.name,
+            Some(_) | None => &self.name,
         }
     }
 
     /// What each value is called where they are written one by one.
-    #[cfg(feature = "host")]
-    pub fn written_names(&self) -> impl Iterator<Item = String> + use<> {
-        let (name, unit) = (self.name, !self.unit.is_empty());
-        let one = self.labels.is_empty().then(|| name.to_owned());
-        one.into_iter().chain(self.labels.iter().map(move |label| match name.rsplit_once('_') {
-            Some((_, unit_name)) if unit => format!("{label}_{unit_name}"),
-            _ => format!("{name}_{label}"),
-        }))
+    pub fn written_names(&self) -> Vec<String> {
+        let label = |label: &String| match self.name.rsplit_once('_') {
+            Some((_, unit)) if !self.unit.is_empty() => format!("{label}_{unit}"),
+            Some(_) | None => format!("{}_{label}", self.name),
+        };
+        if self.labels.is_empty() { vec![self.name.clone()] } else { self.labels.iter().map(label).collect() }
     }
 }

@@ -21,7 +21,7 @@ use core::iter;
 
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
-use protocol::schema::{PACKETS, PacketSchema};
+use protocol::schema::{PacketSchema, packets};
 use protocol::skin::{Bus, Skin};
 
 use signal::Signal;
@@ -98,16 +98,16 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => each.collect(),
         }
     };
-    PACKETS.iter().flat_map(of).collect()
+    packets().iter().flat_map(of).collect()
 }
 
 /// What a cell says of this kind, or what is said to it; a command.
-fn message(schema: &PacketSchema, node: Node, period_ms: u32) -> Message {
-    let PacketSchema { kind, command, meaning, .. } = *schema;
+fn message(schema: &'static PacketSchema, node: Node, period_ms: u32) -> Message {
+    let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };
     let (from, to) = if kind.is_from_cells() { (cell, Party::Gateway) } else { (Party::Gateway, cell) };
     let rhythm = match kind {
-        Kind::Command if command == Some(Command::Joints) => Rhythm::Every(period_ms),
+        Kind::Command if *command == Some(Command::Joints) => Rhythm::Every(period_ms),
         Kind::Torque => Rhythm::WhileActive(period_ms),
         Kind::Network => Rhythm::Every(HEARTBEAT_MS),
         Kind::Command | Kind::Sum | Kind::Sensors | Kind::Configure | Kind::Configured | Kind::Stimulus => {
@@ -115,8 +115,8 @@ fn message(schema: &PacketSchema, node: Node, period_ms: u32) -> Message {
         }
     };
     let (id, name) = match command {
-        Some(command) => (Id::command(command), command.name().to_owned()),
-        None => (Id::new(kind, node), format!("{}_{node}", kind.name())),
+        Some(command) => (Id::command(*command), command.name().to_owned()),
+        None => (Id::new(*kind, node), format!("{}_{node}", kind.name())),
     };
     Message { id, name, from, to, rhythm, comment: meaning, signals: signal::all(schema) }
 }

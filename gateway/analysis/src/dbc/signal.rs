@@ -1,10 +1,11 @@
 //! Signals: where they stand in a packet, and what their words are worth.
 
 use core::f64::consts::FRAC_PI_2;
+use core::slice;
 
 use protocol::message::State;
 use protocol::packet::{BYTES, WORDS};
-use protocol::schema::{Field, Format, Layout, PARAMETERS, PacketSchema, REASONS, Range};
+use protocol::schema::{Field, Format, Layout, PacketSchema, Range, parameters, reasons};
 
 /// Where the words end.
 const END: usize = WORDS * 16;
@@ -39,20 +40,20 @@ pub(super) struct Signal {
 }
 
 /// The signals of a kind of packet: those of its pages, what bytes 12 and 13 say, and the CRC.
-pub(super) fn all(schema: &PacketSchema) -> Vec<Signal> {
+pub(super) fn all(schema: &'static PacketSchema) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
     let of_layout = |layout: &'static Layout| {
         let page = if one_page { Page::Every } else { Page::Only(layout.number) };
         layout
             .fields
             .iter()
-            .flat_map(move |field| of(field, layout.prefix))
+            .flat_map(move |field| of(field, &layout.prefix))
             .map(move |it| Signal { page, ..it })
     };
     let mut signals: Vec<_> = schema.layouts.iter().flat_map(of_layout).collect();
-    for field in schema.end {
+    for field in &schema.end {
         let is_number = matches!(field.format, Format::Page(_) | Format::Parameter(_));
-        let numbered = |signal| Signal { page: Page::Number, names: numbers(schema.layouts), ..signal };
+        let numbered = |signal| Signal { page: Page::Number, names: numbers(&schema.layouts), ..signal };
         let signals_of = of(field, "").into_iter();
         signals.extend(signals_of.map(|signal| if is_number { numbered(signal) } else { signal }));
     }
@@ -62,8 +63,8 @@ pub(super) fn all(schema: &PacketSchema) -> Vec<Signal> {
 }
 
 /// What the numbers of pages or parameters mean.
-fn numbers(layouts: &[Layout]) -> Vec<(i64, &'static str)> {
-    layouts.iter().map(|layout| (i64::from(layout.number), layout.name)).collect()
+fn numbers(layouts: &'static [Layout]) -> Vec<(i64, &'static str)> {
+    layouts.iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
 }
 
 /// Some bits as they are, unsigned.
@@ -83,58 +84,41 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
 }
 
 /// The signals of one field: one for each element, for each bit that has a meaning of its own.
-fn of(field: &Field, prefix: &str) -> Vec<Signal> {
-    let at = usize::from(field.at);
+fn of(field: &'static Field, prefix: &str) -> Vec<Signal> {
+    let at = field.at();
     let named = |label: &str| field.signal_name(prefix, label);
-    match field.format {
-        Format::Total(_) => Vec::new(),
-        Format::State => {
-            let bit = |(bit, name): (State, &str)| {
-                let index = bit.0.trailing_zeros() as usize;
-                bits(format!("state_{}", name.replace('-', "_")), at + index, 1)
-            };
-            let parts =
-                [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
-            State::NAMES.into_iter().map(bit).chain(parts).collect()
-        }
-        Format::Ports(_, ports) => {
-            (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect()
-        }
-        Format::Group(parts) => {
-            let words = field.labels.iter().enumerate();
-            let part = |part: &Field, word: usize, label: &str| {
-                let signal = one(part, part.signal_name(prefix, label));
-                Signal { start: at + word * 16 + signal.start, ..signal }
-            };
-            words.flat_map(|(word, label)| parts.iter().map(move |it| part(it, word, label))).collect()
-        }
-        Format::Unsigned(_)
-        | Format::Signed
-        | Format::Choice
-        | Format::Flag(_)
-        | Format::Hex
-        | Format::Fixed(_)
-        | Format::Threshold(_)
-        | Format::Saturating(_)
-        | Format::Angle
-        | Format::Position
-        | Format::Port
-        | Format::Parameter(_)
-        | Format::Page(_)
-        | Format::Reason => {
-            let labels = if field.labels.is_empty() { &[""] } else { field.labels };
-            let element = |(word, label): (usize, &&str)| {
-                let signal = one(field, named(label));
-                Signal { start: at + word * 16, ..signal }
-            };
-            labels.iter().enumerate().map(element).collect()
-        }
+    if matches!(field.format, Format::Total(_)) {
+        return Vec::new();
     }
+    if field.format == Format::State {
+        let bit = |(bit, name): (State, &str)| {
+            bits(format!("state_{}", name.replace('-', "_")), at + bit.0.trailing_zeros() as usize, 1)
+        };
+        let parts = [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
+        return State::NAMES.into_iter().map(bit).chain(parts).collect();
+    }
+    if let Format::Ports(_, ports) = field.format {
+        return (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect();
+    }
+    if field.labels.is_empty() {
+        return vec![one(field, named(""))];
+    }
+    let element = |(word, label): (usize, &String)| {
+        let parts =
+            if let Format::Group(parts) = &field.format { &parts[..] } else { slice::from_ref(field) };
+        let label = label.clone();
+        let signal = move |part: &'static Field| {
+            let signal = one(part, part.signal_name(prefix, &label));
+            Signal { start: signal.start + word * 16, ..signal }
+        };
+        parts.iter().map(signal)
+    };
+    field.labels.iter().enumerate().flat_map(element).collect()
 }
 
 /// The signal of a field that has one.
-fn one(field: &Field, name: String) -> Signal {
-    let unscaled = bits(name, usize::from(field.at), field.width());
+fn one(field: &'static Field, name: String) -> Signal {
+    let unscaled = bits(name, field.at(), field.width());
     let is_angle = matches!(field.format, Format::Angle | Format::Position);
     let factor = if is_angle { FRAC_PI_2 } else { 1.0 } / f64::from(1_u32 << field.fraction());
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
@@ -144,19 +128,17 @@ fn one(field: &Field, name: String) -> Signal {
         Range::NotNegative | Range::NotNegativeAtCommit => [0.0, greatest],
         Range::Within(least, greatest) => [least, greatest].map(f64::from),
     };
-    let of = |names: &[(i16, &'static str)]| {
-        names.iter().map(|(value, name)| (i64::from(*value), *name)).collect()
-    };
+    let named = |(value, name): &'static (i16, String)| (i64::from(*value), name.as_str());
     let names = if let Format::Parameter(_) = field.format {
-        numbers(PARAMETERS)
-    } else if field.format == Format::Reason {
-        of(REASONS)
+        numbers(parameters())
     } else if field.is_saturating() {
-        of(&[i16::MAX, i16::MIN].map(|end| (end, "saturated")))
+        [i16::MAX, i16::MIN].map(|end| (i64::from(end), "saturated")).to_vec()
+    } else if field.format == Format::Reason {
+        reasons().iter().map(named).collect()
     } else {
-        of(field.names)
+        field.names.iter().map(named).collect()
     };
     // Readers differ in which bytes beyond ASCII they take.
-    let unit = if field.unit == "°C" { "degC" } else { field.unit };
+    let unit = if field.unit == "°C" { "degC" } else { &field.unit };
     Signal { signed: field.is_signed(), factor, range, unit, names, ..unscaled }
 }

@@ -62,10 +62,10 @@ impl Serialize for Values {
         if let Some(Lane { wire, back }) = lane {
             map.serialize_entry("wire", wire)?;
             map.serialize_entry("back", back)?;
-            map.serialize_entry("says", layout.name)?;
+            map.serialize_entry("says", &layout.name)?;
         }
-        entries(&mut map, end, layout.name, bytes)?;
-        entries(&mut map, layout.fields, layout.name, bytes)?;
+        entries(&mut map, end, &layout.name, bytes)?;
+        entries(&mut map, &layout.fields, &layout.name, bytes)?;
         map.end()
     }
 }
@@ -84,21 +84,21 @@ impl Serialize for Group<'_> {
 /// Each field that is there; the epoch and the tag stand beside the values.
 fn entries<M: SerializeMap>(map: &mut M, fields: &[Field], page: &str, bytes: &[u8]) -> Result<(), M::Error> {
     let Some(first) = fields.first() else { return Ok(()) };
-    for field in fields.iter().filter(|field| !matches!(field.name, "" | "epoch" | "tag")) {
+    for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
         let raw = field.raw(bytes, 0);
         if !field.is_there(bytes, first) {
             if field.absent == Absent::Null {
-                map.serialize_entry(field.name, &())?;
+                map.serialize_entry(&field.name, &())?;
             }
         } else if let Format::Page(_) = field.format {
-            map.serialize_entry(field.name, page)?;
+            map.serialize_entry(&field.name, page)?;
         } else if field.format == Format::State {
             let state = State(u16::try_from(raw).map_err(M::Error::custom)?);
             map.serialize_entry("state", &state.names().collect::<Vec<_>>())?;
             map.serialize_entry("joint", &state.joint())?;
             map.serialize_entry("version", &state.version())?;
         } else {
-            map.serialize_entry(field.name, &Shown(field, bytes))?;
+            map.serialize_entry(&field.name, &Shown(field, bytes))?;
             if field.format == Format::Reason {
                 map.serialize_entry("because", schema::reason(raw))?;
             }
@@ -115,7 +115,7 @@ impl Serialize for Shown<'_> {
         let Self(field, bytes) = *self;
         let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
         let real = |element| field.real(field.raw(bytes, element));
-        match field.format {
+        match &field.format {
             Format::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
             Format::Flag(_) => serializer.serialize_bool(first == 1),
             Format::Hex => serializer.collect_str(&format_args!("{first:04X}")),
@@ -137,7 +137,8 @@ impl Serialize for Shown<'_> {
                     serializer.collect_seq(elements.map(real))
                 }
             }
-            Format::Unsigned(_)
+            Format::Word
+            | Format::Unsigned(_)
             | Format::Signed
             | Format::Port
             | Format::Page(_)
@@ -250,8 +251,7 @@ impl Line<'_> {
         (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
         let packet = message.encode();
         let layout = schema::layout(message, &packet);
-        let schema = PacketSchema::of(packet.id).filter(|_| layout.number != schema::REFUSAL.number);
-        let end = schema.map_or(&[][..], |schema| schema.end);
+        let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
         self.values = (!is_bare).then(|| Values { lane: None, end, layout, bytes: packet.encode() });
     }

@@ -104,7 +104,7 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
     let fields: Vec<_> = written(layout, values).collect();
     if values.len() != fields.len() {
         let names: Vec<_> = fields.iter().map(|(_, name)| name.as_str()).collect();
-        let (name, wanted, got) = (layout.name, fields.len(), values.len());
+        let (name, wanted, got) = (&layout.name, fields.len(), values.len());
         return Err(ParameterTextError::Count { name, wanted, fields: names.join(" "), got });
     }
     for (word, ((field, name), text)) in words.iter_mut().zip(fields.into_iter().zip(values)) {
@@ -121,7 +121,7 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
         .fields
         .iter()
         .filter(follows)
-        .flat_map(|field| field.written_names().map(move |name| (field, name)))
+        .flat_map(|field| field.written_names().into_iter().map(move |name| (field, name)))
 }
 
 /// The word of a value of a field.
@@ -129,7 +129,7 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
 /// # Errors
 /// What is allowed.
 pub fn read(field: &Field, text: &str) -> Result<i16, String> {
-    let allowed = || field.allowed.to_owned();
+    let allowed = || field.allowed.clone();
     let known = |number: &i16| match field.range {
         Range::Within(least, greatest) => {
             (i32::from(least)..=i32::from(greatest)).contains(&i32::from(*number))
@@ -142,7 +142,7 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
         Format::Choice => field.value_of(text).ok_or_else(allowed),
         Format::Ports(..) => ports(text).ok_or_else(allowed),
         Format::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
-        Format::Unsigned(_) => {
+        Format::Word | Format::Unsigned(_) => {
             text.parse().ok().filter(|&number| number > 0).map(u16::cast_signed).ok_or_else(allowed)
         }
         Format::Signed | Format::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),

@@ -5,7 +5,7 @@ use core::fmt::{self, Display, Formatter};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::{Message, State};
 use protocol::packet::WORDS;
-use protocol::schema::{self, Field, Format, Layout, PacketSchema, Text};
+use protocol::schema::{self, Field, Format, Layout, PacketSchema, Part};
 
 use super::Decoded;
 use super::wires::{self, Port, Said};
@@ -54,11 +54,11 @@ impl Display for Meaning<'_> {
         };
         let (layout, bytes) = (schema::layout(self.0, &packet), packet.encode());
         f.write_str(" ")?;
-        fill(f, schema.text, u16::from(packet.count), &|f, part| match (part, field(schema.end, part)) {
+        fill(f, &schema.text, u16::from(packet.count), &|f, part| match (part, field(&schema.end, part)) {
             ("", _) => say(f, layout, &bytes),
-            ("page", _) => f.write_str(layout.name),
+            ("page", _) => f.write_str(&layout.name),
             (_, Some(field)) => show(f, field, &bytes, part),
-            (_, None) => field(layout.fields, part).map_or(Ok(()), |field| show(f, field, &bytes, part)),
+            (_, None) => field(&layout.fields, part).map_or(Ok(()), |field| show(f, field, &bytes, part)),
         })
     }
 }
@@ -97,8 +97,8 @@ impl Display for Name {
 /// What a layout's fields say in these bytes.
 pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw(bytes, 0));
-    fill(f, layout.text, u16::try_from(number).unwrap_or_default(), &|f, part| {
-        field(layout.fields, part).map_or(Ok(()), |field| show(f, field, bytes, part))
+    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), &|f, part| {
+        field(&layout.fields, part).map_or(Ok(()), |field| show(f, field, bytes, part))
     })
 }
 
@@ -111,12 +111,12 @@ fn field<'a>(fields: &'a [Field], part: &str) -> Option<&'a Field> {
 /// Writes the parts of a text that belong to a number; `show` writes what stands between braces.
 fn fill(
     f: &mut Formatter<'_>,
-    text: Text,
+    text: &[Part],
     number: u16,
     show: &dyn Fn(&mut Formatter<'_>, &str) -> fmt::Result,
 ) -> fmt::Result {
-    for (_, part) in text.iter().filter(|([least, greatest], _)| (*least..=*greatest).contains(&number)) {
-        let mut rest = *part;
+    for part in text.iter().filter(|part| (part.when[0]..=part.when[1]).contains(&number)) {
+        let mut rest = part.text.as_str();
         while let Some((before, (inside, after))) =
             rest.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
         {
@@ -136,7 +136,7 @@ fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], part: &str) -> fmt::
         return f.write_str(if first == 1 { yes } else { no });
     }
     let decimals = part.split_once(':').and_then(|(_, decimals)| decimals.parse().ok()).unwrap_or(0);
-    match field.format {
+    match &field.format {
         Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
         Format::Hex => write!(f, "{first:04X}"),
         Format::Port => write!(f, "{}", Port(first)),
@@ -151,6 +151,7 @@ fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], part: &str) -> fmt::
         | Format::Saturating(_)
         | Format::Angle
         | Format::Position
+        | Format::Word
         | Format::Unsigned(_)
         | Format::Signed
         | Format::Flag(_)

@@ -16,7 +16,10 @@ pub(super) fn said(message: PortMessage) -> ([u8; BYTES], &'static Layout) {
     for (byte, said) in bytes.iter_mut().zip(body) {
         *byte = said;
     }
-    (bytes, schema::port_message(body[0]).expect("every message has a layout"))
+    (
+        bytes,
+        schema::wires().iter().find(|layout| layout.number == body[0]).expect("every message has a layout"),
+    )
 }
 
 /// The epoch that a message speaks of, if it does.

@@ -1,0 +1,77 @@
+//! The file holds together.
+
+use super::*;
+use crate::packet::{BYTES, Epoch};
+
+/// Every layout with what belongs to it in bytes 12 and 13.
+fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
+    let packets = packets()
+        .iter()
+        .flat_map(|schema| schema.layouts.iter().map(move |layout| (&schema.end[..], layout)));
+    packets.chain(wires().iter().map(|layout| (&[][..], layout)))
+}
+
+#[test]
+fn fields_stand_side_by_side_within_the_packet() {
+    for (end, layout) in all() {
+        let mut taken = [false; BYTES * 8 - 16];
+        let real = |field: &&Field| !matches!(field.format, Format::Total(_));
+        for field in end.iter().chain(&layout.fields).filter(real) {
+            for element in 0..field.elements() {
+                let at = field.at() + element * 16;
+                for bit in &mut taken[at..at + usize::from(field.width())] {
+                    assert!(!*bit, "{} {}", layout.name, field.name);
+                    *bit = true;
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn texts_name_fields_that_are_there() {
+    let names = |text: &'static [Part]| {
+        let parts = text.iter().flat_map(|part| part.text.split('{').skip(1));
+        parts.map(|part| part.split(['}', ':', '?']).next().unwrap()).collect::<Vec<_>>()
+    };
+    for (_, layout) in all() {
+        for name in names(&layout.text) {
+            assert!(layout.fields.iter().any(|field| field.name == name), "{}: {name}", layout.name);
+        }
+    }
+    for schema in packets() {
+        let fields = || schema.end.iter().chain(schema.layouts.iter().flat_map(|layout| &layout.fields));
+        for name in names(&schema.text) {
+            assert!(
+                name.is_empty() || fields().any(|field| field.name == name),
+                "{}: {name}",
+                schema.kind.name()
+            );
+        }
+    }
+}
+
+#[test]
+fn whatever_is_a_message_has_a_layout() {
+    for (bits, count) in (0..0x800).flat_map(|bits| (0..=u8::MAX).map(move |count| (bits, count))) {
+        let packet = Packet { id: Id::from_bits(bits), words: [0; WORDS], epoch: Epoch(0), count };
+        let Ok(message) = Message::decode(&packet) else { continue };
+        let packet = message.encode();
+        let layout = layout(&message, &packet);
+        let says_nothing = matches!(packet.id.kind, Kind::Command | Kind::Configure);
+        assert!(says_nothing || !layout.fields.is_empty(), "{bits:03X} {count}");
+    }
+}
+
+#[test]
+fn a_field_gives_its_bits_with_their_sign() {
+    let bytes = [0x34, 0x12, 0xFF, 0xFF, 0x21];
+    let raw = |text: &str, element| toml::from_str::<Field>(text).unwrap().raw(&bytes, element);
+    assert_eq!(raw("word = 0", 0), 0x1234);
+    assert_eq!(raw("word = 1", 0), 0xFFFF);
+    assert_eq!(raw("format = { fixed = 8 }", 1), -1);
+    assert_eq!(raw("format = { unsigned = 32 }", 0), 0xFFFF_1234);
+    assert_eq!(raw("byte = 4\nbit = 1\nformat = { unsigned = 3 }", 0), 0);
+    assert_eq!(raw("byte = 4\nbit = 5\nformat = { unsigned = 3 }", 0), 1);
+    assert_eq!(raw("word = 7", 0), 0, "what is not there");
+}
