@@ -197,7 +197,7 @@ mod tests {
 
         #[test]
         fn no_words_panic_and_no_torque_wraps(
-            contact: [i16; 3], proximity: i16, words: [i16; 5], jacobian: [i16; 6], steps: i64,
+            contact: [i16; 3], proximity: i16, words: [i16; 5], jacobian: [i16; MAX_JOINTS], steps: i64,
         ) {
             let [alpha_c, alpha_p, c, p, z] = words;
             let rule = Contact {
