@@ -48,12 +48,6 @@ impl Force {
         self.0
     }
 
-    /// The force in N, exactly.
-    #[must_use]
-    pub fn to_f64(self) -> f64 {
-        f64::from(self.0) / 65_536.0
-    }
-
     /// Whether the cell is active: there is a force. (Less than 2^-17 N is none.)
     #[must_use]
     pub const fn is_active(self) -> bool {
@@ -102,6 +96,13 @@ impl Torque {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    impl Force {
+        /// In N, exactly.
+        fn to_f64(self) -> f64 {
+            f64::from(self.0) / 65_536.0
+        }
+    }
 
     fn rule() -> Contact {
         Contact {

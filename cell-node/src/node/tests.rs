@@ -1,6 +1,7 @@
 use super::parameters::padded;
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
 use protocol::packet::Half;
 use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};

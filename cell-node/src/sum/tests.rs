@@ -100,7 +100,7 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     assert_eq!(sum.judge(), Some((Epoch(3), 0b10)), "it did not come");
     sum.begin(&begin(4, 2), None);
     assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "it is looked in time");
-    assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (Check::NotYet, Check::Now));
+    assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (None, Some(Span(0))));
     sum.take(at(4, 500), 1, Epoch(4), words(10, 1));
     assert_eq!(sum.taken, 2, "after a gap");
     sum.disown(1);
