@@ -48,12 +48,6 @@ impl Force {
         self.0
     }
 
-    /// The force in N, exactly.
-    #[must_use]
-    pub fn to_f64(self) -> f64 {
-        f64::from(self.0) / 65_536.0
-    }
-
     /// Whether the cell is active: there is a force. (Less than 2^-17 N is none.)
     #[must_use]
     pub const fn is_active(self) -> bool {
@@ -102,6 +96,13 @@ impl Torque {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    impl Force {
+        /// In N, exactly.
+        fn to_f64(self) -> f64 {
+            f64::from(self.0) / 65_536.0
+        }
+    }
 
     fn rule() -> Contact {
         Contact {
@@ -197,7 +198,7 @@ mod tests {
 
         #[test]
         fn no_words_panic_and_no_torque_wraps(
-            contact: [i16; 3], proximity: i16, words: [i16; 5], jacobian: [i16; 6], steps: i64,
+            contact: [i16; 3], proximity: i16, words: [i16; 5], jacobian: [i16; MAX_JOINTS], steps: i64,
         ) {
             let [alpha_c, alpha_p, c, p, z] = words;
             let rule = Contact {

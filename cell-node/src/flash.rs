@@ -84,9 +84,8 @@ pub fn encode(serial: u32, kept: &Kept) -> [u8; BYTES] {
     for (byte, &part) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
         *byte = part;
     }
-    if let Some((body, crc)) = bytes.split_last_chunk_mut::<2>() {
-        *crc = crc16(body).to_le_bytes();
-    }
+    let [body @ .., low, high] = &mut bytes;
+    [*low, *high] = crc16(body).to_le_bytes();
     bytes
 }
 
@@ -96,14 +95,12 @@ pub fn encode(serial: u32, kept: &Kept) -> [u8; BYTES] {
 /// When the bytes are not whole, sound, of this version, of this cell (by its serial number, and by its number
 /// if it is given one), or no parameters.
 pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
-    let size = FlashError::Size { got: bytes.len() };
-    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| size)?;
-    let (body, crc) = bytes.split_last_chunk::<2>().ok_or(size)?;
-    if crc16(body) != u16::from_le_bytes(*crc) || !body.starts_with(MAGIC) {
+    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| FlashError::Size { got: bytes.len() })?;
+    let [body @ .., low, high] = bytes;
+    if crc16(body) != u16::from_le_bytes([*low, *high]) || !body.starts_with(MAGIC) {
         return Err(FlashError::Damaged);
     }
-    let (head, image) = body.split_first_chunk::<HEAD_BYTES>().ok_or(size)?;
-    let &[_, _, _, _, version, cell, s0, s1, s2, s3, configured] = head;
+    let &[_, _, _, _, version, cell, s0, s1, s2, s3, configured, ref image @ ..] = body;
     if version != VERSION {
         return Err(FlashError::Version { got: version });
     }
@@ -113,7 +110,6 @@ pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
     if is_another || serial != identity.serial {
         return Err(FlashError::OtherCell { cell, serial });
     }
-    let image = image.try_into().map_err(|_| size)?;
     let parameters = (configured == 1).then(|| Parameters::from_image(image)).transpose()?;
     Ok(Kept { number, parameters })
 }

@@ -9,5 +9,6 @@ pub mod io;
 pub mod kernel;
 mod network;
 pub mod node;
+mod phase;
 pub mod sine;
 pub mod sum;

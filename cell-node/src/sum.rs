@@ -19,8 +19,6 @@ use protocol::wire::PORTS;
 
 /// A child whose sum did not come is told so in so many epochs: what it says to that may be lost too.
 const MISSING: u8 = 4;
-/// Who looks later than this was away, and what it misses may wait to be heard.
-const PUNCTUAL: Span = Span::from_millis(1);
 /// Fraction bits that rounding takes away.
 const SHORTENED: u32 = 30 - 8;
 
@@ -44,17 +42,6 @@ impl Words {
     }
 }
 
-/// Whether it is time to look who is missing.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(crate) enum Check {
-    /// Not yet, or not at all.
-    NotYet,
-    /// Now.
-    Now,
-    /// It was, and this cell was away.
-    Late,
-}
-
 /// What is known of the sums of one child.
 #[derive(Clone, Copy, Debug, Default)]
 struct Child {
@@ -75,7 +62,7 @@ struct Child {
 pub struct Sum {
     slots: Option<Slots>,
     /// The present epoch.
-    epoch: Option<Epoch>,
+    pub(crate) epoch: Option<Epoch>,
     /// How it began, or the last one that did.
     begin: Begin,
     /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
@@ -85,14 +72,14 @@ pub struct Sum {
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
-    /// It waits for a sign of the parent.
-    held: bool,
+    /// What is to be said waits for a sign of the parent.
+    pub(crate) held: bool,
     /// When it is to be sent.
     due: Option<Micros>,
     /// The last one that was sent, and its epoch.
     said: Option<(Epoch, Words)>,
-    /// The parent has to be told anew whom the sums are for.
-    restate: bool,
+    /// The parent did not take the last sum, and has to be told anew whom they are for.
+    pub(crate) restate: bool,
     /// Whether it has been looked who is missing in this epoch.
     judged: bool,
     /// When it is looked, if not only at the next joints.
@@ -285,16 +272,6 @@ impl Sum {
         self.due = None;
     }
 
-    /// What is to be said waits until it is released.
-    pub(crate) const fn hold(&mut self) {
-        self.held = true;
-    }
-
-    /// What waited may be said.
-    pub(crate) const fn release(&mut self) {
-        self.held = false;
-    }
-
     /// When there is something to do.
     pub(crate) fn poll_timeout(&self) -> Option<Micros> {
         self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
@@ -321,12 +298,11 @@ impl Sum {
 
     /// All that is known of this epoch; `None` when there is nothing to say.
     fn words(&self) -> Option<Words> {
-        let mut sum = self.own.map_or([0; WORDS], |own| own.map(i64::from));
+        let mut sums = self.own.unwrap_or_default().map(|own| (i64::from(own), false));
         let mut count = u32::from(self.own.is_some());
-        let mut saturated = [false; WORDS];
         for words in self.children.iter().filter_map(|child| child.taken) {
             count += u32::from(words.count);
-            for ((sum, saturated), word) in sum.iter_mut().zip(&mut saturated).zip(words.torque) {
+            for ((sum, saturated), word) in sums.iter_mut().zip(words.torque) {
                 *saturated |= word.is_saturated();
                 *sum += i64::from(word.to_bits());
             }
@@ -334,11 +310,10 @@ impl Sum {
         if count == 0 {
             return self.ends.then_some(Words::END);
         }
-        let mut torque = [Q7_8::ZERO; WORDS];
-        for ((word, sum), saturated) in torque.iter_mut().zip(sum).zip(saturated) {
+        let torque = sums.map(|(sum, saturated)| {
             let fits = i16::try_from(sum).ok().filter(|_| !saturated);
-            *word = Q7_8::from_bits(fits.unwrap_or(if sum < 0 { i16::MIN } else { i16::MAX }));
-        }
+            Q7_8::from_bits(fits.unwrap_or(if sum < 0 { i16::MIN } else { i16::MAX }))
+        });
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
@@ -351,16 +326,6 @@ impl Sum {
     pub(crate) fn is_busy(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
         self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
-    }
-
-    /// The present epoch.
-    pub(crate) const fn epoch(&self) -> Option<Epoch> {
-        self.epoch
-    }
-
-    /// The parent did not take the last sum: the next one has to be stated anew.
-    pub(crate) const fn break_off(&mut self) {
-        self.restate = true;
     }
 
     /// Joints that are not answered: whoever goes on after them has to be stated anew.
@@ -386,14 +351,9 @@ impl Sum {
         self.epoch.is_none() || now >= self.begin.at + self.settles()
     }
 
-    /// Whether the time has come to look before the next joints; who looks late looks then, when all that came
-    /// before them has been heard.
-    pub(crate) fn check(&mut self, now: Micros) -> Check {
-        match self.check.take_if(|check| *check <= now) {
-            None => Check::NotYet,
-            Some(check) if now.since(check) > PUNCTUAL => Check::Late,
-            Some(_) => Check::Now,
-        }
+    /// How late it is looked before the next joints, when the time for that has come.
+    pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
+        self.check.take_if(|check| *check <= now).map(|check| now.since(check))
     }
 
     /// Looks once in an epoch: bit p says that the sum of the child at port p should have come and did not. Such a

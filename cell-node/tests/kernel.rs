@@ -12,7 +12,7 @@ use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
 
 mod witness;
 
-use witness::{Case, Errors, equation_8};
+use witness::{Case, Errors, equation_8, per_joint};
 
 #[test]
 fn the_wrench_kernel_errs_less_than_its_bars_on_a_ur5() {
@@ -30,7 +30,7 @@ fn a_pressed_cell_lets_the_joint_give_way() {
     for position in [0.0, 0.3, -1.7].map(Q1_14::nearest) {
         let joints = [position; MAX_JOINTS];
         let jacobian = Wrench::<Q1_14>::new(&parameters).jacobian(&joints);
-        assert_eq!(jacobian, [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0].map(Q1_14::nearest));
+        assert_eq!(jacobian, per_joint(&[-0.5]).map(Q1_14::nearest));
         let torque = Torque::new(&jacobian, Force::from_steps(2 << 16));
         assert_eq!(torque.words()[0], Q3_12::nearest(-1.0), "tau = -r F");
     }
@@ -56,8 +56,8 @@ fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
         let pose = Pose { position: [zero; 3], normal: [zero, Q1_14::nearest(up), zero] };
         let parameters =
             Parameters { joint: 2, joints: 2, pose, rows: [link; MAX_JOINTS], ..Parameters::default() };
-        let wrench = Wrench::<Q1_14>::new(&parameters).jacobian(&[zero; 6]);
-        let projection = Projection::<Q1_14>::new(&parameters).jacobian(&[zero; 6]);
+        let wrench = Wrench::<Q1_14>::new(&parameters).jacobian(&[zero; MAX_JOINTS]);
+        let projection = Projection::<Q1_14>::new(&parameters).jacobian(&[zero; MAX_JOINTS]);
         assert_eq!(wrench[..2], [wanted, Q1_14::nearest(-1.5 * up)]);
         // Here the position saturates before it meets the force; the last step may differ.
         assert!(projection[0].to_bits().unsigned_abs() >= 0x7FFF);
@@ -69,7 +69,7 @@ fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
 #[test]
 fn an_offset_is_added_to_the_position_and_wraps() {
     let mut case = Case::all().into_iter().find(|case| case.joint == 6).unwrap().parameters();
-    let joints = [-0x7000, 0x7000, 0x1234, -0x4321, 0x6543, -1].map(Q1_14::from_bits);
+    let joints = per_joint(&[-0x7000, 0x7000, 0x1234, -0x4321, 0x6543, -1]).map(Q1_14::from_bits);
     let wanted = in_words::<Wrench>(&case, &joints);
     let shift = Q1_14::from_bits(0x5A5A);
     for row in &mut case.rows {
@@ -104,7 +104,7 @@ fn what_nobody_reads_is_not_computed_behind_an_odd_twist_either() {
     let mut parameters = Case::all().into_iter().find(|case| case.joint == 2).unwrap().parameters();
     parameters.rows[0] = Row { alpha: Q1_14::nearest(0.3), ..Row::default() };
     let kernel = Wrench::<Counted>::new(&parameters);
-    let (_, done) = Operations::count(|| kernel.jacobian(&[Q1_14::nearest(0.7); 6]));
+    let (_, done) = Operations::count(|| kernel.jacobian(&[Q1_14::nearest(0.7); MAX_JOINTS]));
     assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
 }
 
@@ -128,7 +128,7 @@ fn arm(length: impl Strategy<Value = i16> + Clone) -> impl Strategy<Value = Para
         theta_offset: Q1_14::from_bits(theta_offset),
     });
     let position = [length.clone(), length.clone(), length];
-    (prop::array::uniform6(row), 1_u8..=6, position, any::<[i16; 3]>()).prop_map(
+    (prop::array::uniform(row), 1_u8..=6, position, any::<[i16; 3]>()).prop_map(
         |(rows, joint, position, normal)| Parameters {
             joint,
             joints: 6,
@@ -151,11 +151,11 @@ fn sound_arm() -> impl Strategy<Value = Parameters> {
 }
 
 /// The greatest difference of two Jacobians.
-fn apart(lhs: [f64; 6], rhs: [f64; 6]) -> f64 {
+fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
     lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
 }
 
-fn in_words<K: Kernel>(parameters: &Parameters, joints: &[Q1_14; 6]) -> [f64; 6] {
+fn in_words<K: Kernel>(parameters: &Parameters, joints: &[Q1_14; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     K::new(parameters).jacobian(joints).map(Q1_14::to_f64)
 }
 
@@ -163,7 +163,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 1_024, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn both_kernels_are_equation_8_in_real_numbers(parameters in any_arm(), joints: [i16; 6]) {
+    fn both_kernels_are_equation_8_in_real_numbers(parameters in any_arm(), joints: [i16; MAX_JOINTS]) {
         let joints = joints.map(Q1_14::from_bits);
         let wanted = equation_8(&parameters, &joints);
         let wrench = Wrench::<f64>::new(&parameters).jacobian(&joints);
@@ -173,7 +173,7 @@ proptest! {
     }
 
     #[test]
-    fn words_err_by_half_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; 6]) {
+    fn words_err_by_half_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; MAX_JOINTS]) {
         let joints = joints.map(Q1_14::from_bits);
         let wanted = equation_8(&parameters, &joints);
         let wrench = in_words::<Wrench>(&parameters, &joints);
@@ -184,7 +184,7 @@ proptest! {
 
     #[test]
     fn no_words_panic_whether_they_make_sense_or_not(
-        parameters in any_arm(), joint: u8, joints: [i16; 6], steps: i64,
+        parameters in any_arm(), joint: u8, joints: [i16; MAX_JOINTS], steps: i64,
     ) {
         let parameters = Parameters { joint, ..parameters };
         let joints = joints.map(Q1_14::from_bits);

@@ -23,7 +23,7 @@ use model::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;
 use protocol::message::{From, Message, SkinSensors};
-use protocol::packet::Packet;
+use protocol::packet::{Packet, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use protocol::wire_time::BitRates;
@@ -378,7 +378,7 @@ impl Bench {
 
     /// The torques that stood on the wire whole: epoch and words, in their order, of one cell.
     #[must_use]
-    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; 6])> {
+    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.witness.torques(place)
     }
 }

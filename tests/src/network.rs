@@ -45,8 +45,11 @@ pub const PERIOD: Span = Span(16_000);
 const LATENCY: (u64, u64) = (10, 60);
 /// From hearing something to answering it.
 const THINKS: Span = Span(30);
-/// Joints' positions, the same in every epoch.
-const POSITIONS: [f64; WORDS] = [0.1, -0.7, 0.6, -0.4, 0.3, 0.2];
+/// The joints' positions in quarter turns, the same in every epoch.
+fn positions() -> [Q1_14; WORDS] {
+    let positions = [0.1, -0.7, 0.6, -0.4, 0.3, 0.2].map(Q1_14::nearest);
+    std::array::from_fn(|joint| positions.get(joint).copied().unwrap_or_default())
+}
 
 /// The far end of a port.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -416,7 +419,7 @@ impl Wiring {
         self.epoch = Some(epoch);
         self.root_sums.clear();
         self.took.push(Took::default());
-        let joints = Joints { positions: POSITIONS.map(Q1_14::nearest), in_use: 6 };
+        let joints = Joints { positions: positions(), in_use: 6 };
         self.say(&Message::Joints { epoch, joints });
         self.agenda.enter_in(PERIOD, Event::Joints);
     }

@@ -78,7 +78,7 @@ struct Mirror {
     held: Option<[i32; WORDS]>,
     /// What of it is in the sum.
     value: [i32; WORDS],
-    torques: Vec<(u8, [i16; 6])>,
+    torques: Vec<(u8, [i16; WORDS])>,
     arrived: u64,
     /// Who has the number, by the last word that was no claim.
     holder: Option<Party>,
@@ -125,7 +125,7 @@ impl Witness {
 
     /// The torques that came whole from a cell.
     #[must_use]
-    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; 6])> {
+    pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.mirrors.get(place).map(|mirror| mirror.torques.clone()).unwrap_or_default()
     }
 

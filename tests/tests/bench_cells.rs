@@ -9,6 +9,7 @@ use model::table::{DEAD_AFTER, Event, Notice, Replies, Status};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::{Message, State};
+use protocol::packet::WORDS;
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -37,7 +38,7 @@ fn finish(bench: &mut Bench) {
     accounts::check(bench);
 }
 
-fn magnitude(torque: &[f64; 6]) -> f64 {
+fn magnitude(torque: &[f64; WORDS]) -> f64 {
     torque.iter().map(|torque| torque.abs()).sum()
 }
 
@@ -93,7 +94,7 @@ fn a_heartbeat_that_says_quiet_clears_a_held_torque() {
         bench.run(Span::from_millis(1));
         assert!(bench.now().since(let_go) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
     }
-    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; 6]);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; WORDS]);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
 }
@@ -146,7 +147,7 @@ fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
     assert_eq!(bench.gateway.table.snapshot().sums.contributing, 1, "held");
     bench.run(Span(2 * bench.epoch().0));
     assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0, "dead");
-    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; 6]);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; WORDS]);
     finish(&mut bench);
 }
 

@@ -9,7 +9,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{Kind, Node};
 use protocol::message::{Answer, Joints, Message, NetworkPage, Request, State};
-use protocol::packet::{Epoch, Packet};
+use protocol::packet::{Epoch, Packet, WORDS};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::skin::Skin;
 use protocol::time::Span;
@@ -279,10 +279,9 @@ fn who_is_missing_is_named_and_who_is_not_the_skins_is_left_alone() {
     assert_eq!(outcomes(&report), expected);
     assert_eq!(report.strangers.iter().map(|it| (it.number.get(), it.serial)).collect::<Vec<_>>(), [(77, 9)]);
     // Nothing is even staged: it may commit what it has.
-    let request = Request::Write {
-        number: Parameter::Commit.number(),
-        words: [old(0).hash().cast_signed(), 0, 0, 0, 0, 0],
-    };
+    let mut words = [0; WORDS];
+    words[0] = old(0).hash().cast_signed();
+    let request = Request::Write { number: Parameter::Commit.number(), words };
     workshop.say(&Message::Configure { to: Node::Cell(cell(77)), tag: 1, request });
     workshop.rest(Span::from_millis(10));
     assert_eq!(workshop.pieces[stranger].history, [Flash::Sound(old(0)); 2]);
@@ -321,7 +320,7 @@ fn two_cells_with_one_serial_number_are_named_and_neither_is_written() {
 fn joints_or_another_configuration_on_the_bus_end_it_before_a_word_is_said() {
     let (skin, old, _) = skin();
     let joints = Joints { in_use: 6, ..Joints::default() };
-    let write = Request::Write { number: Parameter::Pose.number(), words: [1; 6] };
+    let write = Request::Write { number: Parameter::Pose.number(), words: [1; WORDS] };
     for (message, trouble) in [
         (Message::Joints { epoch: Epoch(3), joints }, Trouble::Rival),
         (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, Trouble::Meddler),

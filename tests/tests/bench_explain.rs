@@ -8,7 +8,7 @@ use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::From;
-use protocol::packet::Epoch;
+use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skinbus_tests::bench::{Act, Bench, OnTheWire};
@@ -58,7 +58,7 @@ fn every_word_of_every_cell_is_explained() {
         for epoch in 0..u8::try_from(EPOCHS).unwrap() {
             let explanation = explained(&bench, &bench.wire, epoch);
             assert_eq!(explanation.missing, Vec::<String>::new(), "epoch {epoch}");
-            let mut sums = [0; 6];
+            let mut sums = [0; WORDS];
             for (place, cell) in bench.skin.cells.iter().enumerate() {
                 let torques = bench.torques(place);
                 let said = torques.iter().find(|(of, _)| *of == epoch).map(|(_, words)| *words);

@@ -7,7 +7,7 @@ use protocol::can::Format;
 use protocol::fixed::Q1_14;
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage};
-use protocol::packet::Epoch;
+use protocol::packet::{Epoch, WORDS};
 use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -103,7 +103,7 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         let answers = epoch_of(bench.gateway.broadcasts() - 1);
         let before = bench.gateway.table.cells()[0].replies;
         bench.run_epochs(late);
-        let torque = [protocol::fixed::Q3_12::from_bits(5); 6];
+        let torque = [protocol::fixed::Q3_12::from_bits(5); WORDS];
         let from = bench.seats[0].identity.cell.unwrap();
         bench.witness.compares = false;
         bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque }));
@@ -152,7 +152,7 @@ fn epochs_may_jump_forward_and_back() {
         // As if it had been started anew, or a recording went round. Not the epoch of the last or next one.
         let ours = bench.gateway.broadcasts();
         let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
-        let joints = Joints { positions: [Q1_14::ZERO; 6], in_use: 6 };
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
         bench.act(Act::Say(Message::Joints { epoch, joints }));
         bench.run(Span(bench.epoch().0 / 2));
     }
@@ -205,7 +205,7 @@ fn a_release_that_a_cell_never_heard_of_shows_as_torques_that_nobody_asked_for()
 
 #[test]
 fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
-    let joints = Joints { positions: [Q1_14::ZERO; 6], in_use: 6 };
+    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
     let joints = Message::Joints { epoch: Epoch(77), joints };
     let page = NetworkPage::Heartbeat(Heartbeat::default());
     let heartbeat = Message::Network { from: Node::Gateway, epoch: Epoch(0), page };

@@ -8,6 +8,7 @@ use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::{Message, State};
+use protocol::packet::WORDS;
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -39,7 +40,7 @@ fn halted(bench: &Bench) -> Option<Halt> {
     bench.gateway.last().unwrap().halted
 }
 
-fn q(bench: &Bench) -> [u64; 6] {
+fn q(bench: &Bench) -> [u64; WORDS] {
     bench.gateway.last().unwrap().q.map(f64::to_bits)
 }
 
@@ -51,7 +52,7 @@ fn a_halt_from_anybody_stops_robot_and_cells_and_a_resume_lets_both_go_on() {
     assert_eq!(halted(&bench), Some(Halt::Frame));
     assert_eq!(
         (bench.gateway.table.snapshot().sums.torque, bench.gateway.table.snapshot().sums.contributing),
-        ([0.0; 6], 0)
+        ([0.0; WORDS], 0)
     );
     let (stands, due, sent) = (q(&bench), replies(&bench).due, bench.torques(0).len());
     bench.run_epochs(30);

@@ -123,7 +123,9 @@ fn configure(random: &mut Pcg64, to: Address) -> Message {
 }
 
 fn mode(obeys: i16) -> Message {
-    let request = Request::Write { number: Parameter::Mode.number(), words: [obeys, 0, 0, 0, 0, 0] };
+    let mut words = [0; WORDS];
+    words[0] = obeys;
+    let request = Request::Write { number: Parameter::Mode.number(), words };
     Message::Configure { to: Address::Everyone, tag: 0, request }
 }
 

@@ -13,6 +13,7 @@ use process::replay::{FRESH, Replayed, TOUCHED, by_hand, cell, changed, is_torqu
 use process::{Place, example, skin_of};
 use protocol::id::Node;
 use protocol::message::{From, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use rustix::process::Signal;
@@ -338,7 +339,7 @@ fn a_cell_that_measures_obeys_for_the_replay_when_it_is_told_to() {
         matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
             if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
     });
-    guest.sends(&mode(1, Request::Write { number, words: [0; 6] }));
+    guest.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
     guest.waits_for("a cell that measures", answers(1, 0));
     let ended = place.replay("run.log", "--expect --to 1 --quiet").end();
     let said = "gateway: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \

@@ -75,20 +75,15 @@ impl FlashFile {
             let _ = File::open(folder.unwrap_or_else(|| Path::new("."))).and_then(|folder| folder.sync_all());
             Ok(())
         };
-        let stored = store();
-        if stored.is_err() {
-            // It may not even have been made.
-            let _ = fs::remove_file(&part);
-        }
-        stored
+        // It may not even have been made.
+        store().inspect_err(|_| drop(fs::remove_file(&part)))
     }
 }
 
 /// The bytes of a regular file, as many as tell that there are too many. A pipe is not waited for.
 fn read(path: &Path) -> io::Result<Vec<u8>> {
-    let mut options = OpenOptions::new();
-    options.read(true).custom_flags(i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or_default());
-    let file = options.open(path)?;
+    let no_wait = i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or_default();
+    let file = OpenOptions::new().read(true).custom_flags(no_wait).open(path)?;
     if !file.metadata()?.is_file() {
         return Err(io::Error::other("it is no regular file: move it away"));
     }

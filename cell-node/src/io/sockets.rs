@@ -78,17 +78,18 @@ impl Sockets {
 
     /// Forgets what came last, and takes what has come by now; whether there is anything.
     pub(super) fn look(&mut self) -> Result<bool, BusError> {
-        self.forget();
-        if self.bus.wait(Some(Duration::ZERO))? {
-            self.bus.receive(&mut self.woke)?;
+        self.wait(Duration::ZERO)?;
+        if self.came.is_empty() {
+            self.take_aside()?;
         }
-        self.take_aside()?;
         Ok(!self.came.is_empty())
     }
 
     /// Forgets what came last, and waits for what wakes; with it comes what waited.
     pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
-        self.forget();
+        self.waited.clear();
+        self.woke.clear();
+        self.came.clear();
         if wait >= Bus::PATIENCE {
             self.bus.receive_one_patiently(&mut self.woke)?;
         } else if self.bus.wait(Some(wait))? {
@@ -113,12 +114,6 @@ impl Sockets {
         }
         self.came.extend(waited);
         Ok(())
-    }
-
-    fn forget(&mut self) {
-        self.waited.clear();
-        self.woke.clear();
-        self.came.clear();
     }
 
     /// What came last.

@@ -24,6 +24,7 @@ use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK};
 
+use crate::phase;
 use numbers::Numbers;
 use port::Port;
 
@@ -105,7 +106,8 @@ pub(crate) struct Network {
     reported: Option<[PortState; PORTS]>,
     /// How often the parent changed.
     pub(crate) changes: u16,
-    tree_changed: bool,
+    /// The place in the tree is another than when this was looked at last.
+    pub(crate) tree_changed: bool,
     next_hello: Micros,
     outbox: Deque<(usize, PortMessage), OUTBOX>,
 }
@@ -116,10 +118,10 @@ impl Network {
         Self { next_hello: now, ..Self::default() }
     }
 
-    /// The same cell with wires at the ports `wired`; hellos of many cells are spread by `phase`.
-    pub(crate) fn wired(mut self, wired: u8, number: Option<CellId>, phase: Span) -> Self {
+    /// The same cell with wires at the ports `wired`; hellos of many cells are spread by serial number.
+    pub(crate) fn wired(mut self, wired: u8, number: Option<CellId>, serial: u32) -> Self {
         (self.wired, self.numbers.own) = (wired, number);
-        self.next_hello = self.next_hello + phase;
+        self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
         self
     }
 
@@ -187,13 +189,6 @@ impl Network {
         self.left.take_if(|left| left.port != UPLINK || now.since(left.since) >= HELLO);
     }
 
-    /// Asks the parent whether it is there.
-    pub(crate) fn ask_parent(&mut self) {
-        if let Some(up) = self.up() {
-            self.say(up, PortMessage::Ask);
-        }
-    }
-
     /// Bit p: the cell at port p is a child.
     pub(crate) fn children(&self) -> u8 {
         self.bits(Port::is_child)
@@ -218,11 +213,6 @@ impl Network {
     pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
-    }
-
-    /// Whether the place in the tree is another than when this was asked last.
-    pub(crate) const fn tree_changed(&mut self) -> bool {
-        core::mem::replace(&mut self.tree_changed, false)
     }
 
     /// A number that a walk gave this cell, once.
@@ -267,7 +257,7 @@ impl Network {
             label: self.label(),
         };
         if hello.label.is_some() {
-            self.ports.get_mut(port).into_iter().for_each(Port::told);
+            self.ports.get_mut(port).into_iter().for_each(|port| port.sought = false);
         }
         self.say(port, PortMessage::Hello(hello));
     }
@@ -286,27 +276,22 @@ impl Network {
             PortMessage::Join => self.let_in(now, port),
             PortMessage::Grant(label) => self.join(now, port, label),
             PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Done),
-            PortMessage::Refuse => {
-                if self.joining.is_some_and(|(asked, _)| asked == port) {
-                    self.distrust(now, port);
-                    self.joining = None;
-                    self.search(now);
-                }
+            PortMessage::Refuse if self.joining.is_some_and(|(asked, _)| asked == port) => {
+                self.distrust(now, port);
+                self.joining = None;
+                self.search(now);
             }
             PortMessage::Leave => {
-                self.ports.get_mut(port).into_iter().for_each(Port::disown);
+                self.ports.get_mut(port).into_iter().for_each(|port| port.child = None);
                 self.say(port, PortMessage::Left);
             }
-            PortMessage::Left => {
-                if let Some(left) = &mut self.left {
-                    left.heard |= left.port == port;
-                }
-            }
+            PortMessage::Left => self.left.iter_mut().for_each(|left| left.heard |= left.port == port),
             PortMessage::Seek(round) => self.pass_on(now, port, round),
             PortMessage::Ask => self.hello(now, port),
             PortMessage::Number(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
             PortMessage::Return(walk) => self.go_on_walking(port, walk),
-            PortMessage::Number(_) | PortMessage::State(_) | PortMessage::Missed(_) => {}
+            PortMessage::Refuse | PortMessage::Number(_) | PortMessage::State(_) | PortMessage::Missed(_) => {
+            }
         }
         self.tell_unnumbered(now);
     }
@@ -345,9 +330,7 @@ impl Network {
     /// Says the hellos that are due until then: while the cell is awake anyway, it need not wake for them.
     pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
-            // After a hang the missed ones are skipped.
-            let missed = now.since(self.next_hello).0 / HELLO.0;
-            self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
+            self.next_hello = phase::next(self.next_hello, HELLO, now);
             let before = self.children();
             self.ports.iter_mut().for_each(|port| port.pass(now));
             self.tree_changed |= before != self.children();

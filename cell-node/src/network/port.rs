@@ -16,11 +16,11 @@ pub(super) struct Port {
     /// The last hello, and when it came.
     heard: Option<(Hello, Micros)>,
     /// Since when the cell there is a child of this one.
-    child: Option<Micros>,
+    pub(super) child: Option<Micros>,
     /// Its hellos count again when they are later than this: it was a parent and was lost.
-    distrusted: Option<Micros>,
-    /// Somebody there asked for a later round, and has not heard a label since.
-    sought: bool,
+    pub(super) distrusted: Option<Micros>,
+    /// Somebody there asked for a later round, and has not been told a label since.
+    pub(super) sought: bool,
 }
 
 impl Port {
@@ -63,16 +63,6 @@ impl Port {
         self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
-    /// A later round is asked for there.
-    pub(super) const fn seek(&mut self) {
-        self.sought = true;
-    }
-
-    /// It has been told the present label.
-    pub(super) const fn told(&mut self) {
-        self.sought = false;
-    }
-
     /// Whether a later round makes a difference there at once: to a child, and to who looks for a way.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
         self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.label.is_none())
@@ -80,19 +70,6 @@ impl Port {
 
     pub(super) const fn is_child(&self) -> bool {
         self.child.is_some()
-    }
-
-    pub(super) const fn adopt(&mut self, now: Micros) {
-        self.child = Some(now);
-    }
-
-    pub(super) const fn disown(&mut self) {
-        self.child = None;
-    }
-
-    /// It was a parent and was lost: only what it says from now on counts.
-    pub(super) const fn distrust(&mut self, now: Micros) {
-        self.distrusted = Some(now);
     }
 
     /// Lets time pass: a child from which nothing comes is none.

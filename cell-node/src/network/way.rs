@@ -54,9 +54,9 @@ impl Network {
         // Two wires may lead to the same cell, whose sums come by one of them.
         for (other, there) in self.ports.iter_mut().enumerate() {
             if other == port {
-                there.adopt(now);
+                there.child = Some(now);
             } else if number.is_some() && there.number() == number {
-                there.disown();
+                there.child = None;
             }
         }
         self.tree_changed = true;
@@ -102,7 +102,7 @@ impl Network {
     }
 
     pub(super) fn distrust(&mut self, now: Micros, port: usize) {
-        self.ports.get_mut(port).into_iter().for_each(|port| port.distrust(now));
+        self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
     /// Asks the nearest port that is good enough, or for a new round where none is.
@@ -155,7 +155,7 @@ impl Network {
         if parent.label.round.wrapping_sub(round).cast_signed() > 0 {
             return self.hello(now, port);
         }
-        self.ports.get_mut(port).into_iter().for_each(Port::seek);
+        self.ports.get_mut(port).into_iter().for_each(|port| port.sought = true);
         let is_deserted = parent.port == port;
         self.deserted |= is_deserted;
         // Upwards is not everywhere: a parent may have two wires to this cell, and seek on both.

@@ -3,8 +3,9 @@
 use protocol::message::{Heartbeat, NetworkPage, Refused, State};
 use protocol::time::{Micros, Span};
 
-use super::{Node, spread};
+use super::{Node, Summing};
 use crate::identity::Identity;
+use crate::phase;
 
 /// From one heartbeat to the next.
 pub const HEARTBEAT: Span = Span::from_millis(250);
@@ -43,7 +44,7 @@ pub(super) struct AddressClaim {
 impl AddressClaim {
     /// The number will be claimed; never while there is none.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
-        let wait = Span(u64::from(identity.serial) * 1_000 % FIRST_WORD.0);
+        let wait = phase::by_serial(FIRST_WORD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
         Self { stage: Claim::Unsaid, next_heartbeat, sync_waits: false, defended: None, taken: None }
     }
@@ -60,7 +61,7 @@ impl Node {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
         if self.claim.stage == Claim::Unsaid {
             self.claim.stage = Claim::Said;
-            self.claim.next_heartbeat = now + CLAIM + spread(HEARTBEAT, cell);
+            self.claim.next_heartbeat = now + CLAIM + phase::by_number(HEARTBEAT, cell);
             return self.push_heartbeat();
         }
         self.claim.stage = Claim::Settled;
@@ -70,17 +71,18 @@ impl Node {
     /// One of four a second, with what has changed.
     pub(super) fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
-        if self.summing.network.exists() {
-            self.summing.notice_round();
+        let Summing { network, report, .. } = &mut self.summing;
+        if network.exists() {
+            // Another round alone is no news for anybody else.
+            report.due |= report.round != network.round();
             self.tell_tree(now);
             if self.summing.network.ports_changed(now) {
                 self.push_ports(now);
             }
         }
-        self.sense_with_heartbeat(now);
-        // After a hang the missed ones are skipped, and the phase is kept.
-        let next = &mut self.claim.next_heartbeat;
-        *next = *next + Span((now.since(*next).0 / HEARTBEAT.0 + 1) * HEARTBEAT.0);
+        let pages = self.sensing.beat(now);
+        self.push_sensors(pages);
+        self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT, now);
     }
 
     /// Somebody else spoke under our number. While we claim it we give way, unless the other claims it
@@ -101,7 +103,7 @@ impl Node {
 
     /// How the cell is: its flags, and what can be derived.
     pub(super) fn state(&self) -> State {
-        let in_use = self.configuration.in_use();
+        let in_use = self.configuration.in_use.as_ref();
         self.flags
             .with(State::CONFIGURED, in_use.is_some())
             .with(State::ACTIVE, self.active)

@@ -3,12 +3,11 @@
 //! Writes go to a staged copy. A commit that names the staged copy's hash takes it into flash, and then
 //! into use, as a whole: a cell that is interrupted between two writes keeps computing with what it had.
 
-use protocol::message::{Answer, SkinSensors};
+use protocol::message::Answer;
 use protocol::packet::WORDS;
 use protocol::parameters::{Parameter, ParameterError, Parameters};
 use protocol::time::Span;
 
-use crate::contact::Force;
 use crate::flash::Flash;
 use crate::kernel::{Kernel, Wrench};
 
@@ -25,7 +24,8 @@ pub(super) struct InUse {
 /// The parameters in use, and the staged ones.
 #[derive(Debug)]
 pub(super) struct Configuration {
-    in_use: Option<InUse>,
+    /// The parameters in use, if the cell is configured.
+    pub(super) in_use: Option<InUse>,
     staged: Parameters,
 }
 
@@ -39,11 +39,6 @@ impl Configuration {
             configuration.activate(parameters);
         }
         configuration
-    }
-
-    /// The parameters in use, if the cell is configured.
-    pub(super) const fn in_use(&self) -> Option<&InUse> {
-        self.in_use.as_ref()
     }
 
     /// Hash of the parameters in use; 0 while there are none.
@@ -78,10 +73,5 @@ impl InUse {
     /// From one joint broadcast to the next.
     pub(super) fn period(&self) -> Span {
         Span(self.parameters.period_us.into())
-    }
-
-    /// The force that is felt, by Algorithm 1.
-    pub(super) fn force(&self, sensors: &SkinSensors) -> Force {
-        Force::fuse(sensors.contact, sensors.proximity, &self.parameters.contact)
     }
 }

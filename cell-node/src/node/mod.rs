@@ -21,13 +21,13 @@ mod summing;
 use heapless::Deque;
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
-use protocol::id::{CellId, Command, Id, Kind, Node as Address};
+use protocol::id::{Command, Id, Kind, Node as Address};
 use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State};
 use protocol::packet::{self, Epoch, Packet, WORDS};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage};
 
-use crate::contact::Torque;
+use crate::contact::{Force, Torque};
 use crate::flash::{Flash, Kept};
 use crate::identity::{Identity, OWN};
 use crate::kernel::Kernel;
@@ -100,8 +100,8 @@ impl Node {
     /// gateway's side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
-        let phase = Span(u64::from(self.identity.serial) * 1_000 % HEARTBEAT.0);
-        self.summing.network = self.summing.network.wired(wired, self.identity.cell, phase);
+        let Identity { cell, serial } = self.identity;
+        self.summing.network = self.summing.network.wired(wired, cell, serial);
         self
     }
 
@@ -150,7 +150,7 @@ impl Node {
     pub fn poll_store(&self) -> Option<Kept> {
         let parameters = match self.storing? {
             Storing::Parameters(parameters, _) => Some(parameters),
-            Storing::Number => self.configuration.in_use().map(|in_use| in_use.parameters),
+            Storing::Number => self.configuration.in_use.as_ref().map(|in_use| in_use.parameters),
         };
         Some(Kept { number: self.identity.cell, parameters })
     }
@@ -259,7 +259,7 @@ impl Node {
         }
         // All that came before these joints has been heard.
         self.judge(now);
-        let in_use = self.configuration.in_use();
+        let in_use = self.configuration.in_use.as_ref();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.receiver.refused.meaning);
             return;
@@ -275,7 +275,8 @@ impl Node {
         count(&mut self.heard.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
-        let force = in_use.force(&self.stimuli.felt.skin);
+        let skin = &self.stimuli.felt.skin;
+        let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
         let torque =
             force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));
         if self.summing.sum.is_on() {
@@ -297,7 +298,7 @@ impl Node {
 
     /// What is due before the next joints is said now, while the cell is awake: hellos and a heartbeat.
     fn speak_before_the_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use() else { return };
+        let Some(in_use) = self.configuration.in_use.as_ref() else { return };
         let next_joints = now + in_use.period();
         self.summing.network.hello_by(now, next_joints);
         self.tell_tree(now);
@@ -341,11 +342,6 @@ impl Node {
         let fits = self.outbox.push_back(message).is_ok();
         debug_assert!(fits, "a shell takes what is to be sent after each call");
     }
-}
-
-/// When in a period a cell speaks: the cells of a bus are spread over it by node number.
-const fn spread(period: Span, cell: CellId) -> Span {
-    Span(period.0 * cell.get() as u64 / 255)
 }
 
 const fn count(counter: &mut u16) {

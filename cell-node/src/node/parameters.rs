@@ -138,7 +138,7 @@ impl Node {
 }
 
 /// These words, and zeros.
-fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
+pub(super) fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     let mut first = first.into_iter();
     core::array::from_fn(|_| first.next().unwrap_or(0))
 }

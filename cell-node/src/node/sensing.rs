@@ -18,7 +18,8 @@ use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact};
 
 use super::stimuli::Felt;
-use super::{Node, Switches, spread};
+use super::{Node, Switches};
+use crate::phase;
 
 /// Every so many heartbeats bring the acceleration too: it tells no touch, and is seldom wanted.
 const BEATS_PER_ACCELERATION: u8 = 4;
@@ -32,7 +33,6 @@ pub(super) struct Pages {
 
 impl Pages {
     const NONE: Self = Self { skin: false, acceleration: false };
-    const SKIN: Self = Self { skin: true, acceleration: false };
     pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
@@ -79,7 +79,7 @@ impl Sensing {
             Mode::Off => return Pages::NONE,
             Mode::Continuous { period_ms } => {
                 let period = Span::from_millis(period_ms.into());
-                self.due = Some(now + period + spread(period, cell));
+                self.due = Some(now + period + phase::by_number(period, cell));
             }
             Mode::Event => {
                 self.follow(&felt.skin, &switches.events);
@@ -99,7 +99,7 @@ impl Sensing {
     }
 
     /// A regular heartbeat goes out. What was said at this very moment is not said again.
-    fn beat(&mut self, now: Micros) -> Pages {
+    pub(super) fn beat(&mut self, now: Micros) -> Pages {
         if self.mode == Mode::Off {
             return Pages::NONE;
         }
@@ -115,9 +115,8 @@ impl Sensing {
             return Pages::NONE;
         }
         let period = Span::from_millis(period_ms.into());
-        let missed = now.since(due).0.checked_div(period.0).unwrap_or(0);
-        self.due = Some(due + Span((missed + 1) * period.0));
-        self.says(now, Pages::SKIN)
+        self.due = Some(phase::next(due, period, now));
+        self.says(now, Pages { skin: true, acceleration: false })
     }
 
     const fn says(&mut self, now: Micros, pages: Pages) -> Pages {
@@ -151,12 +150,6 @@ impl Node {
         self.push_sensors(pages);
     }
 
-    /// Says what goes with a regular heartbeat.
-    pub(super) fn sense_with_heartbeat(&mut self, now: Micros) {
-        let pages = self.sensing.beat(now);
-        self.push_sensors(pages);
-    }
-
     /// When it has something to say by itself; not while its number is in doubt.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
         self.sensing.due.filter(|_| self.claim.is_settled())
@@ -164,17 +157,16 @@ impl Node {
 
     /// Says what is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
-        if self.sensing_due().is_none() {
-            return;
+        if self.sensing_due().is_some() {
+            let pages = self.sensing.pass(now, now + Span(1));
+            self.push_sensors(pages);
         }
-        let pages = self.sensing.pass(now, now + Span(1));
-        self.push_sensors(pages);
     }
 
     /// What is due before the next joints is said now, while the cell is awake. Not where it would be said
     /// once for each joints or more often: all cells would say it at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use() else { return };
+        let Some(in_use) = self.configuration.in_use.as_ref() else { return };
         let joints = in_use.period();
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints

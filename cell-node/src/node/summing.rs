@@ -9,7 +9,7 @@ use protocol::wire::{PORTS, PortMessage, UPLINK};
 use super::{AddressClaim, Node, Storing};
 use crate::contact::Torque;
 use crate::network::{Lost, Network};
-use crate::sum::{Begin, Check, Sum, Words};
+use crate::sum::{Begin, Sum, Words};
 
 /// So many more epochs in a row without an answer are borne each time that a parent that was lost that way says that it
 /// was there and heard.
@@ -20,6 +20,8 @@ const PATIENCE: u16 = 12 * FORGETS;
 const FORGETS: u16 = 16;
 /// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
 const STEADY: u8 = 8;
+/// Who looks later than this who is missing was away, and what it misses may wait to be heard.
+const PUNCTUAL: Span = Span::from_millis(1);
 /// The shortest time between two words about its place in the tree.
 const TREE: Span = Span::from_millis(50);
 
@@ -37,13 +39,13 @@ enum Parent {
 
 /// When a cell says where it is in the tree.
 #[derive(Debug, Default)]
-struct TreeReport {
+pub(super) struct TreeReport {
     /// There is news.
-    due: bool,
+    pub(super) due: bool,
     /// Not before this.
     next: Micros,
     /// The round that was told last.
-    round: u8,
+    pub(super) round: u8,
 }
 
 /// A cell's network, its sums, and what one is to the other.
@@ -71,7 +73,7 @@ pub(super) struct Summing {
     pub(super) waits_for_children: bool,
     /// How often the parent had changed when that was looked at last.
     changes: u16,
-    report: TreeReport,
+    pub(super) report: TreeReport,
 }
 
 impl Summing {
@@ -125,7 +127,7 @@ impl Summing {
         }
         if is_parent && matches!(message, PortMessage::Hello(_)) {
             self.unanswered = None;
-            self.sum.release();
+            self.sum.held = false;
         }
         if message == PortMessage::Left && self.suspected.take_if(|suspected| *suspected == port).is_some() {
             self.patience = (self.patience + PATIENT).min(PATIENCE);
@@ -140,25 +142,20 @@ impl Summing {
         }
         if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
             self.unanswered = None;
-            self.sum.break_off();
+            self.sum.restate = true;
             // What was said in this epoch may have been taken by the parent before.
             self.sum.fall_silent();
         }
         if self.network.up().is_none() {
             self.sum.fall_silent();
         }
-        self.report.due |= self.network.tree_changed();
+        self.report.due |= core::mem::take(&mut self.network.tree_changed);
         // The sums of the parent and of the children.
         let heard = core::array::from_fn(|port| {
             let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
             self.network.number_at(port).filter(|_| is_ours && self.sum.is_on())
         });
         self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
-    }
-
-    /// Another round alone is no news for anybody else, and is told with a heartbeat.
-    pub(super) fn notice_round(&mut self) {
-        self.report.due |= self.report.round != self.network.round();
     }
 
     /// New joints, which stood on the bus `age` ago; the tree is for their sums as it is now.
@@ -196,7 +193,7 @@ impl Summing {
         if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and what was not said is free for another.
             if unanswered >= self.borne() {
-                self.sum.hold();
+                self.sum.held = true;
             }
             self.ask_parent();
         }
@@ -255,9 +252,9 @@ impl Summing {
     /// The parent says that it did not take a sum: it has to be told anew whom they are for, and asked whether it hears
     /// this cell at all.
     fn was_missed(&mut self, epoch: Epoch) {
-        self.sum.break_off();
-        let before = self.sum.epoch().is_some_and(|present| epoch.next() == present);
-        if (self.sum.epoch() == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
+        self.sum.restate = true;
+        let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
+        if (self.sum.epoch == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
             // It was thought to be taken.
             self.unanswered = self.unanswered.or(Some(0));
             self.ask_parent();
@@ -271,7 +268,9 @@ impl Summing {
 
     /// Asks the parent whether it is there; it is looked for the answer before the next joints.
     fn ask_parent(&mut self) {
-        self.network.ask_parent();
+        if let Some(up) = self.network.up() {
+            self.network.say(up, PortMessage::Ask);
+        }
         self.sum.watch();
     }
 }
@@ -311,15 +310,13 @@ impl Node {
             self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
             self.push(Message::Sum { from, epoch, torque, count });
         }
-        match self.summing.sum.check(now) {
-            Check::NotYet => return,
-            Check::Now => {
-                self.judge(now);
-                if self.summing.unanswered.is_some() {
-                    self.summing.ask_parent();
-                }
+        let Some(late) = self.summing.sum.check(now) else { return };
+        // Who looks late looks at the next joints, when all that came before them has been heard.
+        if late <= PUNCTUAL {
+            self.judge(now);
+            if self.summing.unanswered.is_some() {
+                self.summing.ask_parent();
             }
-            Check::Late => {}
         }
         if core::mem::take(&mut self.claim.sync_waits) {
             self.push_heartbeat();

@@ -1,5 +1,7 @@
+use super::parameters::padded;
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
 use protocol::packet::Half;
 use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};
@@ -277,7 +279,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
             Some(Answer::Value { number, written: false, words })
         );
     }
-    let commit = |hash: u16| Request::Write { number: 127, words: [hash.cast_signed(), 0, 0, 0, 0, 0] };
+    let commit = |hash: u16| Request::Write { number: 127, words: padded([hash.cast_signed()]) };
     let refused = |reason| Some(Answer::Refused { number: 127, reason });
     assert_eq!(ask(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
     assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");

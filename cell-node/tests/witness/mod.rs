@@ -19,7 +19,7 @@ pub(crate) struct Case {
     /// The joint that moves the cell, 1 to 6.
     pub(crate) joint: u8,
     /// Joint positions in rad.
-    pub(crate) positions: [f64; 6],
+    pub(crate) positions: [f64; MAX_JOINTS],
     /// The cell's position in the frame of that joint, in m.
     pub(crate) position: [f64; 3],
     /// Where the force points, in the same frame.
@@ -27,7 +27,7 @@ pub(crate) struct Case {
     /// The force in N.
     pub(crate) force: f64,
     /// The torques in Nm.
-    pub(crate) torques: [f64; 6],
+    pub(crate) torques: [f64; MAX_JOINTS],
 }
 
 impl Case {
@@ -41,11 +41,11 @@ impl Case {
         let numbers: Vec<f64> = rest.split(',').map(|number| number.parse().unwrap()).collect();
         Self {
             joint: joint.parse().unwrap(),
-            positions: numbers[..6].try_into().unwrap(),
+            positions: per_joint(&numbers[..6]),
             position: numbers[6..9].try_into().unwrap(),
             direction: numbers[9..12].try_into().unwrap(),
             force: numbers[12],
-            torques: numbers[13..].try_into().unwrap(),
+            torques: per_joint(&numbers[13..]),
         }
     }
 
@@ -59,7 +59,7 @@ impl Case {
     }
 
     /// The joint positions as words.
-    pub(crate) fn words(&self) -> [Q1_14; 6] {
+    pub(crate) fn words(&self) -> [Q1_14; MAX_JOINTS] {
         self.positions.map(|angle| Q1_14::from_radians(angle).unwrap())
     }
 }
@@ -79,7 +79,7 @@ pub(crate) struct Errors {
 
 impl Errors {
     /// Compares what `torques` says of each case.
-    pub(crate) fn of(torques: impl Fn(&Case) -> [f64; 6]) -> Self {
+    pub(crate) fn of(torques: impl Fn(&Case) -> [f64; MAX_JOINTS]) -> Self {
         let cases = Case::all();
         let fits = |case: &&Case| case.torques.iter().all(|torque| torque.abs() < Q3_12::MAX.to_f64());
         let errors: Vec<f64> = cases
@@ -101,7 +101,9 @@ impl Errors {
     }
 
     /// Compares the words that a cell would send.
-    pub(crate) fn of_words(jacobian: impl Fn(&Parameters, &[Q1_14; 6]) -> [Q1_14; 6]) -> Self {
+    pub(crate) fn of_words(
+        jacobian: impl Fn(&Parameters, &[Q1_14; MAX_JOINTS]) -> [Q1_14; MAX_JOINTS],
+    ) -> Self {
         Self::of(|case| {
             let force = Force::from_steps((case.force * 65_536.0) as i64);
             let torque = Torque::new(&jacobian(&case.parameters(), &case.words()), force);
@@ -115,12 +117,13 @@ pub(crate) fn ur5() -> [Row; MAX_JOINTS] {
     let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
     let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
     let alpha = [1.0, 0.0, 0.0, 1.0, -1.0, 0.0];
-    std::array::from_fn(|row| Row {
-        a: Q1_14::nearest(a[row]),
-        d: Q1_14::nearest(d[row]),
-        alpha: Q1_14::nearest(alpha[row]),
-        theta_offset: Q1_14::ZERO,
-    })
+    let [a, d, alpha] = [a, d, alpha].map(|column: [f64; 6]| per_joint(&column).map(Q1_14::nearest));
+    std::array::from_fn(|row| Row { a: a[row], d: d[row], alpha: alpha[row], theta_offset: Q1_14::ZERO })
+}
+
+/// One value a joint, and nothing for joints that the robot has not.
+pub(crate) fn per_joint<T: Copy + Default>(values: &[T]) -> [T; MAX_JOINTS] {
+    std::array::from_fn(|joint| values.get(joint).copied().unwrap_or_default())
 }
 
 type Transform = [[f64; 4]; 4];
@@ -149,7 +152,7 @@ fn transform(row: &Row, position: Q1_14) -> Transform {
 }
 
 /// Eq. 8 as it stands: frames by multiplying 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`.
-pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; 6]) -> [f64; 6] {
+pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     let mut frames: Vec<Transform> =
         vec![std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))];
     for (row, &position) in parameters.chain().iter().zip(positions) {
@@ -162,7 +165,7 @@ pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; 6]) -> [f6
     let local = turn(parameters.pose.position.map(Q1_14::to_f64));
     let cell: [f64; 3] = std::array::from_fn(|i| local[i] + last[i][3]);
 
-    let mut jacobian = [0.0; 6];
+    let mut jacobian = [0.0; MAX_JOINTS];
     for (row, frame) in jacobian.iter_mut().zip(&frames[..frames.len() - 1]) {
         let origin = axis(frame, 3);
         let moment = cross(axis(frame, 2), std::array::from_fn(|i| cell[i] - origin[i]));

@@ -17,7 +17,7 @@ use protocol::wire::{PORTS, PortMessage};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 
-use super::{End, POSITIONS};
+use super::{End, positions};
 
 /// How a cell is.
 #[derive(Debug)]
@@ -74,6 +74,14 @@ impl Place {
             alpha: Q1_14::nearest(alpha),
             theta_offset: Q1_14::ZERO,
         };
+        let rows = [
+            row(0.0, 1.0, 0.09),
+            row(-0.425, 0.0, 0.0),
+            row(-0.392, 0.0, 0.0),
+            row(0.0, 1.0, 0.11),
+            row(0.0, -1.0, 0.095),
+            row(0.0, 0.0, 0.08),
+        ];
         let parameters = Parameters {
             joint: 6,
             joints: 6,
@@ -83,17 +91,10 @@ impl Place {
             },
             contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
             period_us: 16_000,
-            rows: [
-                row(0.0, 1.0, 0.09),
-                row(-0.425, 0.0, 0.0),
-                row(-0.392, 0.0, 0.0),
-                row(0.0, 1.0, 0.11),
-                row(0.0, -1.0, 0.095),
-                row(0.0, 0.0, 0.08),
-            ],
+            rows: std::array::from_fn(|joint| rows.get(joint).copied().unwrap_or_default()),
         };
         let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
-        let jacobian = Wrench::new(&parameters).jacobian(&POSITIONS.map(Q1_14::nearest));
+        let jacobian = Wrench::new(&parameters).jacobian(&positions());
         let own = Torque::new(&jacobian, force).exact().map(|exact| {
             let word: Q7_8 = exact.round();
             i32::from(word.to_bits())

@@ -1,0 +1,20 @@
+//! When in a period a cell speaks: cells are spread over it, and keep their place.
+
+use protocol::id::CellId;
+use protocol::time::{Micros, Span};
+
+/// By number: those of a bus speak one after the other.
+pub(crate) const fn by_number(period: Span, cell: CellId) -> Span {
+    Span(period.0 * cell.get() as u64 / 255)
+}
+
+/// By serial number, for cells whose numbers may be the same.
+pub(crate) const fn by_serial(period: Span, serial: u32) -> Span {
+    Span(serial as u64 * 1_000 % period.0)
+}
+
+/// When to speak next after what was due: what was missed in a hang is skipped, and the phase is kept.
+pub(crate) fn next(due: Micros, period: Span, now: Micros) -> Micros {
+    let missed = now.since(due).0.checked_div(period.0).unwrap_or(0);
+    due + Span((missed + 1) * period.0)
+}
