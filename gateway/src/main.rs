@@ -1,7 +1,10 @@
 //! `gateway`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes are 0 (done),
 //! 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
 
-#![allow(rustdoc::broken_intra_doc_links, reason = "help is written for a terminal: [events] is a table of a skin")]
+#![allow(
+    rustdoc::broken_intra_doc_links,
+    reason = "help is written for a terminal: [events] is a table of a skin"
+)]
 
 mod ack;
 mod buses;
