@@ -27,7 +27,7 @@ pub fn check(bench: &Bench) {
 /// Each cell's two accounts.
 fn cells(bench: &Bench) {
     for (place, cell) in bench.gateway.table.cells().iter().enumerate() {
-        let (uplink, replies, node) = (cell.uplink, cell.replies, cell.node);
+        let (uplink, replies, node) = (cell.uplink(), cell.replies, cell.node);
         let Uplink { sent, delivered, rejected, lost, surplus, .. } = uplink;
         assert_eq!(sent + surplus, delivered + rejected + lost, "packets of cell {node}: {uplink:?}");
         let Replies { due, in_time, late, missing, in_doubt, unasked: _, too_late: _ } = replies;
@@ -36,7 +36,7 @@ fn cells(bench: &Bench) {
         let arrived = bench.witness.arrived(place);
         let tally = bench.witness.tally;
         if is_fd(bench) && (tally.flipped, tally.cut, tally.babbled) == (0, 0, 0) {
-            let elsewhere = uplink.in_doubt + uplink.unsettled();
+            let elsewhere = uplink.in_doubt + uplink.unsettled;
             assert_eq!(delivered + elsewhere, arrived, "arrivals of cell {node}: {uplink:?}");
         }
         assert!(delivered <= arrived, "cell {node} delivered {arrived}: {uplink:?}");

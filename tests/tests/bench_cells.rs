@@ -5,7 +5,8 @@
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::{CLAIM, HEARTBEAT, PENDING};
-use model::table::{DEAD_AFTER, Event, Notice, Replies, Status};
+use model::table::{Event, Notice, Replies, Status};
+use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::{Message, State};
@@ -130,7 +131,7 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         let now = replies(&bench, CELL);
         assert_eq!((now.due, now.in_time), (before.due + 20, before.in_time + 20), "{now:?}");
         finish(&mut bench);
-        let uplink = bench.gateway.table.cells()[CELL].uplink;
+        let uplink = bench.gateway.table.cells()[CELL].uplink();
         assert_eq!((uplink.restarts, uplink.lost, uplink.surplus), (1, 0, 0), "{uplink:?}");
     }
 }
@@ -183,7 +184,7 @@ fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
         assert_eq!(told, [Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
         finish(&mut bench);
-        let uplink = bench.gateway.table.cells()[CELL].uplink;
+        let uplink = bench.gateway.table.cells()[CELL].uplink();
         assert!(uplink.restarts == 1 && uplink.lost <= 1 && uplink.sent < 1_000, "{uplink:?}");
     }
 }
@@ -275,7 +276,7 @@ fn a_cell_that_hung_feels_what_was_said_meanwhile_and_no_stimulus_is_refused() {
     bench.run_epochs(5);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
-    assert_eq!(bench.gateway.table.cells()[CELL].refused.unwrap().stimuli, 0);
+    assert_eq!(bench.gateway.table.cells()[CELL].pages().refused.unwrap().stimuli, 0);
 }
 
 #[test]
@@ -334,7 +335,7 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         }
         assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
         finish(&mut bench);
-        let uplink = bench.gateway.table.cells()[0].uplink;
+        let uplink = bench.gateway.table.cells()[0].uplink();
         let got = (uplink.restarts, uplink.lost, uplink.surplus);
         assert_eq!(got, (0, 0, u64::from(claimed)), "{uplink:?}");
     }
@@ -353,9 +354,9 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
     bench.act(Act::Start(other));
     bench.run(START);
     assert_eq!(status(&bench, 0), Status::Active, "it was told what touches it");
-    assert_eq!(bench.gateway.table.cells()[0].heartbeat.unwrap().serial, 77);
+    assert_eq!(bench.gateway.table.cells()[0].heartbeat().unwrap().serial, 77);
     finish(&mut bench);
-    let uplink = bench.gateway.table.cells()[0].uplink;
+    let uplink = bench.gateway.table.cells()[0].uplink();
     assert_eq!((uplink.restarts, uplink.lost), (1, 0), "{uplink:?}");
 }
 
@@ -368,7 +369,7 @@ fn a_damaged_flash_is_said_and_nothing_is_due() {
     bench.begin();
     bench.press(0, 2.0);
     bench.run_epochs(20);
-    let heartbeat = bench.gateway.table.cells()[0].heartbeat.unwrap();
+    let heartbeat = bench.gateway.table.cells()[0].heartbeat().unwrap();
     assert!(heartbeat.state.has(State::FLASH_DAMAGED) && !heartbeat.state.has(State::CONFIGURED));
     finish(&mut bench);
     assert_eq!((replies(&bench, 0), bench.torques(0).len()), (Replies::default(), 0));

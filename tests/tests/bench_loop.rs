@@ -59,7 +59,7 @@ fn a_halt_from_anybody_stops_robot_and_cells_and_a_resume_lets_both_go_on() {
     assert_eq!(q(&bench), stands);
     assert_eq!((replies(&bench).due, bench.torques(0).len()), (due, sent), "nothing is due, nothing comes");
     for cell in bench.gateway.table.cells() {
-        assert!(cell.heartbeat.unwrap().state.has(State::HALTED) && !cell.is_ready());
+        assert!(cell.heartbeat().unwrap().state.has(State::HALTED) && !cell.is_ready());
     }
 
     bench.act(Act::Inject(Message::Resume));
@@ -116,7 +116,7 @@ fn a_cell_that_did_not_hear_a_halt_is_found_out_by_its_heartbeat() {
         .table
         .cells()
         .iter()
-        .map(|cell| cell.heartbeat.unwrap().state.has(State::HALTED))
+        .map(|cell| cell.heartbeat().unwrap().state.has(State::HALTED))
         .collect();
     assert!(!halted[1..].contains(&false), "{halted:?}");
     finish(&mut bench);

@@ -357,7 +357,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
         seen[from..].iter().for_each(|seen| take(&mut table, seen.own, seen.at_nanos, &seen.frame));
         table.finish();
         let all = Replies::total(table.cells().iter().map(|cell| cell.replies));
-        let lost: u64 = table.cells().iter().map(|cell| cell.uplink.lost).sum();
+        let lost: u64 = table.cells().iter().map(|cell| cell.uplink().lost).sum();
         assert_eq!((all.missing, all.late, lost), (0, 0, 0), "seed {seed}: {all:#?}");
         assert!(all.due > 50 && all.in_time == all.due, "{all:#?}");
     }

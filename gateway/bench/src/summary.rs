@@ -477,7 +477,7 @@ fn sensors(table: &Table) -> SensorsSummary {
 }
 
 fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
-    let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink));
+    let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink()));
     let unexplained = total.lost - total.outage;
     let dropped = unexplained.min(dropped_by_bus);
     UplinkSummary {
@@ -491,7 +491,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         unknown: unexplained - dropped,
         surplus: total.surplus,
         in_doubt: total.in_doubt,
-        unsettled: total.unsettled(),
+        unsettled: total.unsettled,
         restarts: total.restarts,
     }
 }
@@ -529,7 +529,7 @@ fn replies(table: &Table) -> RepliesSummary {
         summary.too_late += explain(too_late);
         summary.skipped += explain(skipped);
         summary.not_heard += explain(not_heard);
-        summary.lost += explain(cell.uplink.lost + cell.uplink.rejected);
+        summary.lost += explain(cell.uplink().lost + cell.uplink().rejected);
         summary.in_doubt += in_doubt;
         summary.unknown += rest;
         summary.unasked += unasked;

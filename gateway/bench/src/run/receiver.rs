@@ -310,7 +310,7 @@ impl Receiver {
             self.tell(News::Notice(notice));
         }
         let cells = self.table.statuses(now).map(|(cell, status)| {
-            let state = cell.heartbeat.map(|heartbeat| heartbeat.state);
+            let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
             let alive = !matches!(status, Status::Dead | Status::Unknown);
             let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
             let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
@@ -321,7 +321,9 @@ impl Receiver {
                 ready,
                 halted: ready && !cell.is_ready(),
                 unconfigured: settled.is_some() && !ready,
-                other: cell.heartbeat.is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+                other: cell
+                    .heartbeat()
+                    .is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
                 last_joints: cell.last_joints,
                 said: cell.said(),
                 reply: cell.reply,

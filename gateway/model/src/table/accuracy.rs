@@ -2,7 +2,8 @@
 
 use protocol::packet::WORDS;
 
-use super::cell::{Expected, word_to_nm};
+use super::held::word_to_nm;
+use super::replies::Expected;
 use super::trunk;
 
 /// Epochs over which errors of sums are averaged.

@@ -1,9 +1,11 @@
 //! A table of a bus whose cells answer with sums.
 
-use protocol::fixed::{Q5_10, Q7_8};
-use protocol::message::{From, Tree};
+use protocol::fixed::{Q1_14, Q5_10, Q7_8};
+use protocol::message::{From, Joints, NetworkPage, SensorPage, State, Tree};
+use protocol::time::Span;
 
 use super::*;
+use crate::tracker::DEAD_AFTER;
 
 /// Four cells on one bus, 1 and 2 of them roots.
 fn skin() -> Skin {
@@ -265,8 +267,8 @@ fn packets_that_the_gateway_does_not_take_are_explained_by_their_senders_own_cou
     // Two pages, five sums, and one packet that is lost.
     bench.heartbeat(3, 9, State::default());
     bench.table.finish();
-    let uplink = bench.table.cells()[2].uplink;
+    let uplink = bench.table.cells()[2].uplink();
     assert_eq!((uplink.sent, uplink.delivered, uplink.unheard, uplink.lost), (10, 4, 5, 1), "{uplink:?}");
-    let total = Uplink::total(bench.table.cells().iter().map(|cell| cell.uplink));
+    let total = Uplink::total(bench.table.cells().iter().map(|cell| cell.uplink()));
     assert_eq!((total.unheard, total.lost), (5, 1));
 }

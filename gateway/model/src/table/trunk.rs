@@ -3,7 +3,7 @@
 use protocol::packet::WORDS;
 
 use super::accuracy::SumError;
-use super::cell::LATEST;
+use crate::tracker::LATEST;
 
 /// What became of sums.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -18,20 +18,6 @@ pub struct SumCounts {
     pub overheard: u64,
     /// Of an epoch that has passed.
     pub stale: u64,
-}
-
-impl SumCounts {
-    /// Both together.
-    #[must_use]
-    pub const fn with(self, other: Self) -> Self {
-        Self {
-            received: self.received + other.received,
-            first: self.first + other.first,
-            resent: self.resent + other.resent,
-            overheard: self.overheard + other.overheard,
-            stale: self.stale + other.stale,
-        }
-    }
 }
 
 /// Cells that are to be in an epoch's sums: due = in time + late + missing.
@@ -64,6 +50,29 @@ pub(super) struct Sum {
 impl Sum {
     pub(super) fn is_saturated(&self) -> bool {
         self.words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN))
+    }
+}
+
+/// What a cell has said as a root.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RootSums {
+    /// Whether its sums are for the gateway; else another cell takes them.
+    pub(super) feeds: bool,
+    /// For the newest epochs.
+    pub(super) said: [Option<Sum>; LATEST + 1],
+}
+
+impl RootSums {
+    pub(super) const fn new(feeds: bool) -> Self {
+        Self { feeds, said: [None; LATEST + 1] }
+    }
+
+    /// A new epoch.
+    pub(super) fn open(&mut self) {
+        self.said.rotate_right(1);
+        if let Some(newest) = self.said.first_mut() {
+            *newest = None;
+        }
     }
 }
 
@@ -202,17 +211,5 @@ impl Contributions {
         self.late += u64::from(all - in_time);
         self.missing += u64::from(due - all);
         self.unasked += u64::from(came - all);
-    }
-
-    /// Both together.
-    #[must_use]
-    pub const fn with(self, other: Self) -> Self {
-        Self {
-            due: self.due + other.due,
-            in_time: self.in_time + other.in_time,
-            late: self.late + other.late,
-            missing: self.missing + other.missing,
-            unasked: self.unasked + other.unasked,
-        }
     }
 }

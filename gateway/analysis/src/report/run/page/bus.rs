@@ -94,7 +94,7 @@ impl Draft<'_> {
         });
         let mut cells: Vec<_> = cells.collect();
         cells.sort_by_key(|(_, cell, _, latency)| {
-            let (replies, uplink) = (&cell.replies, &cell.uplink);
+            let (replies, uplink) = (&cell.replies, cell.uplink());
             std::cmp::Reverse((
                 replies.missing + replies.late,
                 uplink.lost,
@@ -109,12 +109,12 @@ impl Draft<'_> {
                 (latency.sum as f64 / latency.count as f64 * 1e-3, latency.greatest as f64 * 1e-3)
             };
             let replies = &cell.replies;
-            let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink.lost];
+            let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink().lost];
             let counts = counts.map(|count| count.to_string());
             [format!("{} {}", lane.name, cell.node), joint.to_string()]
                 .into_iter()
                 .chain(counts)
-                .chain([cell.uplink.restarts.to_string(), number(mean), number(slowest)])
+                .chain([cell.uplink().restarts.to_string(), number(mean), number(slowest)])
                 .collect::<Vec<_>>()
         };
         let rows: Vec<_> = cells.iter().take(WORST).map(row).collect();
@@ -210,7 +210,7 @@ impl Draft<'_> {
         row("ticks whose velocity was not finite".to_owned(), motion.refused, false);
         for lane in &run.lanes {
             let name = &lane.name;
-            let uplink = Uplink::total(lane.table.cells().iter().map(|cell| cell.uplink));
+            let uplink = Uplink::total(lane.table.cells().iter().map(|cell| cell.uplink()));
             row(format!("{name}: frames recorded"), lane.frames, true);
             row(
                 format!("{name}: frames that are not in the recording, by its own notes"),

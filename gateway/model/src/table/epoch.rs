@@ -1,0 +1,139 @@
+//! The joints that cells are answering: who has to, and what becomes of an epoch when the next one begins.
+
+use protocol::fixed::Q1_14;
+use protocol::message::Joints;
+use protocol::packet::{Epoch, WORDS};
+use protocol::time::Micros;
+
+use super::Table;
+use super::cell::Cell;
+use super::replies::Expected as Reply;
+use super::trunk::Expected;
+use crate::tracker::LATEST;
+
+/// The positions in rad that the words of a broadcast were rounded from.
+pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; WORDS]> + 'a;
+
+/// The broadcast that cells are answering.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Broadcast {
+    pub(super) epoch: Epoch,
+    /// The epochs that may still be answered, in the order in which the bus carried them, newest first.
+    recent: [Option<Epoch>; LATEST + 1],
+    /// Broadcasts before this one.
+    pub(super) number: u64,
+    at: Micros,
+    due: u32,
+    pub(super) in_time: u32,
+    pub(super) last_reply: Option<Micros>,
+    pub(super) error: [f64; WORDS],
+}
+
+impl Broadcast {
+    /// Broadcasts after those of which a cell had heard when it wrote a page; more than a few are not looked for.
+    pub(super) fn since(&self, heard: Epoch) -> u64 {
+        // It has heard of none, where none but these has been.
+        let recent = || self.recent.iter().flatten().count();
+        let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent());
+        self.lag(heard).or_else(all).map_or(0, |passed| passed as u64)
+    }
+
+    /// How many broadcasts before the newest one that of an epoch was, if it may still be answered. Not by the epochs'
+    /// difference: broadcasts may be lost on the way back, or change places.
+    pub(super) fn lag(&self, epoch: Epoch) -> Option<usize> {
+        self.recent.iter().flatten().position(|&recent| recent == epoch)
+    }
+
+    /// Its number, its epoch, and when it stood on the bus.
+    pub(super) const fn joints(&self) -> (u64, Epoch, Micros) {
+        (self.number, self.epoch, self.at)
+    }
+
+    /// What was due and came so far counts for nothing.
+    pub(super) const fn begin_accounts(&mut self) {
+        (self.due, self.in_time, self.last_reply) = (0, 0, None);
+    }
+}
+
+impl Table {
+    /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
+    pub(super) fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
+        if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
+            // Repeated on the way: cells drop it.
+            return self.cells.iter_mut().for_each(Cell::hear_again);
+        }
+        let number = self.broadcast.map_or(0, |before| before.number + 1);
+        let mut recent = self.broadcast.map_or([None; LATEST + 1], |before| before.recent);
+        recent.rotate_right(1);
+        if let Some(newest) = recent.first_mut() {
+            *newest = Some(epoch);
+        }
+        self.close_epoch();
+        self.let_go_of_what_is_over(epoch);
+        let frames = self.comparing.then(|| {
+            let q = q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians));
+            (self.central.frames(&joints.positions), self.unquantised.frames_at(&q))
+        });
+        let (mut due, mut stale, mut age, mut known) = (0, 0, 0, true);
+        let mut whole = frames.as_ref().map(|_| Expected { constant: true, ..Expected::default() });
+        for place in 0..self.cells.len() {
+            let Some(cell) = self.cells.get_mut(place) else { break };
+            let skin = cell.latch(epoch);
+            let force = skin.map_or(0.0, |skin| self.central.force(place, &skin));
+            known &= skin.is_some() || !cell.is_ready();
+            let (change, missed) = cell.open_epoch(number, force > 0.0, &self.safety);
+            due += u32::from(cell.owed.is_due());
+            stale += if missed > 0 { cell.held_cells() } else { 0 };
+            age = age.max(if cell.contributes() { missed } else { 0 });
+            if let (Some((frames, exact)), Some(whole), Some(skin)) = (&frames, &mut whole, skin) {
+                if cell.sums.is_none() {
+                    let quantised = self.central.torque(place, frames, force);
+                    let plain = self.unquantised.force(place, &skin);
+                    let unquantised = self.unquantised.torque(place, exact, plain);
+                    cell.owed.expect(Reply { number, quantised, unquantised });
+                } else if cell.owed.is_due() {
+                    whole.add(self.central.torque(place, frames, force), cell.joint);
+                }
+                if let Some(felt) = self.snapshot.felt.get_mut(place) {
+                    whole.constant &= core::mem::replace(felt, skin) == skin;
+                }
+            }
+            self.apply(change);
+        }
+        if let Some(trunk) = &mut self.trunk {
+            trunk.open(due, known, whole);
+        }
+        let sums = &mut self.snapshot.sums;
+        (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
+        let error = [0.0; WORDS];
+        self.broadcast =
+            Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
+    }
+
+    pub(super) fn close_epoch(&mut self) {
+        let Some(before) = self.broadcast else { return };
+        if let Some(last) = before.last_reply {
+            // The histogram grows by itself; it cannot refuse.
+            let _ = self.last_reply.record(last.since(before.at).0);
+        }
+        if let Some(trunk) = &mut self.trunk {
+            let (due, complete) = trunk.close();
+            return self.counters.epoch(due, complete);
+        }
+        self.counters.epoch(before.due > 0, before.in_time == before.due);
+        if self.comparing && before.due > 0 && before.in_time == before.due {
+            self.accuracy.whole_skin(&before.error);
+        }
+    }
+
+    /// What the loop has let go while the bus carried no joints does not come back with the next ones that it carries.
+    fn let_go_of_what_is_over(&mut self, epoch: Epoch) {
+        // Broadcasts may change places on the way back: the newest is not always the last that came.
+        let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
+        let gap = recent.map(|before| epoch.since(before)).min().unwrap_or(0);
+        let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
+        if core::mem::take(&mut self.interrupted) || over {
+            self.each_cell(Cell::let_go);
+        }
+    }
+}

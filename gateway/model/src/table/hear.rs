@@ -1,0 +1,220 @@
+//! What the bus carries, and what follows from it.
+
+use protocol::fixed::Q;
+use protocol::id::{Id, Node};
+use protocol::message::{Answer, Heartbeat, Message, NetworkPage, State};
+use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::{Cuts, Parameter};
+use protocol::time::Micros;
+
+use super::cell::Cell;
+use super::held::Change;
+use super::trunk::{Sum, Taken, Trunk};
+use super::{Event, Notice, Positions, Table};
+use crate::tracker::{News, Word};
+
+impl Table {
+    /// A frame of this gateway's, as it stood on the bus.
+    pub(super) fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
+        match *message {
+            Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, positions(epoch)),
+            Message::Stimulus { .. } => self.hear_stimulus(message),
+            Message::Halt => self.each_cell(Cell::halt),
+            Message::Sync => self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false),
+            Message::Report => self.cells.iter_mut().for_each(|cell| cell.said.counters = false),
+            Message::Resume
+            | Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configure { .. }
+            | Message::Configured { .. } => {}
+        }
+    }
+
+    /// A frame of somebody else's.
+    pub(super) fn hear(&mut self, at: Micros, id: Id, message: &Message) {
+        // What the gateway's side sends may also come from somebody at a shell.
+        match *message {
+            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
+                self.counters.count(Event::Rival);
+                self.snapshot.sums.rivals += 1;
+                self.notices.push_back(Notice::Rival);
+            }
+            Message::Halt => {
+                self.snapshot.sums.halts += 1;
+                self.each_cell(Cell::halt);
+            }
+            Message::Resume => {
+                self.snapshot.sums.resumes += 1;
+                self.cells.iter_mut().for_each(Cell::resume);
+            }
+            Message::Stimulus { .. } => self.hear_stimulus(message),
+            Message::Sync | Message::Report | Message::Configure { .. } => {}
+            Message::Sum { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Network { .. }
+            | Message::Configured { .. } => self.hear_cell(at, id, message),
+        }
+    }
+
+    fn hear_stimulus(&mut self, message: &Message) {
+        let Message::Stimulus { to, from, page } = *message else { return };
+        let last = self.broadcast.map(|broadcast| broadcast.epoch);
+        for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
+            cell.feel(from, page, last);
+        }
+    }
+
+    fn hear_cell(&mut self, at: Micros, id: Id, message: &Message) {
+        let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
+            self.counters.count(Event::Stranger);
+            if let Message::Network {
+                from: Node::Cell(node), page: NetworkPage::Heartbeat(heartbeat), ..
+            } = *message
+            {
+                self.strangers.insert(node, heartbeat);
+            }
+            return;
+        };
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        let news = cell.tracked.hear(at, message, self.broadcast.map(|broadcast| broadcast.number));
+        if news.revived {
+            self.snapshot.sums.dead -= 1;
+            self.notices.push_back(Notice::Back(cell.node));
+        }
+        match *message {
+            Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                self.take_heartbeat(place, &news, &heartbeat, epoch)
+            }
+            Message::Network { epoch, page: NetworkPage::Heard(_), .. } => {
+                cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
+            }
+            Message::Network { page: NetworkPage::Refused(_), .. } => cell.said.counters = true,
+            Message::Sensors { page, .. } => cell.tells(at, &page, &self.events),
+            Message::Configured { answer, .. } => {
+                cell.switched.answered(&answer);
+                if let Answer::Value { number, written: true, words } = answer {
+                    if number == Parameter::Reply.number() {
+                        cell.reply = Some(words);
+                    } else if number == Parameter::Cuts.number() {
+                        cell.deaf = Cuts::from_words(words).deaf;
+                    }
+                }
+            }
+            Message::Torque { .. } if self.trunk.is_some() => self.counters.count(Event::Stranger),
+            Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
+            Message::Sum { epoch, count, torque, .. } => {
+                self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) })
+            }
+            Message::Network { .. }
+            | Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Configure { .. }
+            | Message::Stimulus { .. } => {}
+        }
+    }
+
+    fn take_heartbeat(&mut self, place: usize, news: &News, heartbeat: &Heartbeat, epoch: Epoch) {
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        if heartbeat.state.has(State::DUPLICATE) {
+            self.counters.count(Event::Duplicate);
+            self.notices.push_back(Notice::Duplicate(cell.node));
+        }
+        if news.word == Some(Word::Started { again: true }) {
+            self.notices.push_back(Notice::Restarted(cell.node));
+        }
+        if news.returned {
+            self.notices.push_back(Notice::Returned(cell.node));
+        }
+        let released = cell.take_heartbeat(news, heartbeat, epoch);
+        self.apply(released);
+    }
+
+    fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
+        let Some(broadcast) = &mut self.broadcast else {
+            return self.counters.count(Event::StaleTorque);
+        };
+        let Some(cell) = self.cells.get_mut(place) else { return };
+        let Some(lag) = broadcast.lag(epoch) else {
+            cell.replies.too_late += 1;
+            return self.counters.count(Event::StaleTorque);
+        };
+        let number = broadcast.number - lag as u64;
+        if cell.answered.is_some_and(|last| number <= last) {
+            if cell.answered == Some(number) {
+                return self.counters.count(Event::RepeatedTorque);
+            }
+            cell.replies.too_late += 1;
+            return self.counters.count(Event::StaleTorque);
+        }
+        if words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN)) {
+            self.counters.count(Event::Saturated);
+        }
+        let was_due = cell.answer(number, lag);
+        if lag == 0 {
+            broadcast.last_reply = Some(at);
+            broadcast.in_time += u32::from(was_due);
+        }
+        if let Some(expected) = cell.owed.expected(number) {
+            let error = self.accuracy.compare(cell.joint, &words, expected);
+            if lag == 0 {
+                for (sum, error) in broadcast.error.iter_mut().zip(error) {
+                    *sum += error;
+                }
+            }
+        }
+        let change = cell.hold(words);
+        self.apply(change);
+    }
+
+    fn take_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
+        let (Some(trunk), Some(cell)) = (&mut self.trunk, self.cells.get_mut(place)) else {
+            return self.counters.count(Event::Stranger);
+        };
+        trunk.counts.received += 1;
+        let Some(sums) = cell.sums.as_mut().filter(|sums| sums.feeds) else {
+            trunk.counts.overheard += 1;
+            return;
+        };
+        let found = self.broadcast.as_mut().and_then(|broadcast| {
+            let lag = broadcast.lag(epoch)?;
+            Some((lag, sums.said.get_mut(lag)?, broadcast))
+        });
+        let Some((lag, said, broadcast)) = found else {
+            trunk.counts.stale += 1;
+            return;
+        };
+        if trunk.take(lag, said, sum) == Taken::Resent {
+            return;
+        }
+        if lag == 0 {
+            broadcast.last_reply = Some(at);
+        }
+        let number = broadcast.number - lag as u64;
+        if sum.is_saturated() {
+            self.counters.count(Event::Saturated);
+        }
+        // Q7.8 in steps of Q3.12, of which the running sum is made.
+        let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
+        self.apply(change);
+        self.let_go_of_what_moved(number);
+    }
+
+    /// Cells whose root fell silent find another one: then they are in its sum and not in what was held.
+    fn let_go_of_what_moved(&mut self, number: u64) {
+        let Some(due) = self.trunk.as_ref().and_then(Trunk::due) else { return };
+        if self.snapshot.sums.contributing > due {
+            self.each_cell(|cell| if cell.is_behind(number) { cell.let_go() } else { Change::default() });
+        }
+    }
+}
+
+/// A word as a whole number of steps.
+fn i32_of<const F: u32>(word: Q<F>) -> i32 {
+    i32::from(word.to_bits())
+}

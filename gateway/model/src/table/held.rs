@@ -1,0 +1,95 @@
+//! A cell's last torque, which holds until its next one, decays when that does not come, and is summed.
+
+use protocol::packet::WORDS;
+use protocol::skin::Safety;
+
+/// What changed in the running sum.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(super) struct Change {
+    pub(super) torque: [i32; WORDS],
+    pub(super) contributing: i32,
+}
+
+/// What is held of a cell.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Held {
+    /// The last torque, in steps of Q3.12, and the cells that it is of: of a root, those in its sum.
+    torque: Option<([i32; WORDS], u8)>,
+    /// What of it is in the running sum.
+    contribution: [i32; WORDS],
+    /// Of its cells, those that are counted there.
+    contributing: u8,
+}
+
+impl Held {
+    /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
+    pub(super) fn hold(&mut self, words: [i32; WORDS]) -> Change {
+        self.torque = (words != [0; WORDS]).then_some((words, 1));
+        self.contribute(words, u8::from(self.torque.is_some()))
+    }
+
+    /// The same of a sum of so many cells; one of no cell ends all contacts.
+    pub(super) fn hold_sum(&mut self, words: [i32; WORDS], count: u8) -> Change {
+        // Of what some cells feel, all words may be rounded to 0.
+        self.torque = (count > 0).then_some((words, count));
+        self.contribute(words, count)
+    }
+
+    /// Lets go of it.
+    pub(super) fn let_go(&mut self) -> Change {
+        self.torque = None;
+        self.contribute([0; WORDS], 0)
+    }
+
+    /// What is held has missed so many epochs, and grows old.
+    pub(super) fn grow_old(&mut self, missed: u32, safety: &Safety, is_sum: bool) -> Change {
+        let Some((held, cells)) = self.torque else { return Change::default() };
+        let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(missed);
+        if left == 0 && missed > 0 {
+            // Nothing of it counts any more; yet the cell has not said that its contact is over.
+            return self.contribute([0; WORDS], 0);
+        }
+        let decay = safety.decay_epochs.max(1);
+        let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
+        let whole = i32::try_from(decay).unwrap_or(i32::MAX);
+        let rest = held.map(|word| word * keep / whole);
+        let counts = is_sum || rest != [0; WORDS];
+        self.contribute(rest, if counts { cells } else { 0 })
+    }
+
+    fn contribute(&mut self, words: [i32; WORDS], cells: u8) -> Change {
+        let counted = core::mem::replace(&mut self.contributing, cells);
+        let before = core::mem::replace(&mut self.contribution, words);
+        let mut torque = words;
+        for (torque, before) in torque.iter_mut().zip(before) {
+            *torque -= before;
+        }
+        Change { torque, contributing: i32::from(cells) - i32::from(counted) }
+    }
+
+    /// Cells that what is held is of; none when nothing is held.
+    pub(super) fn cells(&self) -> u32 {
+        self.torque.map_or(0, |(_, cells)| cells.into())
+    }
+
+    /// Whether anything is held.
+    pub(super) const fn is_some(&self) -> bool {
+        self.torque.is_some()
+    }
+
+    /// Whether something of it is in the running sum.
+    pub(super) const fn contributes(&self) -> bool {
+        self.contributing > 0
+    }
+}
+
+/// A sum of words of Q3.12 in Nm.
+#[expect(clippy::cast_precision_loss, reason = "sums of 254 words of 16 bits are exact")]
+pub(super) fn to_nm(steps: i64) -> f64 {
+    steps as f64 / 4_096.0
+}
+
+/// A word of Q3.12 in Nm.
+pub(super) fn word_to_nm(word: i32) -> f64 {
+    f64::from(word) / 4_096.0
+}

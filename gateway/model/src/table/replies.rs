@@ -1,0 +1,103 @@
+//! Replies due against replies that came.
+
+use derive_more::{Add, Sum};
+use protocol::packet::WORDS;
+
+use crate::tracker::LATEST;
+
+/// Replies of one cell: due = in time + late + missing.
+///
+/// A reply is due when the cell is configured, awake, and feels a force by Algorithm 1.
+#[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
+pub struct Replies {
+    /// Epochs that the cell had to answer.
+    pub due: u64,
+    /// Answered before the next broadcast.
+    pub in_time: u64,
+    /// Answered after it.
+    pub late: u64,
+    /// Not answered.
+    pub missing: u64,
+    /// Of the missing ones, those of a cell that was dead or started anew, or whose bus was lost.
+    pub in_doubt: u64,
+    /// Torques that nobody was waiting for: ends of contacts, and cells whose sensors are unknown.
+    pub unasked: u64,
+    /// Torques that came when their epoch, or a later one of the same cell, was over, and were dropped.
+    pub too_late: u64,
+}
+
+impl Replies {
+    /// The account of several cells together.
+    #[must_use]
+    pub fn total(all: impl Iterator<Item = Self>) -> Self {
+        all.sum()
+    }
+
+    pub(super) fn miss(&mut self, count: u32, is_in_doubt: bool) {
+        self.missing += u64::from(count);
+        self.in_doubt += if is_in_doubt { u64::from(count) } else { 0 };
+    }
+}
+
+/// The central torques of one epoch, in Nm.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Expected {
+    pub(super) number: u64,
+    pub(super) quantised: [f64; WORDS],
+    pub(super) unquantised: [f64; WORDS],
+}
+
+/// What a cell owes for the newest epochs.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Owed {
+    /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
+    due: u8,
+    expected: [Option<Expected>; LATEST + 1],
+}
+
+impl Owed {
+    /// A new broadcast, to be answered if `due`; whether the oldest one was not answered and no longer can be.
+    pub(super) fn open(&mut self, due: bool) -> bool {
+        let oldest = 1 << LATEST;
+        let missed = self.due & oldest != 0;
+        self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
+        missed
+    }
+
+    /// A new broadcast, of which the only thing that counts is whether it is to be answered.
+    pub(super) fn open_only(&mut self, due: bool) {
+        self.due = u8::from(due);
+    }
+
+    /// Whether the newest broadcast is to be answered.
+    pub(super) const fn is_due(&self) -> bool {
+        self.due & 1 != 0
+    }
+
+    /// The broadcast `lag` before the newest is answered; whether that was due.
+    pub(super) const fn answer(&mut self, lag: usize) -> bool {
+        let was_due = self.due >> lag & 1 != 0;
+        self.due &= !(1 << lag);
+        was_due
+    }
+
+    /// Nothing is owed any more; how many answers were.
+    pub(super) const fn forgive(&mut self) -> u32 {
+        let due = self.due.count_ones();
+        self.due = 0;
+        due
+    }
+
+    /// What the newest answer should be.
+    pub(super) fn expect(&mut self, expected: Expected) {
+        self.expected.rotate_right(1);
+        if let Some(newest) = self.expected.first_mut() {
+            *newest = Some(expected);
+        }
+    }
+
+    /// What the answer to a broadcast should be.
+    pub(super) fn expected(&self, number: u64) -> Option<&Expected> {
+        self.expected.iter().flatten().find(|expected| expected.number == number)
+    }
+}

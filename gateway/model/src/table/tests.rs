@@ -1,0 +1,169 @@
+//! A table of a bus whose cells answer with torques.
+
+use super::*;
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::message::{Heard, Joints, NetworkPage, SensorPage, State};
+
+/// A table that heard these, in the frames of the bus, the gateway's own or a cell's.
+fn table(heard: &[(bool, Message)]) -> Table {
+    let mut table = Table::new(&crate::testing::skin(), 0);
+    for (own, message) in heard {
+        let packet: Packet = message.encode();
+        for frame in packet.frames(Format::Fd) {
+            table.handle_frame(Micros(0), *own, &frame, &mut |_| None);
+        }
+    }
+    table
+}
+
+#[test]
+fn what_is_no_packet_is_rejected_under_a_cells_identifier_and_foreign_under_one_that_nobody_uses() {
+    let mut skin = crate::testing::skin();
+    for format in [Format::Fd, Format::Classic] {
+        skin.buses[0].format = format;
+        let mut table = Table::new(&skin, 0);
+        let mut hear = |id, byte, at| {
+            let data = [byte; 16];
+            let (length, flags) = if format == Format::Fd { (16, 1) } else { (8, 0) };
+            let frame = Frame::with_data(id, format, flags, &data[..length]).unwrap();
+            table.handle_frame(Micros(at), false, &frame, &mut |_| None);
+        };
+        // Of the only cell; of one that is not there; a command that does not exist; joints.
+        for at in 0..9_u8 {
+            for id in [0x201, 0x263, 0x077, 0x001] {
+                hear(id, at, 1_000 * u64::from(at));
+            }
+        }
+        let of = |event| table.counters().events(event);
+        let events = [Event::Foreign, Event::Crc, Event::Incomplete].map(of);
+        // Halves: eight of nine were dropped under each; a packet that has lost one is counted once.
+        assert_eq!(events, if format == Format::Fd { [18, 18, 0] } else { [16, 0, 8] }, "{format:?}");
+    }
+}
+
+#[test]
+fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
+    let cell = CellId::new(1).unwrap();
+    let joints = |epoch| Message::Joints {
+        epoch: Epoch(epoch),
+        joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
+    };
+    let torque = |epoch| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [Q3_12::MAX; WORDS] };
+    let hear = |table: &mut Table, own, message: Message| {
+        for frame in message.encode().frames(Format::Fd) {
+            table.handle_frame(Micros(0), own, &frame, &mut |_| None);
+        }
+        table.snapshot().sums.contributing
+    };
+    for (interrupted, next, contributing) in [(false, 2, 1), (true, 2, 0), (false, 8, 1), (false, 9, 0)] {
+        let mut table = table(&[(true, joints(1)), (false, torque(1))]);
+        assert_eq!(table.snapshot().sums.contributing, 1);
+        if interrupted {
+            table.interrupt();
+            assert_eq!(table.snapshot().sums.contributing, 1, "the loop lets it go");
+        }
+        let after = hear(&mut table, true, joints(next));
+        assert_eq!(after, contributing, "{interrupted}, joints {next} after joints 1");
+        assert_eq!(hear(&mut table, false, torque(next)), 1, "new ones count again");
+    }
+}
+
+#[test]
+fn a_cell_that_was_away_owes_nothing_before_it_is_heard_and_told_what_it_feels() {
+    let cell = CellId::new(1).unwrap();
+    let positions = [Q1_14::ZERO; WORDS];
+    let joints =
+        |epoch| (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } });
+    let heartbeat = |sent| {
+        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        let page = NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
+        (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page })
+    };
+    let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page });
+    let hear = |table: &mut Table, heard: &[(bool, Message)]| {
+        for (own, message) in heard {
+            for frame in message.encode().frames(Format::Fd) {
+                table.handle_frame(Micros(0), *own, &frame, &mut |_| None);
+            }
+        }
+        let replies = table.cells().first().unwrap().replies;
+        (replies.due, replies.missing, replies.in_doubt)
+    };
+    let mut table = table(&[]);
+    assert_eq!(hear(&mut table, &[heartbeat(1), press, joints(1), joints(2)]), (2, 0, 0));
+    table.interrupt();
+    // It may not be back when the bus is, and so may not have heard this.
+    assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
+    assert_eq!(table.notices().count(), 0);
+    assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "nobody knows what it feels");
+    assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
+    assert_eq!(hear(&mut table, &[press, joints(6), heartbeat(10), joints(7)]), (4, 2, 2));
+    assert_eq!(table.notices().count(), 0, "said once");
+    let uplink = table.cells().first().unwrap().uplink();
+    assert_eq!((uplink.lost, uplink.outage), (7, 7));
+}
+
+#[test]
+fn joints_that_passed_a_report_on_its_way_count_as_not_heard_when_they_were_not() {
+    let joints = |epoch| {
+        (
+            true,
+            Message::Joints {
+                epoch: Epoch(epoch),
+                joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
+            },
+        )
+    };
+    let report = |epoch, joints| {
+        let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
+        (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
+    };
+    let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
+    // It has not heard the first; nor, when it began, one that came before its report.
+    assert_eq!(unanswered(&[report(0, 0), joints(1), joints(2), report(2, 1)]), Some((0, 1)));
+    assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 1)]), Some((0, 1)));
+    assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 2)]), Some((0, 0)));
+    assert_eq!(unanswered(&[joints(1), report(1, 1), joints(2), report(2, 2)]), Some((0, 0)));
+    // Who was long there, and before this gateway, has counted on.
+    assert_eq!(unanswered(&[joints(8), joints(9), report(8, 70), joints(10), report(10, 72)]), Some((0, 0)));
+}
+
+#[test]
+fn a_claim_of_a_number_that_is_taken_changes_nothing_of_its_cell() {
+    let (cell, contact) = (CellId::new(1).unwrap(), [protocol::fixed::Q5_10::nearest(2.0); 3]);
+    let says = |serial, sent, state| {
+        let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
+        (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page })
+    };
+    let settled = State::CONFIGURED.with(State::TEST_MODE, true);
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    let press = Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page };
+    let joints = |epoch| {
+        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        (true, Message::Joints { epoch: Epoch(epoch), joints })
+    };
+    let told = |intruded| {
+        let mut said =
+            vec![says(7, 40, settled), (true, press), joints(1), joints(2), says(7, 44, settled), joints(3)];
+        if intruded {
+            said.insert(3, says(9, 0, State::CLAIMING));
+        }
+        let mut table = table(&said);
+        assert_eq!(table.notices().count(), 0, "nobody started");
+        let cell = table.cells().first().unwrap();
+        let uplink = cell.uplink();
+        (
+            cell.heartbeat(),
+            cell.feeling(),
+            cell.replies,
+            cell.is_ready(),
+            uplink.sent,
+            uplink.lost,
+            uplink.restarts,
+        )
+    };
+    assert_eq!(told(true), told(false));
+    assert_eq!((told(true).2.due, told(true).5, told(true).6), (3, 3, 0));
+}
