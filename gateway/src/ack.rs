@@ -2,14 +2,15 @@
 
 use std::path::PathBuf;
 
+use bench::listen;
 use clap::Args;
-use model::generate::Format;
-use protocol::bus::{Bus, BusError, Choice, Kinds, OneKind, Options};
-use protocol::can;
+use protocol::bus::{Bus, BusError, Choice, Options};
+use protocol::can::Format;
 use protocol::message::Message;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
+use super::arguments::{BusKinds, FORMATS, one_of};
 use super::output;
 
 /// Leave the halted state: send resume to a bus, or to all buses of a skin
@@ -23,12 +24,10 @@ pub(crate) struct Ack {
     #[arg(value_name = "BUS|SKIN")]
     whom: PathBuf,
     /// What a packet travels in on the bus; a skin says it itself
-    #[arg(long, value_enum, default_value = "fd")]
+    #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of a
-    /// skin BUS=KIND, as often as there are buses
-    #[arg(long, value_name = "[BUS=]KIND")]
-    bus_kind: Vec<OneKind>,
+    #[command(flatten)]
+    kinds: BusKinds,
 }
 
 impl Ack {
@@ -39,11 +38,9 @@ impl Ack {
             let skin = Skin::read(&self.whom).map_err(Failure::usage)?;
             skin.buses.into_iter().map(|bus| (bus.name, bus.format)).collect()
         } else {
-            vec![(name.to_string(), wire(self.format))]
+            vec![(name.to_string(), self.format)]
         };
-        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
-            .and_then(|kinds| kinds.only(wanted.iter().map(|(bus, _): &(String, _)| bus.as_str())))
-            .map_err(Failure::usage)?;
+        let kinds = self.kinds.of(wanted.iter().map(|(bus, _)| bus.as_str()))?;
         // All are opened before anybody is told.
         let mut buses = Vec::new();
         for (bus, format) in &wanted {
@@ -52,31 +49,18 @@ impl Ack {
                 false => Failure::usage(format!("there is no file {name}, and as a bus: {error}")),
             })?);
         }
-        for (bus, (_, format)) in buses.iter().zip(&wanted) {
-            send(bus, &Message::Resume, *format)?;
-        }
-        Ok(())
-    }
-}
-
-/// The format as the wire knows it.
-pub(crate) const fn wire(format: Format) -> can::Format {
-    match format {
-        Format::Fd => can::Format::Fd,
-        Format::Classic => can::Format::Classic,
+        buses.iter().zip(&wanted).try_for_each(|(bus, (_, format))| send(bus, &Message::Resume, *format))
     }
 }
 
 /// Opens a bus to send on it.
-pub(crate) fn open(name: &str, kind: Choice, format: can::Format) -> Result<Bus, BusError> {
-    let options = Options { filters: Vec::new(), fd: format == can::Format::Fd, ..Options::default() };
-    Bus::open(name, kind, &options)
+pub(crate) fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
+    listen::open(name, kind, Some(format), Options { filters: Vec::new(), ..Options::default() })
 }
 
 /// Sends one packet, and says on which kind of bus.
-pub(crate) fn send(bus: &Bus, message: &Message, format: can::Format) -> Result<(), Failure> {
-    let frames: Vec<_> = message.encode().frames(format).collect();
-    bus.send(&frames).map_err(|error| Failure::run(error.cause))?;
+pub(crate) fn send(bus: &Bus, message: &Message, format: Format) -> Result<(), Failure> {
+    listen::send(bus, message, format).map_err(Failure::run)?;
     output::note(format_args!("sent on {} ({})", bus.name(), bus.kind()));
     Ok(())
 }

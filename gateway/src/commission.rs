@@ -1,31 +1,24 @@
 //! `gateway commission`.
 
 mod show;
-mod work;
-
-pub(super) use self::show::some;
 
 use std::path::PathBuf;
-use std::sync::Mutex;
 use std::sync::atomic::Ordering;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
+use bench::commission::{Done, commission, open};
 use bench::run::progress::Progress as Line;
 use clap::Args;
 use model::commission::numbers::{Numbers, renumbered};
 use model::commission::{Outcome, Progress, Wish};
-use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::document;
 use protocol::skin::Skin;
-use protocol::usage::Failure;
+use protocol::usage::{Failure, print};
 
-use self::work::{Bench, Done, open};
+use super::arguments::{BusKinds, bus_names, bus_of};
 use super::output::Force;
+use super::print::{list, some};
 use super::{input, output};
-
-/// How often it is looked how far the buses are.
-const LOOK: Duration = Duration::from_millis(20);
 
 /// Write what a skin's description says into its cells, and read it back
 ///
@@ -46,10 +39,8 @@ pub(crate) struct Commission {
     /// Only this bus of the skin's
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
-    /// several BUS=KIND, as often as there are buses
-    #[arg(long, value_name = "[BUS=]KIND")]
-    bus_kind: Vec<OneKind>,
+    #[command(flatten)]
+    kinds: BusKinds,
     /// Write nothing: say which cells are there and which would be written
     #[arg(long)]
     dry_run: bool,
@@ -74,43 +65,21 @@ impl Commission {
         let text = document::text(&self.skin).map_err(Failure::usage)?;
         let file = self.skin.display().to_string();
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
-        let wanted = self.buses(&skin)?;
+        let wanted = match &self.bus {
+            Some(name) => vec![bus_of(&skin, &file, name)?],
+            None => (0..skin.buses.len()).collect(),
+        };
         // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
         let begun = self.numbers.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
-        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
-            .and_then(|kinds| kinds.only(skin.buses.iter().map(|bus| bus.name.as_str())))
-            .map_err(Failure::usage)?;
+        let kinds = self.kinds.of(bus_names(&skin))?;
         // All are opened before anybody is told.
-        let benches = wanted.iter().map(|&bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
+        let benches = wanted.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
-        let far = Mutex::new(vec![None; benches.len()]);
         let mut line = Line::new(self.quiet);
-        let done: Vec<Done> = thread::scope(|scope| {
-            let work = |(place, bench): (usize, &Bench)| {
-                let (far, stopped, skin) = (&far, &stopped, &skin);
-                let bench = bench.clone();
-                scope.spawn(move || {
-                    bench.work(skin, wish, stopped, |progress| {
-                        if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
-                            *own = Some(progress);
-                        }
-                    })
-                })
-            };
-            let threads: Vec<_> = benches.iter().enumerate().map(work).collect();
-            while threads.iter().any(|thread| !thread.is_finished()) {
-                let now: Vec<Progress> =
-                    far.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
-                if !now.is_empty() {
-                    line.show(|| how_far(&now));
-                }
-                thread::sleep(LOOK);
-            }
-            threads.into_iter().filter_map(|thread| thread.join().ok()).collect()
-        });
+        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|| how_far(far)));
         line.clear();
         let interrupted = stopped.load(Ordering::Relaxed);
         nobody(&file, &done, interrupted)?;
@@ -125,7 +94,7 @@ impl Commission {
         if !self.quiet && !self.json {
             whole.notes(self.numbers.is_some()).iter().for_each(output::note);
         }
-        whole.print(self.json)?;
+        print(&if self.json { super::print::json(&whole)? } else { whole.table() })?;
         if let Some((file, out)) = begun {
             let numbers: Numbers = done
                 .iter()
@@ -139,28 +108,13 @@ impl Commission {
         }
         whole.end()
     }
-
-    /// The buses that are meant.
-    fn buses(&self, skin: &Skin) -> Result<Vec<usize>, Failure> {
-        let Some(name) = &self.bus else { return Ok((0..skin.buses.len()).collect()) };
-        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-        let found = skin.bus_named(name).ok_or_else(|| {
-            Failure::usage(format!("bus {name} is not in {}, which has {}", self.skin.display(), names()))
-        });
-        Ok(vec![found?])
-    }
 }
 
 /// All buses in one line.
 fn how_far(all: &[Progress]) -> String {
     let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
-    let [cells, found, done, failed] = [
-        |it: &Progress| it.cells,
-        |it: &Progress| it.found,
-        |it: &Progress| it.done,
-        |it: &Progress| it.failed,
-    ]
-    .map(sum);
+    let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
+    let [done, failed] = [sum(|it| it.done), sum(|it| it.failed)];
     // The one that is least far says what is being done.
     let doing = all.iter().filter(|it| it.doing != "done").map(|it| it.doing).next().unwrap_or("done");
     let failed = if failed == 0 { String::new() } else { format!(", {failed} failed") };
@@ -187,7 +141,7 @@ fn nobody(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
         return Ok(());
     }
     let strangers: Vec<_> = done.iter().flat_map(|done| &done.report.strangers).collect();
-    let buses = done.iter().map(|done| done.name.as_str()).collect::<Vec<_>>().join(", ");
+    let buses = list(done.iter().map(|done| &done.name));
     Err(Failure::run(if strangers.is_empty() {
         format!("no cells are on {buses}: start them, or switch them on, and run this again")
     } else {

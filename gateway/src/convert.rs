@@ -7,17 +7,19 @@ use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Output, convert};
-use trace::capture::log::{self, Style};
+use trace::capture::log::{Digits, Style};
 use trace::capture::{Format, ORIGIN, Reader};
 use trace::files::WholeFile;
 
-use super::input::captures;
+use super::arguments::{Word, one_of};
+use super::input::{captures, no_frame, place};
 use super::output::{Force, apart, note, refused};
+use super::print::list;
 
 /// Lines that cannot be read and are named; further ones are counted.
 const NAMED: u64 = 100;
@@ -49,7 +51,7 @@ pub(crate) struct Convert {
     #[arg(long)]
     strict: bool,
     /// Digits of a second in a log: 6 or 9; else as many as IN has
-    #[arg(long, value_enum, value_name = "N")]
+    #[arg(long, value_parser = one_of(DIGITS), value_name = "N")]
     digits: Option<Digits>,
     /// Write T or R behind frames in a log, which a log that had them has anyway; Wireshark does not read that
     #[arg(long, conflicts_with = "plain")]
@@ -59,13 +61,7 @@ pub(crate) struct Convert {
     plain: bool,
 }
 
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
-enum Digits {
-    #[value(name = "6")]
-    Six,
-    #[value(name = "9")]
-    Nine,
-}
+const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
 impl Convert {
     pub(crate) fn run(self) -> Result<(), Failure> {
@@ -93,12 +89,7 @@ impl Convert {
         if !text && reader.format() == Format::Mcap {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
-        let digits = match self.digits {
-            None if self.plain => log::Digits::Six,
-            None => log::Digits::Own,
-            Some(Digits::Six) => log::Digits::Six,
-            Some(Digits::Nine) => log::Digits::Nine,
-        };
+        let digits = self.digits.unwrap_or(if self.plain { Digits::Six } else { Digits::Own });
         let directions = !self.plain && (self.direction || reader.is_of_a_log());
         let style = Style { digits, plain: self.plain, directions };
         let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
@@ -107,7 +98,7 @@ impl Convert {
         let mut named = 0;
         let done = convert(&mut reader, &mut output, |line, why| {
             named += 1;
-            let place = if line.line > 0 { format!("{name}:{}", line.line) } else { name.clone() };
+            let place = place(&name, line.line);
             if self.strict {
                 return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
             }
@@ -212,10 +203,7 @@ fn bar(size: Option<u64>) -> ProgressBar {
 fn nothing(name: &str, reader: &Reader) -> String {
     match (reader.format(), reader.lines()) {
         (Format::Candump, 0) => format!("{name} is empty: there is nothing to convert"),
-        (Format::Candump, lines) => format!(
-            "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
-             `(1700000000.123456) vcan0 123#00`"
-        ),
+        (Format::Candump, lines) => no_frame(name, lines),
         (Format::Mcap, _) => match others(reader) {
             others if others.is_empty() => format!("{name}: there is no frame in it"),
             others => format!("{name}: there is no frame in it, only {others}"),
@@ -231,7 +219,7 @@ fn others(reader: &Reader) -> String {
     let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
     let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
     let facts = facts.map(|(name, _)| format!("metadata {name}"));
-    topics.chain(attached).chain(facts).collect::<Vec<_>>().join(", ")
+    list(topics.chain(attached).chain(facts))
 }
 
 /// What somebody may want to know of a conversion, a line each.
@@ -240,7 +228,7 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
     if let Some((times, first)) = done.backwards {
         lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
     }
-    let shortened = if style.plain || style.digits != log::Digits::Own || style.directions {
+    let shortened = if style.plain || style.digits != Digits::Own || style.directions {
         "frames are written without something that a log cannot have or was not to have"
     } else {
         "frames are written without their direction, which not every tool reads; --direction writes it"

@@ -8,7 +8,9 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 
+use super::arguments::bus_names;
 use super::output::{Force, apart};
+use super::print::list;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
@@ -42,7 +44,7 @@ impl Dbc {
         let file = self.file.display();
         apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
-        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        let names = || list(bus_names(&skin));
         let bus = match (&self.bus, skin.buses.as_slice()) {
             (Some(name), _) => skin.bus_named(name).ok_or_else(|| {
                 Failure::usage(format!("{file} has no bus {name:?}; its buses are {}", names()))

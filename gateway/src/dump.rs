@@ -9,21 +9,23 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use analysis::stats::Report;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use model::decode::pick::{self, Pick, Wanted};
-use protocol::bus::{Bus, BusError, Choice, Inbox, Options};
-use protocol::can::{self, EXTENDED_MASK};
+use protocol::bus::Options;
+use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
 use protocol::stop::{self, Stoppable};
 use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
-use trace::capture::{self, Entry, Extras, NoteKind, Reader};
+use trace::capture::{Entry, Extras, NoteKind, Reader};
 
-use self::show::{Flow, How, Show};
-use super::input::{LOOK, captures, stopped};
+use self::show::{How, Show};
+use super::arguments::{BusKind, Word, nanos, one_of};
+use super::input::{self, Ear, LOOK, Missing, captures, is_file, no_frame, place, stopped};
 use super::output;
+use super::print::{json, list};
 
 /// Show what is on a bus or in a capture, in words beside the raw frames
 ///
@@ -83,47 +85,25 @@ pub(crate) struct Dump {
     #[arg(long)]
     strict: bool,
     /// What packets travel in; auto takes each frame for what it is
-    #[arg(long, value_enum, default_value = "auto")]
-    format: Format,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
+    format: Packets,
+    #[command(flatten)]
+    on: BusKind,
 }
 
-/// What packets travel in.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
-enum Format {
-    /// Each frame as it is
-    Auto,
-    /// One CAN FD frame
-    Fd,
-    /// Two classic frames
-    Classic,
-}
+/// What packets travel in, or nothing that is known before.
+type Packets = Option<Format>;
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
-pub(super) fn nanos(text: &str) -> Result<u64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
-        _ => Err("a number of seconds from 0 to 1e9".to_owned()),
-    }
-}
+const ANY_FORMAT: &[Word<Packets>] = &[
+    ("auto", "Each frame as it is", None),
+    ("fd", "One CAN FD frame", Some(Format::Fd)),
+    ("classic", "Two classic frames", Some(Format::Classic)),
+];
 
 impl Dump {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let name =
-            self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
-        let is_file = |source: &PathBuf| source.as_os_str() == "-" || source.exists();
-        if let Some(bus) = self.sources.iter().find(|source| self.sources.len() > 1 && !is_file(source)) {
-            return Err(Failure::usage(format!(
-                "there is no file {}: several captures are the parts of one recording, and a bus is dumped alone",
-                bus.display()
-            )));
-        }
-        if let Some(folder) = self.sources.iter().find(|source| source.is_dir()) {
-            let folder = folder.display();
-            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or a bus")));
-        }
+        let is_capture = self.is_capture()?;
+        let mut title = list(self.sources.iter().map(|source| source.display()));
         let out = io::stdout();
         let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         let colour = out.is_terminal() && !no_color;
@@ -133,46 +113,47 @@ impl Dump {
             (false, false, true) => How::Brief { colour },
             (false, false, false) => How::Lines { colour },
         };
-        let format = match self.format {
-            Format::Auto => None,
-            Format::Fd => Some(can::Format::Fd),
-            Format::Classic => Some(can::Format::Classic),
-        };
-        let Self { kind: kinds, node: nodes, from, to, contact, .. } = self;
-        let pick = Pick { kinds, nodes, from, to };
+        let pick = Pick { kinds: self.kind.clone(), nodes: self.node.clone(), from: self.from, to: self.to };
         let max = self.max.unwrap_or(u64::MAX);
-        let mut show = Show::new(BufWriter::new(Stoppable::new(&out)), format, pick, contact, how, max);
-        let mut title = name.clone();
-        let (what, extras, done) = match self.sources.iter().all(is_file) {
-            true => {
-                let mut reader = captures(&self.sources, |file| Box::new(file))?;
-                reader.name().clone_into(&mut title);
-                let done = captured(&mut reader, &mut show, stop::flag(), self.strict);
-                let what = match reader.format() {
-                    capture::Format::Candump => "candump log",
-                    capture::Format::Mcap => "MCAP",
-                };
-                (what, Some(reader.extras().clone()), done)
-            }
-            false => {
-                let bus = open(&name, self.bus_kind, self.format).map_err(|error| {
-                    Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
-                })?;
-                ("live", None, live(&bus, &mut show, to, &*stopped()?))
-            }
+        let to_out = BufWriter::new(Stoppable::new(&out));
+        let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
+        let (what, extras, done) = if is_capture {
+            let mut reader = captures(&self.sources, |file| Box::new(file))?;
+            reader.name().clone_into(&mut title);
+            let done = captured(&mut reader, &mut show, self.strict);
+            (input::format(&reader), Some(reader.extras().clone()), done)
+        } else {
+            let mut ear = Ear::open(&title, self.on.bus_kind, self.format, Options::default())?;
+            ("live", None, live(&mut ear, &mut show, self.to, &*stopped()?))
         };
-        written(show.finish().and_then(|_| show.flush()))?;
+        written(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();
         drop(show);
         if let Some(report) = report {
             // What was counted is shown whatever ended it.
-            if self.json {
-                print(&as_json(&title, what, &report, extras.as_ref())?)?;
-            } else {
-                print(&table::text(&title, what, &report, extras.as_ref()))?;
-            }
+            print(&match self.json {
+                true => as_json(&title, what, &report, extras.as_ref())?,
+                false => table::text(&title, what, &report, extras.as_ref()),
+            })?;
         }
         done
+    }
+
+    /// Whether a capture is meant, and not a bus.
+    fn is_capture(&self) -> Result<bool, Failure> {
+        let sources = &self.sources;
+        let other = sources.iter().find(|source| !is_file(source));
+        if let Some(bus) = other.filter(|_| sources.len() > 1) {
+            return Err(Failure::usage(format!(
+                "there is no file {}: several captures are the parts of one recording, and a bus is dumped alone",
+                bus.display()
+            )));
+        }
+        if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
+            let folder = folder.display();
+            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or a bus")));
+        }
+        Ok(other.is_none())
     }
 }
 
@@ -199,86 +180,56 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>)
     let attachments = extras.iter().flat_map(|extras| &extras.attachments).map(|(name, _)| name.as_str());
     let (other_topics, attachments) = (other_topics.collect(), attachments.collect());
     let whole = Whole { source, format, report, other_topics, attachments };
-    let text = serde_json::to_string_pretty(&whole).map_err(Failure::run)?;
-    Ok(text + "\n")
-}
-
-/// Opens a bus to hear all of it; a classic interface too, unless FD is asked for.
-fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
-    let options = |fd| Options { fd, error_mask: EXTENDED_MASK, ..Options::default() };
-    match Bus::open(name, kind, &options(format != Format::Classic)) {
-        Err(BusError::ClassicOnly { .. }) if format == Format::Auto => Bus::open(name, kind, &options(false)),
-        opened => opened,
-    }
+    json(&whole)
 }
 
 /// Shows a capture.
-fn captured(
-    reader: &mut Reader,
-    show: &mut Show<impl Write>,
-    stopped: &AtomicBool,
-    strict: bool,
-) -> Result<(), Failure> {
+fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> Result<(), Failure> {
     let name = reader.name().to_owned();
-    let (mut frames, mut bad, mut xl) = (0_u64, 0_u64, 0_u64);
+    let (mut frames, mut missing) = (0_u64, Missing::default());
     let done = loop {
         if reader.is_drained()
             && let Err(error) = show.flush()
         {
             break Err(error);
         }
-        let Some(entry) = reader.next().map_err(Failure::run)? else { break Ok(()) };
-        let note = match entry {
-            Entry::Frame(record) => {
+        match reader.next().map_err(Failure::run)? {
+            None => break Ok(()),
+            Some(Entry::Frame(record)) => {
                 frames += 1;
-                match show.frame(&record) {
-                    Ok(Flow::More) => continue,
-                    Ok(Flow::Enough) => break Ok(()),
-                    Err(error) => break Err(error),
+                if let Err(error) = show.frame(&record) {
+                    break Err(error);
+                }
+                if show.has_enough() {
+                    break Ok(());
                 }
             }
-            Entry::Note(note) => note,
-        };
-        let complaint = match note.kind {
-            NoteKind::Text => continue,
-            NoteKind::CanXl => {
-                xl += 1;
-                continue;
-            }
-            NoteKind::Dropped(lost) => {
-                show.dropped(note.interface, lost);
-                format!("{lost} frames are missing here: candump lost them")
-            }
-            NoteKind::Unreadable(why) => {
-                bad += 1;
-                if strict {
-                    return Err(Failure::run(format!("{name}:{}: {why}", note.line)));
+            Some(Entry::Note(note)) => {
+                missing.take(&note);
+                let place = place(&name, note.line);
+                match note.kind {
+                    NoteKind::Text | NoteKind::CanXl => {}
+                    NoteKind::Dropped(lost) => {
+                        show.dropped(note.interface, lost);
+                        output::note(format_args!(
+                            "{place}: {lost} frames are missing here: candump lost them"
+                        ));
+                    }
+                    NoteKind::Unreadable(why) if strict => {
+                        return Err(Failure::run(format!("{place}: {why}")));
+                    }
+                    NoteKind::Unreadable(why) => output::note(format_args!("{place}: {why}")),
                 }
-                why
             }
-        };
-        if note.line == 0 {
-            output::note(format_args!("{name}: {complaint}"));
-        } else {
-            output::note(format_args!("{name}:{}: {complaint}", note.line));
         }
     };
     written(done)?;
-    let seen = reader.lines();
-    if bad > 0 {
-        output::note(format_args!("{name}: {bad} of {seen} lines could not be read"));
-    }
-    if xl > 0 {
-        output::note(format_args!("{name}: CAN XL frames are not shown: {xl}"));
-    }
-    if let Some(what) = &reader.extras().unfinished {
-        output::note(format_args!("{name}: {what}"));
-    }
-    if frames == 0 && seen > 0 && !stopped.load(Ordering::Relaxed) {
-        let like = "its lines are like `(1700000000.123456) vcan0 123#00`";
-        return Err(Failure::run(format!(
-            "{name}: there is no frame in {seen} lines; a candump log is read: {like}"
-        )));
+    // They have been named, each where it is.
+    missing.frames = 0;
+    missing.tell(reader, "not shown");
+    let lines = reader.lines();
+    if frames == 0 && lines > 0 && !stop::flag().load(Ordering::Relaxed) {
+        return Err(Failure::run(no_frame(&name, lines)));
     }
     Ok(())
 }
@@ -294,58 +245,43 @@ fn now() -> Micros {
 
 /// Shows a bus until somebody says stop, or it is closed.
 fn live(
-    bus: &Bus,
+    ear: &mut Ear,
     show: &mut Show<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
 ) -> Result<(), Failure> {
-    output::note(format_args!("{} is {}", bus.name(), bus.kind()));
-    let mut inbox = Inbox::new();
-    let (mut down, mut end) = (false, None);
+    let mut end = None;
     let done = loop {
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
         }
-        let patience = if show.is_waiting() { SETTLE } else { LOOK };
-        match bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) }) {
-            Ok(0) => match show.handle_time(now()).and_then(|flow| show.flush().map(|()| flow)) {
-                Ok(Flow::More) => continue,
-                Ok(Flow::Enough) => break Ok(()),
-                Err(error) => break written(Err(error)),
-            },
-            Ok(_) => down = false,
-            Err(error) if error.may_pass() => {
-                if !std::mem::replace(&mut down, true) {
-                    output::note(format_args!("gateway: {error}; waiting"));
-                }
-                std::thread::sleep(LOOK);
-                continue;
+        let shown = match ear.hear(if show.is_waiting() { SETTLE } else { LOOK }) {
+            Ok(false) => show.handle_time(now()),
+            Ok(true) => {
+                // When nothing more comes, the end comes all the same.
+                end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
+                ear.frames().try_for_each(|received| {
+                    if show.has_enough() {
+                        return Ok(());
+                    }
+                    let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
+                    let interface = ear.bus().name();
+                    show.frame(&Record { time, interface, frame: received.frame, direction: None })
+                })
             }
             // What was missed until then is said all the same.
             Err(error) => break Err(Failure::run(error)),
+        };
+        if let Err(error) = shown.and_then(|()| show.flush()) {
+            break written(Err(error));
         }
-        // When nothing more comes, the end comes all the same.
-        end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
-        let mut received = inbox.frames();
-        let flow = received.try_fold(Flow::More, |flow, received| match flow {
-            Flow::More => {
-                let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
-                show.frame(&Record { time, interface: bus.name(), frame: received.frame, direction: None })
-            }
-            Flow::Enough => Ok(Flow::Enough),
-        });
-        match flow.and_then(|flow| show.flush().map(|()| flow)) {
-            Ok(Flow::More) => {}
-            Ok(Flow::Enough) => break Ok(()),
-            Err(error) => break written(Err(error)),
+        if show.has_enough() {
+            break Ok(());
         }
     };
-    if inbox.dropped() > 0 {
-        let (name, dropped) = (bus.name(), inbox.dropped());
-        show.dropped(name, dropped.into());
-        output::note(format_args!(
-            "{name}: {dropped} frames are missing: they came faster than they were shown"
-        ));
+    match ear.missing("shown") {
+        0 => {}
+        missing => show.dropped(ear.bus().name(), missing),
     }
     done
 }

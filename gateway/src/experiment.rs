@@ -22,10 +22,10 @@ use paper::moving::Run;
 use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print, quoted};
 
+use super::arguments::Programs;
 use super::input::stopped;
 use super::output::{Force, note};
-use super::print::Rows;
-use super::programs::Programs;
+use super::print::{Rows, json};
 use benches::Benches;
 use folder::Folder;
 
@@ -215,15 +215,12 @@ fn write(page: &Page, folder: &Folder) -> Result<(), Failure> {
         folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
         folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
     }
-    let results = serde_json::to_string_pretty(&files::results(page));
-    let results = results.map_err(|error| Failure::run(format!("results.json: {error}")))?;
-    folder.write("results.json", &(results + "\n"))
+    folder.write("results.json", &json(&files::results(page))?)
 }
 
 /// Prints every finding, and where the page is.
 fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
-    let head = ["", "here", "paper, bar"].map(str::to_owned);
-    let mut rows = Rows::new(head);
+    let mut rows = Rows::new("", "here", "paper, bar");
     for section in &page.sections {
         rows.section(&section.title, "", "");
         for Finding { what, paper, ours, bar, verdict } in &section.findings {
@@ -243,7 +240,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     } else {
         format!("worse than the paper's or than their bar: {worse}\n")
     };
-    print(&format!("{}\n{worse}{}\n", rows.table(), report.display()))
+    print(&format!("{}{worse}{}\n", rows.text(), report.display()))
 }
 
 /// A bar on a terminal, a line for each experiment elsewhere.

@@ -15,7 +15,9 @@ use protocol::usage::{Failure, print};
 use serde::Serialize;
 use trace::capture::{Entry, NoteKind, Reader};
 
+use super::arguments::{bus_names, nanos};
 use super::output;
+use super::print::{json, list};
 
 /// The skin in a recording.
 const ATTACHED: &str = "skin.toml";
@@ -39,7 +41,7 @@ pub(crate) struct Explain {
     #[arg(long, value_name = "N")]
     epoch: u8,
     /// Only joints from so many seconds after the first frame on
-    #[arg(long, value_name = "S", value_parser = super::dump::nanos, default_value = "0")]
+    #[arg(long, value_name = "S", value_parser = nanos, default_value = "0")]
     at: u64,
     /// Which joints of this epoch, when there are several
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
@@ -112,8 +114,7 @@ impl Explain {
         }
         if self.json {
             let whole = Whole { source: name, epoch: self.epoch, explanation: &explanation };
-            let text = serde_json::to_string_pretty(&whole).map_err(Failure::run)?;
-            return print(&(text + "\n"));
+            return print(&json(&whole)?);
         }
         let what = match (self.cell.is_some(), self.joint) {
             (true, _) => show::What::Cells,
@@ -134,7 +135,7 @@ impl Explain {
         }
         let Some(Named { bus, node }) = &self.cell else { return Ok(()) };
         let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
-        let names = || skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+        let names = || list(bus_names(skin));
         if let Some(bus) = bus.as_ref().filter(|bus| skin.bus_named(bus).is_none()) {
             return Err(Failure::usage(format!("--cell {bus}:{node}: the skin's buses are {}", names())));
         }
@@ -152,11 +153,8 @@ impl Explain {
                 bus.clone().unwrap_or_else(names)
             ))),
             buses => {
-                let choices: Vec<_> = buses.iter().map(|bus| format!("{}:{node}", bus.name)).collect();
-                Err(Failure::usage(format!(
-                    "--cell {node} is on several buses: say one of {}",
-                    choices.join(", ")
-                )))
+                let choices = list(buses.iter().map(|bus| format!("{}:{node}", bus.name)));
+                Err(Failure::usage(format!("--cell {node} is on several buses: say one of {choices}")))
             }
         }
     }

@@ -5,11 +5,14 @@ mod text;
 use std::path::PathBuf;
 
 use analysis::fit::{self, BusFit, COMPUTATION_NS};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use protocol::can::Format;
 use protocol::skin::{Bus, Skin};
 use protocol::usage::{Failure, print};
 use protocol::wire_time::{BitRates, bit_rate};
+
+use super::arguments::{FORMATS, one_of};
+use super::print::json;
 
 /// Say whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
 ///
@@ -35,8 +38,8 @@ pub(crate) struct Fit {
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
     /// What packets travel in on all buses, whatever the description says
-    #[arg(long, value_enum)]
-    format: Option<Packets>,
+    #[arg(long, value_parser = one_of(FORMATS))]
+    format: Option<Format>,
     /// The longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = computation)]
     computation: Option<u64>,
@@ -45,47 +48,30 @@ pub(crate) struct Fit {
     json: bool,
 }
 
-/// What a packet travels in.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
-enum Packets {
-    /// One CAN FD frame
-    Fd,
-    /// Two classic frames
-    Classic,
-}
-
 impl Fit {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
         let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
-        let format = self.format.map(|it| match it {
-            Packets::Fd => Format::Fd,
-            Packets::Classic => Format::Classic,
-        });
-        let rates = if self.table { None } else { self.rates(&skin, format)? };
-        let Some(rates) = rates else {
-            let rows = fit::table(&skin, format, computation_ns);
-            return if self.json {
-                print_json(&fit::json(&skin, &[], None, &rows))
-            } else {
-                print(&text::table(&skin, &rows))
-            };
+        let rates = if self.table { None } else { self.rates(&skin)? };
+        let (buses, whole, rows) = match rates {
+            None => (Vec::new(), None, fit::table(&skin, self.format, computation_ns)),
+            Some(rates) => {
+                let buses = rates.into_iter().enumerate();
+                let fit = |(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns);
+                let buses: Vec<BusFit> = buses.filter_map(fit).collect();
+                let whole = fit::fullest(buses.iter().cloned()).map(|it| fit::whole(&skin, &it));
+                (buses, whole, Vec::new())
+            }
         };
-        let buses = rates.into_iter().enumerate();
-        let buses = buses
-            .filter_map(|(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns));
-        let buses: Vec<BusFit> = buses.collect();
-        let whole = fit::fullest(buses.iter().cloned()).map(|it| fit::whole(&skin, &it));
-        if self.json {
-            print_json(&fit::json(&skin, &buses, whole.as_ref(), &[]))
-        } else {
-            print(&text::buses(&skin, &buses, whole.as_ref()))
-        }
+        print(&match self.json {
+            true => json(&fit::json(&skin, &buses, whole.as_ref(), &rows))?,
+            false => text::table(&skin, &rows) + &text::buses(&skin, &buses, whole.as_ref()),
+        })
     }
 
     /// Format and rates of every bus; `None` when neither the command line nor the description has them for all.
-    fn rates(&self, skin: &Skin, format: Option<Format>) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
-        let formats: Vec<_> = skin.buses.iter().map(|bus| format.unwrap_or(bus.format)).collect();
+    fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
+        let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
         let Some(nominal) = self.nominal else {
             let described = skin.buses.iter().zip(&formats).map(|(bus, &format)| described(bus, format));
             return described.collect();
@@ -132,8 +118,4 @@ fn computation(text: &str) -> Result<u64, String> {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 65 000 000")]
     let ns = (us * 1e3).ceil() as u64;
     Ok(ns)
-}
-
-fn print_json(value: &serde_json::Value) -> Result<(), Failure> {
-    print(&format!("{value:#}\n"))
 }

@@ -4,10 +4,9 @@ use std::fmt::Write;
 
 use clap::{Args, Subcommand};
 use model::decode::{parameter, pick};
-use model::generate::Format;
 use model::scenario::contact_words;
 use protocol::bus::Choice;
-use protocol::can::{self, BIT_RATE_SWITCH, Frame as CanFrame};
+use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
@@ -16,6 +15,7 @@ use protocol::schema::packets;
 use protocol::usage::{Failure, print};
 
 use super::ack;
+use super::arguments::{FORMATS, one_of};
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
@@ -30,7 +30,7 @@ pub(crate) struct Frame {
     #[command(subcommand)]
     what: What,
     /// What the packet travels in
-    #[arg(long, value_enum, default_value = "fd", global = true)]
+    #[arg(long, value_parser = one_of(FORMATS), default_value = "fd", global = true)]
     format: Format,
     /// Send it on this bus instead of printing it
     #[arg(long, value_name = "NAME", global = true)]
@@ -170,19 +170,18 @@ struct Asked {
 impl Frame {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let message = self.what.message().map_err(Failure::usage)?;
-        let format = ack::wire(self.format);
         match self.bus {
             Some(name) => {
-                let bus = ack::open(&name, self.bus_kind, format).map_err(Failure::usage)?;
-                ack::send(&bus, &message, format)
+                let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
+                ack::send(&bus, &message, self.format)
             }
-            None => print(&text(&message, format)),
+            None => print(&text(&message, self.format)),
         }
     }
 }
 
 /// The lines for cansend.
-fn text(message: &Message, format: can::Format) -> String {
+fn text(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {
         // cansend needs only to be told of the bit-rate switch: `##1`, as the document has it.

@@ -3,17 +3,22 @@
 use std::fs::File;
 use std::io::{self, Read};
 use std::os::fd::AsFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+use bench::listen::{self, Listener};
 use bench::signals::caught;
+use protocol::bus::{Bus, BusError, Choice, Options, Received};
+use protocol::can::{self, EXTENDED_MASK};
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::Reader;
+use trace::capture::{Format, Note, NoteKind, Reader};
+
+use super::output;
 
 /// How long a signal to end may wait, when nothing comes.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
@@ -21,6 +26,126 @@ pub(crate) const LOOK: Duration = Duration::from_millis(200);
 /// A flag that SIGINT and SIGTERM set.
 pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
     caught(&[SIGINT, SIGTERM]).map_err(Failure::run)
+}
+
+/// Whether it is the name of a capture, and not of a bus.
+pub(crate) fn is_file(source: &Path) -> bool {
+    source.as_os_str() == "-" || source.exists()
+}
+
+/// What a capture is written in.
+pub(crate) fn format(reader: &Reader) -> &'static str {
+    match reader.format() {
+        Format::Candump => "candump log",
+        Format::Mcap => "MCAP",
+    }
+}
+
+/// Where an entry stands: in a capture, and in a line of it if it has lines.
+pub(crate) fn place(name: &str, line: u64) -> String {
+    if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
+}
+
+/// Why a log has nothing for whoever wants frames.
+pub(crate) fn no_frame(name: &str, lines: u64) -> String {
+    format!(
+        "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
+         `(1700000000.123456) vcan0 123#00`"
+    )
+}
+
+/// What a capture lacks.
+#[derive(Debug, Default)]
+pub(crate) struct Missing {
+    /// Lines that cannot be read.
+    pub(crate) lines: u64,
+    /// Frames that whoever took the capture lost.
+    pub(crate) frames: u64,
+    /// CAN XL frames.
+    can_xl: u64,
+}
+
+impl Missing {
+    /// Counts what an entry that is no frame says.
+    pub(crate) fn take(&mut self, note: &Note<'_>) {
+        match note.kind {
+            NoteKind::Text => {}
+            NoteKind::CanXl => self.can_xl += 1,
+            NoteKind::Dropped(frames) => self.frames = self.frames.saturating_add(frames),
+            NoteKind::Unreadable(_) => self.lines += 1,
+        }
+    }
+
+    /// Says it at the end; also what has become of CAN XL frames.
+    pub(crate) fn tell(&self, reader: &Reader, can_xl: &str) {
+        let name = reader.name();
+        let said = [
+            (self.lines, format!("{} of {} lines could not be read", self.lines, reader.lines())),
+            (self.frames, format!("{} frames are missing: whoever took the capture lost them", self.frames)),
+            (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
+        ];
+        let said = said.iter().filter(|(count, _)| *count > 0).map(|(_, said)| said);
+        for line in said.chain(&reader.extras().unfinished) {
+            output::note(format_args!("{name}: {line}"));
+        }
+    }
+}
+
+/// A live bus. That it is down is said once, until it works again.
+#[derive(Debug)]
+pub(crate) struct Ear {
+    listener: Listener,
+    is_down: bool,
+}
+
+impl Ear {
+    /// Opens a bus to hear all of it, and says of which kind it is; with `None` a classic interface too.
+    pub(crate) fn open(
+        name: &str,
+        kind: Choice,
+        format: Option<can::Format>,
+        options: Options,
+    ) -> Result<Self, Failure> {
+        let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })
+            .map_err(|error| Failure::usage(format!("there is no file {name}, and as a bus: {error}")))?;
+        output::note(format_args!("{} is {}", bus.name(), bus.kind()));
+        Ok(Self { listener: Listener::new(bus, format), is_down: false })
+    }
+
+    /// Takes what is there or comes within this time; whether there is anything.
+    pub(crate) fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
+        let heard = self.listener.hear(wait);
+        match heard {
+            Ok(heard) => self.is_down &= !heard,
+            Err(ref error) if error.may_pass() => {
+                if !std::mem::replace(&mut self.is_down, true) {
+                    output::note(format_args!("gateway: {error}; waiting"));
+                }
+            }
+            Err(_) => {}
+        }
+        listen::passing(heard, LOOK).map(Option::unwrap_or_default)
+    }
+
+    /// What was taken last.
+    pub(crate) fn frames(&self) -> impl Iterator<Item = Received> + '_ {
+        self.listener.frames()
+    }
+
+    pub(crate) fn bus(&self) -> &Bus {
+        self.listener.bus()
+    }
+
+    /// Says at the end how many frames are missing, which came faster than something was done with them.
+    pub(crate) fn missing(&self, done: &str) -> u64 {
+        let (name, missing) = (self.bus().name(), self.listener.dropped());
+        if missing > 0 {
+            output::note(format_args!(
+                "{name}: {missing} frames are missing: they came faster than they were {done}"
+            ));
+        }
+        missing.into()
+    }
 }
 
 /// Opens a capture, standard input or the parts of a recording, so that its reader can be told to stop. Signals are caught

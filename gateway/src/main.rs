@@ -7,6 +7,7 @@
 )]
 
 mod ack;
+mod arguments;
 mod buses;
 mod cells;
 mod commission;
@@ -20,7 +21,6 @@ mod frame;
 mod input;
 mod output;
 mod print;
-mod programs;
 mod recover;
 mod replay;
 mod report;

@@ -4,20 +4,19 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use bench::replay::player::Pace;
-use bench::replay::reel::Only as What;
+use bench::replay::reel::Only;
 use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::Part;
 use bench::replay::{Options, Spawn, replay};
 use bench::run::RunError;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use model::decode::pick::{self, Pick, Wanted};
-use model::quantiles::Quantiles;
-use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
+use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
 use super::output::{self, Force, apart};
-use super::print::Rows;
+use super::print::{Rows, json, list, or, quantiles};
 
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -28,6 +27,10 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 /// bus answer; with --expect their answers have to be the recorded ones, bit for bit. docs/replay.md says what is
 /// compared and how. Exit code 0: all was sent, and all answers were right; 1: not so; 2: wrong use.
 #[derive(Args, Debug)]
+#[command(mut_args(|arg| match arg.get_id().as_str() {
+    "cells_per_process" | "cell_node" | "vcan_setup" => arg.requires("spawn"),
+    _ => arg,
+}))]
 #[command(after_help = "Examples:
   gateway replay run.log --only inputs --speed 0.5
   gateway replay run.mcap --expect --spawn --lockstep
@@ -37,10 +40,8 @@ pub(crate) struct Replay {
     /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
-    /// several BUS=KIND, as often as there are buses
-    #[arg(long, value_name = "[BUS=]KIND")]
-    bus_kind: Vec<OneKind>,
+    #[command(flatten)]
+    kinds: BusKinds,
     /// Send the frames of one of the capture's buses on another bus
     #[arg(long, value_name = "FROM=TO", value_parser = route)]
     map: Vec<(String, String)>,
@@ -49,7 +50,7 @@ pub(crate) struct Replay {
     bus: Vec<String>,
     /// Whose frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
     /// else all are sent
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = one_of(ONLY))]
     only: Option<Only>,
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
     /// joints, sync, resume, report alone, wire, and foreign
@@ -88,15 +89,8 @@ pub(crate) struct Replay {
     /// The skin of the cells that are started; else the recording's own
     #[arg(long, value_name = "FILE", requires = "spawn")]
     skin: Option<PathBuf>,
-    /// Put up to N cells into one process
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254), requires = "spawn")]
-    cells_per_process: u8,
-    /// The program of the cells, when it is not beside this one
-    #[arg(long, value_name = "PATH", requires = "spawn")]
-    cell_node: Option<PathBuf>,
-    /// The program that serves embedded buses, when it is not beside this one
-    #[arg(long, value_name = "PATH", requires = "spawn")]
-    vcan_setup: Option<PathBuf>,
+    #[command(flatten)]
+    programs: Programs,
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
@@ -119,29 +113,16 @@ pub(crate) struct Replay {
     quiet: bool,
 }
 
-/// Whose frames are sent.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
-enum Only {
-    /// Commands, configuration, stimuli
-    Inputs,
-    /// What cells said
-    Replies,
-    /// Everything
-    All,
-}
+const ONLY: &[Word<Only>] = &[
+    ("inputs", "Commands, configuration, stimuli", Only::Inputs),
+    ("replies", "What cells said", Only::Replies),
+    ("all", "Everything", Only::All),
+];
 
 fn route(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((from, to)) if !from.is_empty() && !to.is_empty() => Ok((from.to_owned(), to.to_owned())),
         _ => Err("a bus of the capture and the bus it goes to, such as vcan0=vcan1".to_owned()),
-    }
-}
-
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
-fn nanos(text: &str) -> Result<u64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
-        _ => Err("a number of seconds from 0 to 1e9".to_owned()),
     }
 }
 
@@ -161,11 +142,11 @@ impl Replay {
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
         let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
-        let json = serde_json::to_string_pretty(&summary).map_err(Failure::run)?;
+        let json = json(&summary)?;
         if let Some((whole, file)) = file {
-            output::finish("--summary", whole, file, &format!("{json}\n"))?;
+            output::finish("--summary", whole, file, &json)?;
         }
-        print(&if self.json { format!("{json}\n") } else { table(&summary) })?;
+        print(&if self.json { json } else { table(&summary) })?;
         summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
@@ -179,13 +160,12 @@ impl Replay {
                      two"
                 )));
             }
-            (Some(Only::Inputs), _) | (None, Some(_)) => What::Inputs,
-            (Some(Only::Replies), None) => What::Replies,
-            (Some(Only::All) | None, None) => What::All,
+            (None, Some(_)) => Only::Inputs,
+            (only, _) => only.unwrap_or(Only::All),
         };
         Ok(Options {
             files: self.files.clone(),
-            kinds: Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)?,
+            kinds: self.kinds.of_any()?,
             only,
             pick: Pick { kinds: self.kind.clone(), nodes: self.node.clone(), ..Pick::default() },
             buses: self.bus.clone(),
@@ -198,10 +178,10 @@ impl Replay {
             expect: self.expect,
             spawn: self.spawn.then(|| Spawn {
                 skin: self.skin.clone(),
-                cells_per_process: self.cells_per_process.into(),
-                cell_node: self.cell_node.clone(),
+                cells_per_process: self.programs.cells_per_process.into(),
+                cell_node: self.programs.cell_node.clone(),
             }),
-            vcan_setup: self.vcan_setup.clone(),
+            vcan_setup: self.programs.vcan_setup.clone(),
             test_mode: self.test_mode,
             patience: Duration::from_millis(self.patience.into()),
             receive_buffer: RECEIVE_BUFFER as usize,
@@ -214,8 +194,7 @@ impl Replay {
 /// The whole replay, for people.
 fn table(summary: &Summary) -> String {
     let ended = if summary.interrupted { "interrupted" } else { "done" };
-    let head = [summary.file.clone(), format!("{:.1} s, {ended}", summary.duration_s), String::new()];
-    let mut rows = Rows::new(head);
+    let mut rows = Rows::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
     rows.section("frames", "", "");
     rows.row("sent", summary.sent, "");
     rows.row("refused", summary.refused, "a bus stayed full");
@@ -223,9 +202,7 @@ fn table(summary: &Summary) -> String {
     for (reason, count) in &summary.skipped {
         rows.row("not sent", count, reason);
     }
-    if summary.sent_at_once > 0 {
-        rows.row("sent at once", summary.sent_at_once, "older than what was sent before");
-    }
+    rows.any("sent at once", summary.sent_at_once, "older than what was sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.section("lateness", "50 % / 90 % / 99 % / greatest, µs", "");
         rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
@@ -237,7 +214,7 @@ fn table(summary: &Summary) -> String {
         }
     }
     if let Some(lockstep) = &summary.lockstep {
-        let silent = lockstep.silent_cells.join(", ");
+        let silent = list(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
         rows.section("lockstep", silent, format!("{} joints asked again", lockstep.asked_again));
     }
@@ -245,8 +222,7 @@ fn table(summary: &Summary) -> String {
         expectation(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
-    let first = first.map(|first| format!("{}\n", first.text)).unwrap_or_default();
-    format!("{}\n{first}", rows.table())
+    rows.text() + &or(first.map(|first| format!("{}\n", first.text)), "")
 }
 
 fn expectation(rows: &mut Rows, expect: &Expect) {
@@ -260,20 +236,10 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    if tally.not_asked > 0 {
-        rows.row("not asked for", tally.not_asked, "a bus did not take the joints");
-    }
+    rows.any("not asked for", tally.not_asked, "a bus did not take the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }
-    if expect.recording_dropped > 0 {
-        rows.row("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
-    }
-    if expect.unchecked_cells > 0 {
-        rows.row("unknown configurations", expect.unchecked_cells, "not told before they were changed");
-    }
-}
-
-fn quantiles(of: &Quantiles) -> String {
-    format!("{:.0} / {:.0} / {:.0} / {:.0}", of.p50, of.p90, of.p99, of.max)
+    rows.any("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
+    rows.any("unknown configurations", expect.unchecked_cells, "not told before they were changed");
 }

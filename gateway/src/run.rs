@@ -1,5 +1,7 @@
 //! `gateway run` and `gateway demo`.
 
+mod show;
+
 use std::fs::File;
 use std::io::Write;
 use std::os::fd::AsRawFd;
@@ -13,18 +15,18 @@ use bench::run::{self, Options};
 use bench::summary::{Outcome, Summary};
 use clap::Args;
 use model::scenario::Scenario;
-use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds, OneKind};
+use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::time::Span;
-use protocol::usage::{Failure, quoted};
+use protocol::usage::{Failure, print, quoted};
 use rustix::fs::{MemfdFlags, memfd_create};
 use trace::recording::series::{Attached, Split};
 
+use super::arguments::{BusKinds, Programs, bus_names, seconds};
 use super::buses::Buses;
 use super::output::{self, Force, apart, note};
-use super::print;
-use super::programs::Programs;
+use super::print::json;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
@@ -170,10 +172,8 @@ pub(crate) struct Run {
     /// Write all frames as candump text: a log that can be followed while it grows
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
-    /// several BUS=KIND, as often as there are buses
-    #[arg(long, value_name = "[BUS=]KIND")]
-    bus_kind: Vec<OneKind>,
+    #[command(flatten)]
+    kinds: BusKinds,
     /// Start no cells: they are on the bus already, or are real
     #[arg(long)]
     no_spawn: bool,
@@ -184,13 +184,6 @@ pub(crate) struct Run {
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if seconds > 0.0 && seconds <= 1e7 => Ok(seconds),
-        _ => Err("a number of seconds above 0, up to 1e7".to_owned()),
-    }
 }
 
 /// A file in memory that goes with this program, and how its cells name it.
@@ -257,9 +250,7 @@ impl Run {
         };
         let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, .. } = self.common;
-        let kinds = Kinds::of_words(&self.bus_kind, Choice::Auto)
-            .and_then(|kinds| kinds.only(options.skin.buses.iter().map(|bus| bus.name.as_str())));
-        options.kinds = kinds.map_err(Failure::usage)?;
+        options.kinds = self.kinds.of(bus_names(&options.skin))?;
         options.record = recording.options(
             self.candump.map(|path| Candump { path, numbered: false }),
             &options.skin,
@@ -310,22 +301,21 @@ fn bench(
     ];
     apart(written, read.iter().map(PathBuf::as_path))?;
     // Before the run: nobody wants to hear after an hour that there is nowhere to write.
-    let json = summary_file.map(|path| force.create("--summary", path)).transpose()?;
+    let summary = summary_file.map(|path| force.create("--summary", path)).transpose()?;
     // What it says of its own end is not lost with the program.
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
     let (ended, panicked) = match ended {
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
         Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),
     };
-    let unwritten = json.and_then(|(whole, file)| {
-        let text = serde_json::to_string_pretty(&ended).map_err(Failure::run);
-        text.and_then(|text| output::finish("--summary", whole, file, &format!("{text}\n"))).err()
+    let unwritten = summary.and_then(|(whole, file)| {
+        json(&ended).and_then(|text| output::finish("--summary", whole, file, &text)).err()
     });
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);
     }
     if ended.control.ticks > 0 {
-        print::summary(&ended)?;
+        print(&show::rows(&ended).text())?;
     }
     // The last line is the failure's own; each of them is one line.
     let mut lines = ended.complaints();

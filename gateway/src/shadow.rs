@@ -3,16 +3,14 @@
 mod show;
 
 use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use analysis::fit::rates::Asked;
-use analysis::shadow::{Options, Shadow};
+use analysis::shadow::{self, Shadow};
 use clap::Args;
-use protocol::bus::{self, Bus, BusError, Choice, Inbox};
-use protocol::can::EXTENDED_MASK;
+use protocol::bus::{BusError, Options};
 use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::{Failure, print, written};
@@ -20,9 +18,10 @@ use protocol::wire_time::{BitRates, bit_rate};
 use trace::capture::{Entry, Format, NoteKind, Reader};
 
 use self::show::write_frames;
-use super::dump::nanos;
-use super::input::{LOOK, captures, stopped};
+use super::arguments::{BusKind, nanos};
+use super::input::{self, Ear, LOOK, Missing, captures, is_file, place, stopped};
 use super::output;
+use super::print::list;
 
 /// Bytes for frames that wait while others are worked on.
 const RECEIVE_BUFFER: usize = 8 << 20;
@@ -79,9 +78,8 @@ pub(crate) struct ShadowCommand {
     /// End a live shadow after so many seconds
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     duration: Option<u64>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    #[command(flatten)]
+    kind: BusKind,
 }
 
 fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
@@ -94,59 +92,35 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
 }
 
 /// What was taken in, beside the frames.
-#[derive(Default)]
 struct Taken {
     /// What it was read from.
     what: &'static str,
     /// Frames that whoever took the capture lost.
     missing: u64,
-    /// Lines that could not be read.
-    unreadable: u64,
     /// Why there is no more, if not because that was all.
-    ended: Option<Failure>,
+    ended: Result<(), Failure>,
 }
 
 impl ShadowCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         let mut out = BufWriter::new(Stoppable::new(io::stdout()));
-        let files = self.sources.iter().filter(|source| is_file(source)).count();
-        let name =
-            self.sources.iter().map(|source| source.display().to_string()).collect::<Vec<_>>().join(", ");
+        let name = list(self.sources.iter().map(|source| source.display()));
         let mut title = name.clone();
-        let (mut shadow, taken) = match self.sources.as_slice() {
-            sources if files == sources.len() => {
-                if self.duration.is_some() {
-                    return Err(Failure::usage(format!(
-                        "--duration is for live buses, and {name} is a file"
-                    )));
-                }
-                if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
-                    return Err(Failure::usage(format!(
-                        "{} is a directory: name a candump log, an MCAP recording or a bus",
-                        folder.display()
-                    )));
-                }
-                let reader = captures(sources, |file| Box::new(file))?;
-                reader.name().clone_into(&mut title);
-                let mut shadow = self.shadow(skin.or_else(|| attached(reader.name(), &reader)))?;
-                for before in &reader.extras().in_force {
-                    shadow.in_force(&before.bus, before.nanos, &before.frame);
-                }
-                let taken = captured(reader, &mut shadow, &mut out, stop::flag())?;
-                (shadow, taken)
+        let (mut shadow, taken) = if self.are_captures(&name)? {
+            let reader = captures(&self.sources, |file| Box::new(file))?;
+            reader.name().clone_into(&mut title);
+            let mut shadow = self.shadow(skin.or_else(|| attached(&reader)))?;
+            for before in &reader.extras().in_force {
+                shadow.in_force(&before.bus, before.nanos, &before.frame);
             }
-            _ if files > 0 => {
-                return Err(Failure::usage(format!(
-                    "{name}: one file, the parts of one recording, or buses without a file"
-                )));
-            }
-            sources => {
-                let stopped = stopped()?;
-                let mut shadow = self.shadow(skin)?;
-                let taken = self.live(sources, &mut shadow, &mut out, &stopped)?;
-                (shadow, taken)
-            }
+            let taken = captured(reader, &mut shadow, &mut out)?;
+            (shadow, taken)
+        } else {
+            let stopped = stopped()?;
+            let mut shadow = self.shadow(skin)?;
+            let taken = self.live(&mut shadow, &mut out, &stopped)?;
+            (shadow, taken)
         };
         shadow.finish();
         written(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
@@ -160,7 +134,29 @@ impl ShadowCommand {
         if !self.json && report.frames > 0 {
             print(&show::text(&title, taken.what, taken.missing, &report))?;
         }
-        taken.ended.map_or(Ok(()), Err)
+        taken.ended
+    }
+
+    /// Whether captures are meant, and not buses.
+    fn are_captures(&self, name: &str) -> Result<bool, Failure> {
+        match self.sources.iter().filter(|source| is_file(source)).count() {
+            0 => return Ok(false),
+            files if files < self.sources.len() => {
+                return Err(Failure::usage(format!(
+                    "{name}: one file, the parts of one recording, or buses without a file"
+                )));
+            }
+            _ => {}
+        }
+        if self.duration.is_some() {
+            return Err(Failure::usage(format!("--duration is for live buses, and {name} is a file")));
+        }
+        self.sources.iter().find(|source| source.is_dir()).map_or(Ok(true), |folder| {
+            Err(Failure::usage(format!(
+                "{} is a directory: name a candump log, an MCAP recording or a bus",
+                folder.display()
+            )))
+        })
     }
 
     /// With the rates of the command line, else of the skin, else common ones.
@@ -172,14 +168,14 @@ impl ShadowCommand {
             let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
             of_bus.push((bus.name.clone(), rates));
         }
-        let options = Options {
+        let options = shadow::Options {
             of_bus,
             bit_errors: self.ber,
             seed: self.seed,
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
             skin,
-            ..Options::new(asked.rates().map_err(Failure::usage)?)
+            ..shadow::Options::new(asked.rates().map_err(Failure::usage)?)
         };
         Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
@@ -187,29 +183,23 @@ impl ShadowCommand {
     /// Listens to buses until somebody says stop.
     fn live(
         &self,
-        sources: &[PathBuf],
         shadow: &mut Shadow,
         out: &mut impl Write,
         stopped: &AtomicBool,
     ) -> Result<Taken, Failure> {
-        let mut ears = Vec::new();
-        for source in sources {
-            let name = source.display().to_string();
-            let bus = open(&name, self.bus_kind)
-                .map_err(|error| Failure::usage(format!("there is no file {name}, and as a bus: {error}")))?;
-            output::note(format_args!("{} is {}", bus.name(), bus.kind()));
-            ears.push(Ear { bus, inbox: Inbox::new(), down: false });
-        }
+        let open = |source: &PathBuf| {
+            let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
+            Ear::open(&source.display().to_string(), self.kind.bus_kind, None, options)
+        };
+        let mut ears = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let end = self.duration.map(|nanos| Instant::now() + Duration::from_nanos(nanos));
-        let mut ended = None;
-        while ended.is_none()
-            && !stopped.load(Ordering::Relaxed)
-            && end.is_none_or(|end| Instant::now() < end)
+        let mut ended = Ok(());
+        while ended.is_ok() && !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end)
         {
             wait(&ears)?;
             for ear in &mut ears {
-                if let Err(failure) = ear.take(shadow) {
-                    ended = Some(failure);
+                if let Err(error) = take(ear, shadow) {
+                    ended = Err(Failure::run(error));
                 }
             }
             if let Err(error) = write_frames(shadow, out).and_then(|()| out.flush()) {
@@ -218,160 +208,84 @@ impl ShadowCommand {
             }
         }
         let mut missing = 0;
-        for Ear { bus, inbox, .. } in &ears {
-            let lost = u64::from(inbox.dropped());
-            shadow.missing(bus.name(), lost);
+        for ear in &ears {
+            let lost = ear.missing("read");
+            shadow.missing(ear.bus().name(), lost);
             missing += lost;
-            if lost > 0 {
-                output::note(format_args!(
-                    "{}: {lost} frames are missing: they came faster than they were read",
-                    bus.name()
-                ));
-            }
         }
-        Ok(Taken { what: "live", missing, unreadable: 0, ended })
+        Ok(Taken { what: "live", missing, ended })
     }
 }
 
-/// A bus that is listened to.
-struct Ear {
-    bus: Bus,
-    inbox: Inbox,
-    down: bool,
-}
-
-impl Ear {
-    /// Takes what has come.
-    fn take(&mut self, shadow: &mut Shadow) -> Result<(), Failure> {
-        loop {
-            match self.bus.receive(&mut self.inbox) {
-                Ok(0) => return Ok(()),
-                Ok(_) => self.down = false,
-                Err(error) if error.may_pass() => {
-                    if !std::mem::replace(&mut self.down, true) {
-                        output::note(format_args!("gateway: {error}; waiting"));
-                    }
-                    std::thread::sleep(LOOK);
-                    return Ok(());
-                }
-                Err(error) => return Err(Failure::run(error)),
-            }
-            for received in self.inbox.frames() {
-                shadow.frame(self.bus.name(), received.at_nanos, &received.frame);
-            }
+/// Takes what has come.
+fn take(ear: &mut Ear, shadow: &mut Shadow) -> Result<(), BusError> {
+    while ear.hear(Duration::ZERO)? {
+        for received in ear.frames() {
+            shadow.frame(ear.bus().name(), received.at_nanos, &received.frame);
         }
     }
+    Ok(())
 }
 
 /// Waits until a frame comes, or it is time to look at other things.
 fn wait(ears: &[Ear]) -> Result<(), Failure> {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
-    let mut fds: Vec<_> = ears.iter().map(|ear| PollFd::new(&ear.bus, PollFlags::IN)).collect();
+    let mut fds: Vec<_> = ears.iter().map(|ear| PollFd::new(ear.bus(), PollFlags::IN)).collect();
     match poll(&mut fds, Timespec::try_from(LOOK).ok().as_ref()) {
         Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
         Err(errno) => Err(Failure::run(io::Error::from(errno))),
     }
 }
 
-fn is_file(source: &Path) -> bool {
-    source.as_os_str() == "-" || source.exists()
-}
-
-/// Opens a bus to hear all of it; a classic interface too.
-fn open(name: &str, kind: Choice) -> Result<Bus, BusError> {
-    let options = |fd| bus::Options {
-        fd,
-        error_mask: EXTENDED_MASK,
-        receive_buffer: RECEIVE_BUFFER,
-        ..bus::Options::default()
-    };
-    match Bus::open(name, kind, &options(true)) {
-        Err(BusError::ClassicOnly { .. }) => Bus::open(name, kind, &options(false)),
-        opened => opened,
-    }
-}
-
 /// The skin that is attached to a recording.
-fn attached(name: &str, reader: &Reader) -> Option<Skin> {
+fn attached(reader: &Reader) -> Option<Skin> {
+    let name = reader.name();
     let skin = reader.extras().skin()?;
     skin.inspect_err(|error| output::note(format_args!("{name}: the attached {error}; name one with --skin")))
         .ok()
 }
 
 /// Takes in a capture, and says what is missing of it.
-fn captured(
-    mut reader: Reader,
-    shadow: &mut Shadow,
-    out: &mut impl Write,
-    stopped: &Arc<AtomicBool>,
-) -> Result<Taken, Failure> {
+fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
     let name = reader.name().to_owned();
-    let what = match reader.format() {
-        Format::Candump => "candump log",
-        Format::Mcap => "MCAP",
-    };
-    let mut taken = Taken { what, ..Taken::default() };
-    let (mut frames, mut xl) = (0_u64, 0_u64);
-    loop {
-        let note = match reader.next() {
+    let what = input::format(&reader);
+    let (mut frames, mut missing) = (0_u64, Missing::default());
+    let mut ended = loop {
+        match reader.next() {
+            Ok(None) => break Ok(()),
+            Err(error) => break Err(Failure::run(error)),
             Ok(Some(Entry::Frame(record))) => {
                 frames += 1;
                 shadow.frame(record.interface, record.time.nanos, &record.frame);
                 if let Err(error) = write_frames(shadow, out) {
                     written(Err(error))?;
-                    return Ok(taken);
-                }
-                continue;
-            }
-            Ok(Some(Entry::Note(note))) => note,
-            Ok(None) => break,
-            Err(error) => {
-                taken.ended = Some(Failure::run(error));
-                break;
-            }
-        };
-        match note.kind {
-            NoteKind::Text => {}
-            NoteKind::CanXl => xl += 1,
-            NoteKind::Dropped(lost) => {
-                taken.missing = taken.missing.saturating_add(lost);
-                if !note.interface.is_empty() {
-                    shadow.missing(note.interface, lost);
+                    return Ok(Taken { what, missing: missing.frames, ended: Ok(()) });
                 }
             }
-            NoteKind::Unreadable(why) => {
-                if taken.unreadable == 0 {
-                    output::note(format_args!("{name}:{}: {why}", note.line));
+            Ok(Some(Entry::Note(note))) => {
+                missing.take(&note);
+                match note.kind {
+                    NoteKind::Dropped(lost) if !note.interface.is_empty() => {
+                        shadow.missing(note.interface, lost);
+                    }
+                    NoteKind::Unreadable(why) if missing.lines == 1 => {
+                        output::note(format_args!("{}: {why}", place(&name, note.line)));
+                    }
+                    NoteKind::Text | NoteKind::CanXl | NoteKind::Dropped(_) | NoteKind::Unreadable(_) => {}
                 }
-                taken.unreadable += 1;
             }
         }
-    }
-    let lines = reader.lines();
-    if taken.unreadable > 0 {
-        output::note(format_args!("{name}: {} of {lines} lines could not be read", taken.unreadable));
-    }
-    if taken.missing > 0 {
-        output::note(format_args!(
-            "{name}: {} frames are missing: whoever took the capture lost them",
-            taken.missing
-        ));
-    }
-    if xl > 0 {
-        output::note(format_args!("{name}: CAN XL frames are left out: {xl}"));
-    }
-    if let Some(what) = &reader.extras().unfinished {
-        output::note(format_args!("{name}: {what}"));
-    }
-    if stopped.load(Ordering::Relaxed) {
+    };
+    missing.tell(&reader, "left out");
+    if stop::flag().load(Ordering::Relaxed) {
         output::note(format_args!("{name}: stopped after {frames} frames"));
-    } else if frames == 0 && taken.ended.is_none() {
+    } else if frames == 0 && ended.is_ok() {
         let like = "a candump log has lines like `(1700000000.123456) vcan0 123#00`";
-        taken.ended = Some(Failure::run(match (reader.format(), lines) {
+        ended = Err(Failure::run(match (reader.format(), reader.lines()) {
             (Format::Candump, 0) => format!("{name} is empty: there is no frame to look at"),
-            (Format::Candump, _) => format!("{name}: there is no frame in {lines} lines; {like}"),
+            (Format::Candump, lines) => format!("{name}: there is no frame in {lines} lines; {like}"),
             (Format::Mcap, _) => format!("{name}: there is no CAN frame in this recording"),
         }));
     }
-    Ok(taken)
+    Ok(Taken { what, missing: missing.frames, ended })
 }

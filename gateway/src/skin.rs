@@ -1,17 +1,22 @@
 //! `gateway skin generate` and `gateway skin check`.
 
 use std::collections::BTreeMap;
-use std::fmt::{self, Write};
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use model::generate::{self, Wanted};
+use model::generate::{Reply as Answers, Robot, Wanted, generate};
 use protocol::can::Format;
 use protocol::packet::crc16;
-use protocol::skin::{ControllerKind, Reply, Skin as Description};
+use protocol::skin::{Cell, ControllerKind, Reply, Skin as Description};
 use protocol::usage::{Failure, print};
 
+use super::arguments::{FORMATS, Word, one_of};
 use super::output::Force;
+use super::print::{count, list, or, words};
+
+const ROBOTS: &[Word<Robot>] = &[("ur5", "Universal Robots UR5", Robot::Ur5)];
+const REPLIES: &[Word<Answers>] =
+    &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
 
 /// Make and check the descriptions of skins
 #[derive(Args, Debug)]
@@ -34,8 +39,24 @@ enum Command {
   gateway skin generate -o skin.toml
   gateway skin generate --cells 508 --buses 2 --format classic > skin.toml")]
 struct Generate {
-    #[command(flatten)]
-    wanted: Wanted,
+    /// The robot that wears the skin
+    #[arg(long, value_parser = one_of(ROBOTS), default_value = "ur5")]
+    robot: Robot,
+    /// How many cells, 1 to 254 a bus
+    #[arg(long, default_value_t = 253)]
+    cells: usize,
+    /// How many buses; cells of one bus lie together
+    #[arg(long, default_value_t = 1)]
+    buses: usize,
+    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop
+    #[arg(long, default_value_t = 62.5)]
+    broadcast_hz: f64,
+    /// What the cells answer with
+    #[arg(long, value_parser = one_of(REPLIES), default_value = "torque")]
+    reply: Answers,
+    /// What their packets travel in
+    #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
+    format: Format,
     /// The file to write, whole or not at all; else standard output
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -69,9 +90,11 @@ impl Skin {
 
 impl Generate {
     fn run(self) -> Result<(), Failure> {
-        let text = generate::generate(&self.wanted).map_err(Failure::usage)?;
-        match self.output {
-            Some(path) => self.force.write("-o", &path, &text),
+        let Self { robot, cells, buses, broadcast_hz, reply, format, output, force } = self;
+        let wanted = Wanted { robot, cells, buses, broadcast_hz, reply, format };
+        let text = generate(&wanted).map_err(Failure::usage)?;
+        match output {
+            Some(path) => force.write("-o", &path, &text),
             None => print(&text),
         }
     }
@@ -80,29 +103,27 @@ impl Generate {
 impl Check {
     fn run(self) -> Result<(), Failure> {
         let skin = Description::read(&self.file).map_err(Failure::usage)?;
-        let mut text = String::new();
-        describe(&mut text, &skin).expect("a string takes whatever is written");
-        if self.cells {
-            list(&mut text, &skin).expect("a string takes whatever is written");
-        }
-        print(&text)
+        print(&if self.cells { describe(&skin) + &cells(&skin) } else { describe(&skin) })
     }
 }
 
-fn describe(out: &mut String, skin: &Description) -> fmt::Result {
+fn describe(skin: &Description) -> String {
     let Description { name, robot, timing, events: _, buses, controller, safety: _, cells } = skin;
-    let joints = robot.joints.len();
-    writeln!(out, "{name}: {}, {}", count(cells.len(), "cell"), count(buses.len(), "bus"))?;
-    writeln!(out, "robot: {}, {}", robot.name, count(joints, "joint"))?;
     let controller = match &controller.kind {
         ControllerKind::Kinesthetic { .. } => "kinesthetic controller".to_owned(),
         ControllerKind::External { socket } => format!("external controller at {socket}"),
     };
-    write!(out, "timing: control loop {} Hz, joints {} Hz", timing.control_hz, timing.broadcast_hz())?;
-    if let Some(cell) = cells.first() {
-        write!(out, " (every {} us)", skin.parameters(cell).period_us)?;
-    }
-    writeln!(out, ", {controller}")?;
+    let every = cells.first().map(|cell| format!(" (every {} us)", skin.parameters(cell).period_us));
+    let mut text = format!(
+        "{name}: {}, {}\nrobot: {}, {}\ntiming: control loop {} Hz, joints {} Hz{}, {controller}\n",
+        count(cells.len(), "cell"),
+        count(buses.len(), "bus"),
+        robot.name,
+        count(robot.joints.len(), "joint"),
+        timing.control_hz,
+        timing.broadcast_hz(),
+        or(every, ""),
+    );
     for (index, bus) in buses.iter().enumerate() {
         let format = match bus.format {
             Format::Fd => "fd",
@@ -113,41 +134,32 @@ fn describe(out: &mut String, skin: &Description) -> fmt::Result {
             Reply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
             Reply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
         };
-        write!(out, "bus {} ({format}, {reply}): ", bus.name)?;
-        let mut by_joint = BTreeMap::new();
+        let mut by_joint = BTreeMap::<_, usize>::new();
         for cell in skin.cells_of(index) {
-            *by_joint.entry(cell.joint).or_insert(0) += 1;
+            *by_joint.entry(cell.joint).or_default() += 1;
         }
-        let parts: Vec<_> =
-            by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")).collect();
-        write!(out, "{}: {}; ", count(by_joint.values().sum(), "cell"), parts.join(", "))?;
-        let roots: Vec<_> =
-            skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node.to_string()).collect();
-        match roots.as_slice() {
-            [] => writeln!(out, "no root")?,
-            [root] => writeln!(out, "root {root}")?,
-            roots => writeln!(out, "roots {}", roots.join(" "))?,
-        }
+        let cells = count(by_joint.values().sum::<usize>(), "cell");
+        let parts = list(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
+        let roots: Vec<_> = skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
+        let roots = match roots.as_slice() {
+            [] => "no root".to_owned(),
+            [root] => format!("root {root}"),
+            roots => format!("roots {}", words(roots)),
+        };
+        text += &format!("bus {} ({format}, {reply}): {cells}: {parts}; {roots}\n", bus.name);
     }
     let images: Vec<u8> = cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
-    writeln!(out, "hash: {:04X} over the parameters of all cells; --cells lists each cell's", crc16(&images))
+    let hash = crc16(&images);
+    text + &format!("hash: {hash:04X} over the parameters of all cells; --cells lists each cell's\n")
 }
 
-fn list(out: &mut String, skin: &Description) -> fmt::Result {
-    for cell in &skin.cells {
+/// One line a cell.
+fn cells(skin: &Description) -> String {
+    let line = |cell: &Cell| {
         let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
-        let (node, joint, serial) = (cell.node, cell.joint, cell.serial);
+        let Cell { node, joint, serial, .. } = cell;
         let hash = skin.parameters(cell).hash();
-        writeln!(out, "{bus} {node} joint {joint} serial {serial} hash {hash:04X}")?;
-    }
-    Ok(())
-}
-
-fn count(count: usize, what: &str) -> String {
-    let plural = match what {
-        _ if count == 1 => "",
-        "bus" => "es",
-        _ => "s",
+        format!("{bus} {node} joint {joint} serial {serial} hash {hash:04X}\n")
     };
-    format!("{count} {what}{plural}")
+    skin.cells.iter().map(line).collect()
 }

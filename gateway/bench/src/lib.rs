@@ -2,13 +2,19 @@
 //!
 //! | module | what |
 //! |---|---|
+//! | [`listen`] | an open bus on which others speak |
+//! | [`cells`], [`commission`], [`sensing`] | asking cells, writing their parameters, switching what they tell |
 //! | [`run`] | a run: processes, buses, loop, and what it came to ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
 //! | [`replay`] | a capture on a bus again, compared |
 //! | [`signals`] | signals that end a command |
 
+pub mod cells;
+pub mod commission;
+pub mod listen;
 pub mod record;
 pub mod replay;
 pub mod run;
+pub mod sensing;
 pub mod signals;
 pub mod summary;

@@ -2,51 +2,64 @@
 
 use std::collections::BTreeMap;
 
+use bench::cells::Watch;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use model::listing::{self, Cell, Listing};
 use protocol::can::Format;
 use protocol::id::CellId;
 use protocol::message::{Heard, Heartbeat, PortState, Refused, State, Tree};
+use protocol::skin::Skin;
 use protocol::time::Micros;
 use protocol::usage::Failure;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::commission::some;
+use crate::print::{self, filled, some, words};
 
 /// What a description says of a bus.
 pub(super) struct Known {
-    pub(super) file: String,
+    file: String,
     pub(super) format: Format,
     /// Numbers and hashes, by serial number.
-    pub(super) cells: BTreeMap<u32, (CellId, u16)>,
+    cells: BTreeMap<u32, (CellId, u16)>,
 }
 
 /// What is shown now.
 pub(super) struct Shown<'a> {
-    pub(super) bus: &'a str,
-    pub(super) kind: &'a str,
-    pub(super) listing: &'a Listing,
-    pub(super) known: Option<&'a Known>,
-    pub(super) now: Micros,
+    bus: &'a str,
+    kind: String,
+    listing: &'a Listing,
+    known: Option<&'a Known>,
+    now: Micros,
 }
 
-/// A column: its head, and what stands there of a cell that has said it.
-type Column<'a> = (&'static str, Box<dyn Fn(u8, &Cell) -> Option<String> + 'a>);
+/// What stands in a column of a cell that has said it.
+type Text<'a> = Box<dyn Fn(&(u8, &'a Cell)) -> Option<String> + 'a>;
 
-impl Shown<'_> {
-    /// All of it.
-    pub(super) fn text(&self, json: bool, watch: bool) -> Result<String, Failure> {
-        if !json {
-            return Ok(self.table());
-        }
-        let whole = self.json();
-        let text = if watch { serde_json::to_string(&whole) } else { serde_json::to_string_pretty(&whole) };
-        text.map(|text| text + "\n").map_err(Failure::run)
+/// A column: its head and its text.
+type Column<'a> = (&'static str, Text<'a>);
+
+/// A counter: its head and its value.
+type Counter = (&'static str, fn(&Cell) -> Option<u16>);
+
+/// What stands in a column of what heartbeats say.
+fn of_heartbeat<'a>(what: fn(&Heartbeat) -> Option<String>) -> Text<'a> {
+    Box::new(move |(_, cell)| what(cell.heartbeat.as_ref()?))
+}
+
+/// Columns that are not of numbers.
+const OF_WORDS: [&str; 3] = ["state", "ports", "skin"];
+
+impl<'a> Shown<'a> {
+    /// What was heard, beside what a description says.
+    pub(super) fn of(watch: &'a Watch, known: Option<&'a Known>) -> Self {
+        let (bus, kind) = (watch.bus().name(), watch.bus().kind().to_string());
+        Self { bus, kind, listing: watch.listing(), known, now: watch.now() }
     }
 
-    fn table(&self) -> String {
-        let whole = self.lines(self.columns().into_iter().chain(counters()).collect());
+    /// One line a cell, and what is odd; without counters where there is no room for them.
+    pub(super) fn table(&self) -> String {
+        let whole = self.lines(self.columns().into_iter().chain(counters()));
         let wide = Table::new().width();
         let text = match wide {
             Some(wide) if width(&whole) > usize::from(wide) => self.lines(self.columns()),
@@ -56,40 +69,34 @@ impl Shown<'_> {
     }
 
     fn columns(&self) -> Vec<Column<'_>> {
-        let beat =
-            |what: fn(&Heartbeat) -> Option<String>| move |_: u8, cell: &Cell| what(cell.heartbeat.as_ref()?);
+        let now = self.now;
         let mut columns: Vec<Column<'_>> = vec![
-            ("cell", Box::new(|number, _| Some(number.to_string()))),
-            ("serial", Box::new(beat(|it| Some(it.serial.to_string())))),
-            ("state", Box::new(beat(|it| Some(state(it.state))))),
-            ("joint", Box::new(beat(|it| configured(it).then(|| it.state.joint().to_string())))),
-            ("up", Box::new(|_, cell| cell.tree.as_ref().map(listing::parent))),
-            ("depth", Box::new(|_, cell| depth(cell.tree.as_ref()?))),
-            ("ports", Box::new(|_, cell| cell.ports.as_ref().map(listing::ports))),
-            ("hash", Box::new(beat(|it| configured(it).then(|| format!("{:04X}", it.configuration))))),
+            ("cell", Box::new(|(number, _)| Some(number.to_string()))),
+            ("serial", of_heartbeat(|it| Some(it.serial.to_string()))),
+            ("state", of_heartbeat(|it| Some(state(it.state)))),
+            ("joint", of_heartbeat(|it| configured(it).then(|| it.state.joint().to_string()))),
+            ("up", Box::new(|(_, cell)| cell.tree.as_ref().map(listing::parent))),
+            ("depth", Box::new(|(_, cell)| depth(cell.tree.as_ref()?).map(|depth| depth.to_string()))),
+            ("ports", Box::new(|(_, cell)| cell.ports.as_ref().map(listing::ports))),
+            ("hash", of_heartbeat(hash)),
         ];
         if let Some(known) = self.known {
-            columns.push(("skin", Box::new(|number, cell| known.says(number, cell.heartbeat.as_ref()?))));
+            columns.push(("skin", Box::new(|(number, cell)| known.says(*number, cell.heartbeat.as_ref()?))));
         }
-        let now = self.now;
-        columns.push(("age", Box::new(move |_, cell| Some(seconds(cell, now)))));
+        columns.push(("age", Box::new(move |(_, cell)| Some(format!("{:.2}", age_s(cell, now))))));
         columns
     }
 
     /// One line a cell; a column in which nobody has said anything is left out.
-    fn lines(&self, columns: Vec<Column<'_>>) -> String {
-        let there =
-            |(_, of): &Column<'_>| self.listing.cells().any(|(number, cell)| of(number, cell).is_some());
-        let columns: Vec<_> = columns.into_iter().filter(there).collect();
+    fn lines<'b>(&'b self, columns: impl IntoIterator<Item = Column<'b>>) -> String {
+        let cells: Vec<_> = self.listing.cells().collect();
+        let (heads, lines) = filled(columns, &cells, "-");
         let mut table = Table::new();
         table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
-        table.set_header(columns.iter().map(|(head, _)| *head));
-        for (number, cell) in self.listing.cells() {
-            table.add_row(columns.iter().map(|(_, of)| of(number, cell).unwrap_or_else(|| "-".to_owned())));
-        }
-        for (column, (head, _)) in table.column_iter_mut().zip(&columns) {
+        table.set_header(&heads).add_rows(lines);
+        for (column, head) in table.column_iter_mut().zip(&heads) {
             column.set_padding((0, 1));
-            if !matches!(*head, "state" | "ports" | "skin") {
+            if !OF_WORDS.contains(head) {
                 column.set_cell_alignment(CellAlignment::Right);
             }
         }
@@ -98,12 +105,12 @@ impl Shown<'_> {
 
     /// How many there are, and what is odd.
     fn end(&self) -> String {
-        let count = |is: &dyn Fn(&Heartbeat) -> bool| {
+        let number = |is: fn(&Heartbeat) -> bool| {
             self.listing.cells().filter(|(_, cell)| cell.heartbeat.as_ref().is_some_and(is)).count()
         };
         let all = self.listing.cells().len();
         let mut text = format!("{all} cells on {} ({})", self.bus, self.kind);
-        let (active, bare) = (count(&|it| it.state.has(State::ACTIVE)), count(&|it| !configured(it)));
+        let (active, bare) = (number(|it| it.state.has(State::ACTIVE)), number(|it| !configured(it)));
         for (count, what) in [(active, "in contact"), (bare, "without parameters")] {
             if count > 0 {
                 text += &format!(", {count} {what}");
@@ -130,60 +137,66 @@ impl Shown<'_> {
         text
     }
 
-    fn missing<'a>(&'a self, known: &'a Known) -> impl Iterator<Item = CellId> + 'a {
+    fn missing<'b>(&'b self, known: &'b Known) -> impl Iterator<Item = CellId> + 'b {
         let silent = known.cells.iter().filter(|(serial, _)| self.listing.number_of(**serial).is_none());
         silent.map(|(_, (cell, _))| *cell)
     }
 
-    fn json(&self) -> Whole<'_> {
-        let cell = |(node, cell): (u8, &Cell)| {
-            let beat = cell.heartbeat.as_ref();
-            CellShown {
-                node,
-                age_s: age_s(cell, self.now),
-                serial: beat.map(|it| it.serial),
-                configured: beat.map(configured),
-                state: beat.map(|it| names(it.state).collect()),
-                joint: beat.filter(|it| configured(it)).map(|it| it.state.joint()),
-                version: beat.map(|it| it.state.version()),
-                hash: beat.filter(|it| configured(it)).map(|it| format!("{:04X}", it.configuration)),
-                skin: self.known.and_then(|known| known.says(node, beat?)),
-                sent: beat.map(|it| it.sent),
-                refused: beat.map(|it| it.rejected),
-                heard: cell.heard.as_ref().map(HeardShown::of),
-                refused_by: cell.refused.as_ref().map(RefusedShown::of),
-                tree: cell.tree.as_ref().map(TreeShown::of),
-                ports: cell.ports.as_ref().map(|it| it.ports.iter().map(PortShown::of).collect()),
-                parent_changes: cell.ports.as_ref().map(|it| it.changes),
-                other_serial: cell.other,
-            }
-        };
-        Whole {
+    /// One object, in one line if it is one of many.
+    pub(super) fn json(&self, is_one_of_many: bool) -> Result<String, Failure> {
+        let whole = Whole {
             bus: self.bus,
-            kind: self.kind,
+            kind: &self.kind,
             gateway_heard: self.listing.has_gateway(),
-            cells: self.listing.cells().map(cell).collect(),
+            cells: self.listing.cells().map(|(node, cell)| self.cell(node, cell)).collect(),
             missing: self.known.map(|known| self.missing(known).map(CellId::get).collect()),
+        };
+        if is_one_of_many {
+            return serde_json::to_string(&whole).map(|text| text + "\n").map_err(Failure::run);
+        }
+        print::json(&whole)
+    }
+
+    fn cell(&self, node: u8, cell: &Cell) -> CellShown {
+        let beat = cell.heartbeat.as_ref();
+        CellShown {
+            node,
+            age_s: age_s(cell, self.now),
+            serial: beat.map(|it| it.serial),
+            configured: beat.map(configured),
+            state: beat.map(|it| names(it.state).collect()),
+            joint: beat.filter(|it| configured(it)).map(|it| it.state.joint()),
+            version: beat.map(|it| it.state.version()),
+            hash: beat.and_then(hash),
+            skin: self.known.and_then(|known| known.says(node, beat?)),
+            sent: beat.map(|it| it.sent),
+            refused: beat.map(|it| it.rejected),
+            heard: cell.heard,
+            refused_by: cell.refused,
+            tree: cell.tree.as_ref().map(TreeShown::of),
+            ports: cell.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
+            parent_changes: cell.ports.map(|it| it.changes),
+            other_serial: cell.other,
         }
     }
 }
 
 /// Counters, for who has the room.
-fn counters() -> Vec<Column<'static>> {
-    fn of(count: u16) -> String {
-        count.to_string()
-    }
-    vec![
-        ("sent", Box::new(|_, cell| cell.heartbeat.map(|it| of(it.sent)))),
-        ("refused", Box::new(|_, cell| cell.heartbeat.map(|it| of(it.rejected)))),
-        ("joints", Box::new(|_, cell| cell.heard.map(|it| of(it.joints)))),
-        ("late", Box::new(|_, cell| cell.heard.map(|it| of(it.joints_late)))),
-        ("torques", Box::new(|_, cell| cell.heard.map(|it| of(it.torques)))),
-        ("stimuli", Box::new(|_, cell| cell.heard.map(|it| of(it.stimuli)))),
-        ("sums", Box::new(|_, cell| cell.tree.map(|it| of(it.sent)))),
-        ("taken", Box::new(|_, cell| cell.tree.map(|it| of(it.taken)))),
-        ("dropped", Box::new(|_, cell| cell.tree.map(|it| of(it.dropped)))),
-    ]
+fn counters<'a>() -> impl Iterator<Item = Column<'a>> {
+    let counters: [Counter; 9] = [
+        ("sent", |cell| cell.heartbeat.map(|it| it.sent)),
+        ("refused", |cell| cell.heartbeat.map(|it| it.rejected)),
+        ("joints", |cell| cell.heard.map(|it| it.joints)),
+        ("late", |cell| cell.heard.map(|it| it.joints_late)),
+        ("torques", |cell| cell.heard.map(|it| it.torques)),
+        ("stimuli", |cell| cell.heard.map(|it| it.stimuli)),
+        ("sums", |cell| cell.tree.map(|it| it.sent)),
+        ("taken", |cell| cell.tree.map(|it| it.taken)),
+        ("dropped", |cell| cell.tree.map(|it| it.dropped)),
+    ];
+    counters.into_iter().map(|(head, of)| -> Column<'a> {
+        (head, Box::new(move |(_, cell)| of(cell).map(|count| count.to_string())))
+    })
 }
 
 const fn configured(heartbeat: &Heartbeat) -> bool {
@@ -199,11 +212,17 @@ fn names(state: State) -> impl Iterator<Item = &'static str> {
 fn state(state: State) -> String {
     let bare = (!state.has(State::CONFIGURED)).then_some("unconfigured");
     let others: Vec<_> = bare.into_iter().chain(names(state).filter(|name| *name != "configured")).collect();
-    if others.is_empty() { "configured".to_owned() } else { others.join(" ") }
+    if others.is_empty() { "configured".to_owned() } else { words(others) }
 }
 
-fn depth(tree: &Tree) -> Option<String> {
-    tree.parent.map(|_| tree.depth.to_string())
+/// Of a cell that has a parent.
+fn depth(tree: &Tree) -> Option<u8> {
+    tree.parent.map(|_| tree.depth)
+}
+
+/// The configuration, of a cell that has one.
+fn hash(heartbeat: &Heartbeat) -> Option<String> {
+    configured(heartbeat).then(|| format!("{:04X}", heartbeat.configuration))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "seconds")]
@@ -212,11 +231,14 @@ fn age_s(cell: &Cell, now: Micros) -> f64 {
     (cell.age(now).0 as f64 / 1e3).round() / 1e3
 }
 
-fn seconds(cell: &Cell, now: Micros) -> String {
-    format!("{:.2}", age_s(cell, now))
-}
-
 impl Known {
+    /// What a skin, from this file, says of one of its buses.
+    pub(super) fn of(skin: &Skin, bus: usize, file: String) -> Self {
+        let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
+        let cells = skin.cells_of(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
+        Self { file, format, cells: cells.collect() }
+    }
+
     /// Whether a cell is as the description has it.
     fn says(&self, number: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
@@ -239,16 +261,11 @@ fn width(text: &str) -> usize {
 /// A screen that is drawn over the last one; what does not fit is left out.
 pub(super) fn screen(text: &str) -> String {
     let rows = tcgetwinsize(std::io::stdout()).map_or(0, |size| usize::from(size.ws_row));
-    let lines: Vec<_> = text.lines().collect();
-    let all = lines.len();
-    let shown = if rows > 2 && all >= rows {
-        let mut shown: Vec<String> = lines.iter().take(rows - 2).map(|line| (*line).to_owned()).collect();
-        shown.push(format!("... and {} more lines", all - (rows - 2)));
-        shown
-    } else {
-        lines.into_iter().map(str::to_owned).collect()
-    };
-    let lines: String = shown.iter().map(|line| format!("{line}\x1b[K\n")).collect();
+    let all = text.lines().count();
+    let shown = if rows > 2 && all >= rows { rows - 2 } else { all };
+    let more = (shown < all).then(|| format!("... and {} more lines", all - shown));
+    let lines = text.lines().take(shown).chain(more.as_deref());
+    let lines: String = lines.map(|line| format!("{line}\x1b[K\n")).collect();
     format!("\x1b[H{lines}\x1b[J")
 }
 
@@ -277,47 +294,13 @@ struct CellShown {
     skin: Option<String>,
     sent: Option<u16>,
     refused: Option<u16>,
-    heard: Option<HeardShown>,
-    refused_by: Option<RefusedShown>,
+    heard: Option<Heard>,
+    refused_by: Option<Refused>,
     tree: Option<TreeShown>,
     ports: Option<Vec<PortShown>>,
     parent_changes: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
     other_serial: Option<u32>,
-}
-
-#[derive(Serialize)]
-struct HeardShown {
-    joints: u16,
-    joints_late: u16,
-    joints_repeated: u16,
-    stimuli: u16,
-    stimuli_late: u16,
-    torques: u16,
-}
-
-impl HeardShown {
-    const fn of(it: &Heard) -> Self {
-        let Heard { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques } = *it;
-        Self { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }
-    }
-}
-
-#[derive(Serialize)]
-struct RefusedShown {
-    length: u16,
-    crc: u16,
-    foreign: u16,
-    meaning: u16,
-    incomplete: u16,
-    stimuli: u16,
-}
-
-impl RefusedShown {
-    const fn of(it: &Refused) -> Self {
-        let Refused { length, crc, foreign, meaning, incomplete, stimuli } = *it;
-        Self { length, crc, foreign, meaning, incomplete, stimuli }
-    }
 }
 
 #[derive(Serialize)]
@@ -332,9 +315,8 @@ struct TreeShown {
 
 impl TreeShown {
     fn of(it: &Tree) -> Self {
-        let Tree { parent, depth, sent, taken, dropped, .. } = *it;
-        let depth = parent.map(|_| depth);
-        Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
+        let Tree { parent, sent, taken, dropped, .. } = *it;
+        Self { parent, depth: depth(it), sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
     }
 }
 

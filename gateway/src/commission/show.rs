@@ -2,15 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use bench::commission::Done;
 use model::commission::{CellReport, Outcome, Stranger};
-use protocol::usage::{Failure, print};
+use protocol::usage::Failure;
 use serde::Serialize;
 
-use super::work::Done;
-use crate::print::Rows;
+use crate::print::{Rows, some};
 
-/// Names in a line; of more, the first few and how many there are.
-const NAMES: usize = 12;
 /// Cells with other numbers that get a line each.
 const LINES: usize = 8;
 
@@ -121,17 +119,12 @@ impl BusShown {
             count => format!("{count} others, left alone"),
         };
         rows.section(format!("{} ({})", self.name, self.kind), cells, others);
-        for (name, count, beside) in [
-            ("written", self.written, "read back, and compared word by word"),
-            ("already so", self.already_so, "by their hash; --verify reads them back"),
-            ("already so, verified", self.verified, "read back, and compared word by word"),
-            ("would be written", self.would_write, ""),
-            ("failed", self.failed, ""),
-        ] {
-            if count > 0 {
-                rows.row(name, count, beside);
-            }
-        }
+        let compared = "read back, and compared word by word";
+        rows.any("written", self.written, compared);
+        rows.any("already so", self.already_so, "by their hash; --verify reads them back");
+        rows.any("already so, verified", self.verified, compared);
+        rows.any("would be written", self.would_write, "");
+        rows.any("failed", self.failed, "");
         // One row for each reason, whatever the number of cells.
         let mut reasons = BTreeMap::<&str, Vec<String>>::new();
         for cell in &self.cells {
@@ -146,15 +139,9 @@ impl BusShown {
             rows.row("ended", failure, "");
         }
         let moved = self.moved().count();
-        if moved > 0 {
-            rows.row("under another number", moved, "than in the description; --numbers writes a copy");
-        }
-        if self.requests > 0 {
-            rows.row("requests", self.requests, format!("{} said again", self.repeated));
-        }
-        if self.frames_dropped > 0 {
-            rows.row("frames lost", self.frames_dropped, "they came faster than they were read");
-        }
+        rows.any("under another number", moved, "than in the description; --numbers writes a copy");
+        rows.any("requests", self.requests, format!("{} said again", self.repeated));
+        rows.any("frames lost", self.frames_dropped, "they came faster than they were read");
     }
 }
 
@@ -165,31 +152,24 @@ impl Whole {
         let mut notes = Vec::new();
         for bus in &self.buses {
             let name = &bus.name;
-            let strangers = bus.strangers.iter().filter(|it| it.belongs_to.is_none());
-            let strangers: Vec<_> =
-                strangers.map(|it| format!("{} (serial number {})", it.node, it.serial)).collect();
-            if !strangers.is_empty() {
-                notes.push(format!(
-                    "cells on {name} that {file} does not have, left alone: {}",
-                    some(&strangers)
-                ));
-            }
-            for it in bus.strangers.iter() {
-                if let Some(other) = &it.belongs_to {
-                    let (node, serial) = (it.node, it.serial);
-                    notes.push(format!(
+            let [mut strangers, mut elsewhere] = [Vec::new(), Vec::new()];
+            for StrangerShown { node, serial, belongs_to } in &bus.strangers {
+                match belongs_to {
+                    None => strangers.push(format!("{node} (serial number {serial})")),
+                    Some(other) => elsewhere.push(format!(
                         "cell {node} on {name} (serial number {serial}) belongs to {other} by {file}; left alone"
-                    ));
+                    )),
                 }
             }
+            if !strangers.is_empty() {
+                let strangers = some(&strangers);
+                notes.push(format!("cells on {name} that {file} does not have, left alone: {strangers}"));
+            }
+            notes.extend(elsewhere);
             let moved = bus.moved().count();
-            if moved > LINES && !has_copy {
-                notes.push(format!(
-                    "{moved} cells have other numbers on {name} than in {file}; --numbers FILE writes a copy with \
-                     theirs"
-                ));
-            } else if moved > LINES {
-                notes.push(format!("{moved} cells have other numbers on {name} than in {file}"));
+            if moved > LINES {
+                let copy = if has_copy { "" } else { "; --numbers FILE writes a copy with theirs" };
+                notes.push(format!("{moved} cells have other numbers on {name} than in {file}{copy}"));
             } else {
                 notes.extend(bus.moved().map(|(node, CellShown { serial, described, .. })| {
                     format!("the cell with serial number {serial} is {node} on {name}, {described} in {file}")
@@ -199,21 +179,17 @@ impl Whole {
         notes
     }
 
-    pub(super) fn print(&self, json: bool) -> Result<(), Failure> {
-        if json {
-            let text = serde_json::to_string_pretty(self).map_err(Failure::run)?;
-            return print(&format!("{text}\n"));
-        }
+    /// A table for people.
+    pub(super) fn table(&self) -> String {
         let cells = self.buses.iter().map(|bus| bus.cells.len()).sum::<usize>();
         let ended = match (self.interrupted, self.dry_run) {
             (true, _) => "interrupted",
             (false, true) => "dry run, nothing was written",
             (false, false) => "done",
         };
-        let head = format!("{cells} cells, {:.1} s, {ended}", self.seconds);
-        let mut rows = Rows::new([self.skin.clone(), head, String::new()]);
+        let mut rows = Rows::new(&self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
         self.buses.iter().for_each(|bus| bus.rows(&mut rows));
-        print(&format!("{}\n", rows.table()))
+        rows.text()
     }
 
     /// How it ends, when all has been shown.
@@ -233,10 +209,4 @@ impl Whole {
             }
         }
     }
-}
-
-/// A few names, or the first of many.
-pub(crate) fn some(names: &[String]) -> String {
-    let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
-    few.map_or_else(|| names.join(", "), |few| format!("{}, ... ({} in all)", few.join(", "), names.len()))
 }

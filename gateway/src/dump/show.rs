@@ -35,13 +35,6 @@ pub(super) enum How {
     Stats(Box<Stats>),
 }
 
-/// Whether there is more to be shown.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Flow {
-    More,
-    Enough,
-}
-
 /// A frame of which it is not known yet what it is.
 struct Waiting {
     time: Timestamp,
@@ -74,7 +67,7 @@ impl<W: Write> Show<W> {
     }
 
     /// Takes the next frame; it is shown if it is wanted, as soon as it is known what it is.
-    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<Flow> {
+    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<()> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
             self.bus = Arc::from(interface);
@@ -85,13 +78,13 @@ impl<W: Write> Show<W> {
     }
 
     /// It is that late, and no frame came.
-    pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<Flow> {
+    pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
         self.settled()
     }
 
     /// No more frames follow.
-    pub(super) fn finish(&mut self) -> io::Result<Flow> {
+    pub(super) fn finish(&mut self) -> io::Result<()> {
         self.settler.finish();
         self.settled()
     }
@@ -102,13 +95,18 @@ impl<W: Write> Show<W> {
     }
 
     /// Shows what is known by now.
-    fn settled(&mut self) -> io::Result<Flow> {
+    fn settled(&mut self) -> io::Result<()> {
         while self.left > 0
             && let Some((Waiting { time, bus, frame, direction }, decoded)) = self.settler.pop()
         {
             self.show(&Record { time, interface: &bus, frame, direction }, decoded)?;
         }
-        Ok(if self.left == 0 { Flow::Enough } else { Flow::More })
+        Ok(())
+    }
+
+    /// Whether no more frames are to be shown.
+    pub(super) const fn has_enough(&self) -> bool {
+        self.left == 0
     }
 
     /// Shows a frame if it is wanted.

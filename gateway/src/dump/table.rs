@@ -1,31 +1,25 @@
 //! The numbers of a capture as tables.
 
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
-use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use comfy_table::Table;
 use trace::capture::{Extras, Topic};
 
-use crate::print::Rows;
+use crate::print::{self, Rows, decimals, filled, list, or, words};
 
 /// All of it: what the capture is, each bus, and each bus' cells.
 pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
-    let mut rows = Rows::new([name.to_owned(), head, format!("{} frames", report.frames)]);
-    if report.times_backwards > 0 {
-        rows.row("frames before the one before them", report.times_backwards, "times run backwards");
-    }
-    if report.dropped > 0 {
-        rows.row("frames missing", report.dropped, "lost by whoever took the capture");
-    }
-    if report.frames_of_other_buses > 0 {
-        rows.row("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
-    }
+    let mut rows = Rows::new(name, head, format!("{} frames", report.frames));
+    rows.any("frames before the one before them", report.times_backwards, "times run backwards");
+    rows.any("frames missing", report.dropped, "lost by whoever took the capture");
+    rows.any("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
     for bus in &report.buses {
         numbers(&mut rows, bus);
     }
     if let Some(extras) = extras {
         beside(&mut rows, extras);
     }
-    let mut text = format!("{}\n", rows.table());
+    let mut text = rows.text();
     for bus in &report.buses {
         if !bus.cells.is_empty() {
             text += &format!("\n{}\n", cells(bus));
@@ -38,7 +32,7 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
 }
 
 fn per_s(rate: Option<f64>) -> String {
-    rate.map(|rate| format!("{rate:.1} a second")).unwrap_or_default()
+    or(rate.map(|rate| format!("{rate:.1} a second")), "")
 }
 
 fn numbers(rows: &mut Rows, bus: &BusReport) {
@@ -49,27 +43,19 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
     let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
         let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "begun anew")];
-        let odd = odd.map(|(count, what)| format!("{count} {what}")).join(", ");
+        let odd = list(odd.map(|(count, what)| format!("{count} {what}")));
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
-    if bus.wires > 0 {
-        rows.row("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s)));
-    }
+    rows.any("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s)));
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
-    let reasons: Vec<_> = refused.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
-    let total: u64 = refused.iter().map(|(_, count)| count).sum();
-    rows.row("damaged or refused", total, reasons.join(", "));
+    let reasons = list(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
+    rows.row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
     rows.row("foreign", bus.foreign.frames, "");
-    let of = [
-        (standard, "  11-bit identifiers"),
-        (extended, "  29-bit identifiers"),
-        (remote, "  remote frames"),
-        (error, "  error frames"),
-    ];
-    for (frames, of) in of.into_iter().filter(|(frames, _)| *frames > 0) {
-        rows.row(of, frames, "");
-    }
+    rows.any("  11-bit identifiers", standard, "");
+    rows.any("  29-bit identifiers", extended, "");
+    rows.any("  remote frames", remote, "");
+    rows.any("  error frames", error, "");
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
         rows.row("  packets by chance", chance, "expected");
@@ -99,89 +85,63 @@ const FOREIGN: usize = 40;
 
 /// One line a foreign identifier, those with the most frames.
 fn foreign(bus: &BusReport) -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    let head = format!("{} foreign", bus.bus);
-    table.set_header([head.as_str(), "frames", "per s", "first s", "last s", "bytes", ""]);
-    for id in bus.foreign.identifiers.iter().take(FOREIGN) {
-        let ForeignId { bytes_min, bytes_max, .. } = *id;
-        let bytes =
-            if bytes_min == bytes_max { bytes_min.to_string() } else { format!("{bytes_min}..{bytes_max}") };
+    let head = [&format!("{} foreign", bus.bus), "frames", "per s", "first s", "last s", "bytes", ""];
+    let line = |id: &ForeignId| {
+        let (least, most) = (id.bytes_min, id.bytes_max);
+        let bytes = if least == most { least.to_string() } else { format!("{least}..{most}") };
         let what = match id.of {
             FrameType::Data if id.wrong_crc > 0 => format!("{} wrong CRC", id.wrong_crc),
             FrameType::Data => String::new(),
             FrameType::Remote => "remote".to_owned(),
             FrameType::Error => "error".to_owned(),
         };
-        table.add_row([
-            id.id.clone(),
-            id.frames.to_string(),
-            id.frames_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default(),
-            format!("{:.3}", id.first_s),
-            format!("{:.3}", id.last_s),
-            bytes,
-            what,
-        ]);
-    }
-    let further = bus.foreign.identifiers.iter().skip(FOREIGN);
+        let [first, last] = [id.first_s, id.last_s].map(|s| format!("{s:.3}"));
+        vec![id.id.clone(), id.frames.to_string(), decimals(id.frames_per_s, 1, ""), first, last, bytes, what]
+    };
+    let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
+    let mut lines: Vec<_> = identifiers.iter().take(FOREIGN).map(line).collect();
+    let further = identifiers.iter().skip(FOREIGN);
     let count = further.len();
-    let frames = further.map(|id| id.frames).sum::<u64>() + bus.foreign.frames_of_other_identifiers;
+    let frames = further.map(|id| id.frames).sum::<u64>() + unknown;
     if frames > 0 {
-        let more = if bus.foreign.frames_of_other_identifiers > 0 { "more than " } else { "" };
-        table.add_row([format!("{more}{count} further"), frames.to_string()]);
+        let more = if *unknown > 0 { "more than " } else { "" };
+        lines.push(vec![format!("{more}{count} further"), frames.to_string()]);
     }
-    for column in table.column_iter_mut().take(6) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
-    table
+    print::table(head, lines, |column| column < 6)
 }
 
-/// What stands in a column: its head, and a cell's text there.
-type Column = (&'static str, fn(&CellReport) -> String);
+/// What stands in a column: its head, and a cell's text there, if it has any.
+type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 
 /// One line a cell. What no cell has (missed, lost, ...) has no column.
 fn cells(bus: &BusReport) -> Table {
     // What is not there is no zero.
-    fn some(count: u64) -> String {
-        if count == 0 { String::new() } else { count.to_string() }
+    fn some(count: u64) -> Option<String> {
+        (count > 0).then(|| count.to_string())
     }
-    let columns: [Column; 15] = [
-        ("torques", |cell| cell.torques.to_string()),
-        ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}")).unwrap_or_default()),
-        ("epochs", |cell| match (cell.first_epoch, cell.last_epoch) {
-            (Some(first), Some(last)) => format!("{first}..{last}"),
-            (_, _) => String::new(),
-        }),
+    const STATE: &str = "last state";
+    let columns: [Column<'_>; 16] = [
+        (&bus.bus, |cell| Some(cell.node.to_string())),
+        ("torques", |cell| Some(cell.torques.to_string())),
+        ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
+        ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
         ("missed", |cell| some(cell.missed)),
         ("twice", |cell| some(cell.repeated)),
         ("sums", |cell| some(cell.sums)),
         ("again", |cell| some(cell.resent)),
-        ("parent", |cell| match cell.parent {
-            None => String::new(),
-            Some(0) => "gateway".to_owned(),
-            Some(parent) => parent.to_string(),
+        ("parent", |cell| match cell.parent? {
+            0 => Some("gateway".to_owned()),
+            parent => Some(parent.to_string()),
         }),
-        ("depth", |cell| cell.depth.map(|depth| depth.to_string()).unwrap_or_default()),
+        ("depth", |cell| cell.depth.map(|depth| depth.to_string())),
         ("satur.", |cell| some(cell.saturated)),
-        ("beats", |cell| cell.heartbeats.to_string()),
-        ("refused", |cell| cell.refused.map(|refused| some(refused.into())).unwrap_or_default()),
+        ("beats", |cell| Some(cell.heartbeats.to_string())),
+        ("refused", |cell| some(cell.refused?.into())),
         ("lost", |cell| some(cell.lost)),
         ("starts", |cell| some(cell.restarts)),
-        ("last state", |cell| cell.state.join(" ")),
+        (STATE, |cell| Some(words(&cell.state)).filter(|state| !state.is_empty())),
     ];
-    let there = |(_, text): &Column| bus.cells.iter().any(|cell| !text(cell).is_empty());
-    let columns: Vec<_> = columns.into_iter().filter(there).collect();
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header(std::iter::once(bus.bus.as_str()).chain(columns.iter().map(|(head, _)| *head)));
-    for cell in &bus.cells {
-        table.add_row(
-            std::iter::once(cell.node.to_string()).chain(columns.iter().map(|(_, text)| text(cell))),
-        );
-    }
-    let states = columns.last().is_some_and(|(head, _)| *head == "last state");
-    for column in table.column_iter_mut().take(columns.len() + usize::from(!states)) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
-    table
+    let (heads, lines) = filled(columns, &bus.cells, "");
+    let of_words = heads.iter().rposition(|head| *head == STATE);
+    print::table(heads, lines, |column| Some(column) != of_words)
 }

@@ -15,8 +15,8 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::arguments::Programs;
 use crate::buses::Buses;
-use crate::programs::Programs;
 
 /// Where benches are run, and with what.
 #[derive(Debug)]

@@ -1,7 +1,8 @@
 //! An explanation as tables.
 
 use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
-use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+
+use crate::print::{self, decimals, or};
 
 /// Which part is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -24,15 +25,13 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
             "{name}: joints of epoch {epoch} on {}, {at} s after the first frame{halted}\n",
             bus.bus
         );
-        let mut table = table();
-        let joints = (1..=bus.position_words.len()).map(|joint| format!("joint {joint}"));
-        table.set_header(std::iter::once(String::new()).chain(joints));
-        table
-            .add_row(std::iter::once("word".to_owned()).chain(bus.position_words.iter().map(i16::to_string)));
-        table.add_row(
-            std::iter::once("rad".to_owned()).chain(bus.position_rad.iter().map(|rad| format!("{rad:.4}"))),
-        );
-        text += &right(table, false);
+        let line = |name: &str, values: &mut dyn Iterator<Item = String>| {
+            [name.to_owned()].into_iter().chain(values).collect::<Vec<_>>()
+        };
+        let head = line("", &mut (1..=bus.position_words.len()).map(|joint| format!("joint {joint}")));
+        let words = line("word", &mut bus.position_words.iter().map(i16::to_string));
+        let angles = line("rad", &mut bus.position_rad.iter().map(|rad| format!("{rad:.4}")));
+        text += &table(head, [words, angles], false);
     }
     let cells = &explanation.cells;
     match (what, cells.as_slice()) {
@@ -57,24 +56,14 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
     text
 }
 
-fn table() -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    table
-}
-
-/// The table with its columns to the right, but the first and, where that is of words, the last; close together, so
+/// A table with its columns to the right, but the first and, where that is of words, the last; close together, so
 /// that it fits on 80 columns.
-fn right(mut table: Table, words_at_the_end: bool) -> String {
-    let count = table.column_count();
-    let last = count.saturating_sub(usize::from(words_at_the_end));
+fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
+    let count = head.len();
+    let numbers = |index| index > 0 && index < count.saturating_sub(usize::from(words_at_the_end));
+    let mut table = print::table(head, rows, numbers);
     for (index, column) in table.column_iter_mut().enumerate() {
-        let numbers = index > 0 && index < last;
-        let at_the_end = index + 1 == count;
-        column.set_padding((1, u16::from(!numbers || at_the_end)));
-        if numbers {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
+        column.set_padding((1, u16::from(!numbers(index) || index + 1 == count)));
     }
     format!("{table}\n")
 }
@@ -90,27 +79,28 @@ fn millis(nanos: u64) -> String {
 }
 
 fn one_line_each(cells: &[CellExplained]) -> String {
-    let mut table = table();
     // Joints beyond those that move any of them have nothing but zeros, if all is well.
     let odd = |row: &&Row| row.word.is_some_and(|word| word != 0);
     let odd = cells.iter().flat_map(|cell| cell.rows.iter().filter(odd)).map(|row| row.joint);
     let joints = cells.iter().map(|cell| cell.joint).chain(odd).max().map_or(0, usize::from);
     let names = Names::of(cells);
-    let head = [names.head(), "F_z N".to_owned()].into_iter();
-    let head = head.chain((1..=joints).map(|joint| format!("Nm {joint}")));
-    table.set_header(head.chain(["off".to_owned(), "which is".to_owned()]));
-    for cell in cells {
-        let force =
-            cell.force.as_ref().map_or_else(|| "?".to_owned(), |force| format!("{:.3}", force.force_n));
-        let head = [names.of_cell(cell), force];
-        let words = cell.rows.iter().take(joints);
-        let words = words.map(|row| row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.4}")));
-        table.add_row(head.into_iter().chain(words).chain([steps_off(&cell.rows), worst(&cell.rows)]));
-    }
+    let mut head = vec![names.head(), "F_z N".to_owned()];
+    head.extend((1..=joints).map(|joint| format!("Nm {joint}")));
+    head.extend(["off", "which is"].map(str::to_owned));
+    let lines = cells.iter().map(|cell| {
+        let mut line = vec![names.of_cell(cell), decimals(force_of(cell), 3, "?")];
+        line.extend(cell.rows.iter().take(joints).map(|row| decimals(row.word_nm, 4, "-")));
+        line.extend([steps_off(&cell.rows), worst(&cell.rows)]);
+        line
+    });
     format!(
         "\nwhat cells said in Nm, and by how many steps of 2^-12 at most; --cell shows how\n{}",
-        right(table, true)
+        table(head, lines, true)
     )
+}
+
+fn force_of(cell: &CellExplained) -> Option<f64> {
+    cell.force.as_ref().map(|force| force.force_n)
 }
 
 /// How cells are called: by their numbers, and by their bus where there are several.
@@ -137,12 +127,9 @@ fn name(cell: &CellExplained) -> String {
 
 /// The differences of a cell's words from the nearest steps.
 fn steps_off(rows: &[Row]) -> String {
-    let mut off: Vec<_> = rows.iter().filter_map(|row| row.difference_steps).collect();
-    if off.is_empty() {
-        return "?".to_owned();
-    }
-    off.sort_unstable_by_key(|steps| steps.abs());
-    off.last().map(|steps| sign(*steps)).unwrap_or_default()
+    // The last of those that are as far off.
+    let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
+    or(most.map(sign), "?")
 }
 
 fn sign(steps: i32) -> String {
@@ -263,67 +250,43 @@ fn joint(cells: &[CellExplained]) -> String {
 
 /// Joints of cells, each in a line.
 fn rows(cells: &[CellExplained], by_cell: bool) -> String {
-    let mut table = table();
     let names = Names::of(cells);
     let first = if by_cell { names.head() } else { "joint".to_owned() };
-    let head = [first.as_str(), "J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"];
-    let force = by_cell.then_some("F_z N");
-    table.set_header(head.into_iter().take(1).chain(force).chain(head.into_iter().skip(1)));
-    let number = |value: Option<f64>, decimals: usize| {
-        value.map_or_else(|| "?".to_owned(), |value| format!("{value:.decimals$}"))
+    let mut head = vec![first];
+    head.extend(by_cell.then(|| "F_z N".to_owned()));
+    head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
+    let line = |cell: &CellExplained, row: &Row| {
+        let mut line = vec![if by_cell { names.of_cell(cell) } else { row.joint.to_string() }];
+        line.extend(by_cell.then(|| decimals(force_of(cell), 2, "?")));
+        line.extend([
+            decimals(row.jacobian_m, 6, "?"),
+            decimals(row.product_nm, 6, "?"),
+            or(row.nearest_word, "-"),
+            or(row.word, "-"),
+            decimals(row.word_nm, 6, "-"),
+            or(row.difference_steps.map(sign), "?"),
+            long(&row.verdict),
+        ]);
+        line
     };
-    for cell in cells {
-        for row in &cell.rows {
-            let first = if by_cell { names.of_cell(cell) } else { row.joint.to_string() };
-            let force = by_cell.then(|| number(cell.force.as_ref().map(|force| force.force_n), 2));
-            let word = |word: Option<i16>| word.map_or_else(|| "-".to_owned(), |word| word.to_string());
-            let rest = [
-                number(row.jacobian_m, 6),
-                number(row.product_nm, 6),
-                word(row.nearest_word),
-                word(row.word),
-                row.word_nm.map_or_else(|| "-".to_owned(), |word| format!("{word:.6}")),
-                row.difference_steps.map_or_else(|| "?".to_owned(), sign),
-                long(&row.verdict),
-            ];
-            table.add_row(std::iter::once(first).chain(force).chain(rest));
-        }
-    }
-    right(table, true) + &legend(cells)
+    let lines = cells.iter().flat_map(|cell| cell.rows.iter().map(move |row| (cell, row)));
+    table(head, lines.map(|(cell, row)| line(cell, row)), true) + &legend(cells)
 }
 
 fn totals(total: &[Total]) -> String {
-    let mut table = table();
-    table.set_header(["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"]);
-    for Total {
-        joint,
-        word_steps,
-        words_nm,
-        products_nm,
-        central_nm,
-        unrounded_nm,
-        difference_nm,
-        saturated,
-        open,
-    } in total
-    {
-        let difference = match (open, saturated) {
-            (0, 0) => format!("{difference_nm:+.6}"),
+    let head = ["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];
+    let lines = total.iter().map(|it| {
+        let difference = match (it.open, it.saturated) {
+            (0, 0) => format!("{:+.6}", it.difference_nm),
             (0, saturated) => format!("{saturated} saturated"),
             (open, _) => format!("{open} not known"),
         };
-        table.add_row([
-            joint.to_string(),
-            word_steps.to_string(),
-            format!("{words_nm:.6}"),
-            format!("{products_nm:.6}"),
-            format!("{central_nm:.6}"),
-            difference,
-            format!("{unrounded_nm:.6}"),
-        ]);
-    }
+        let [words, products] = [it.words_nm, it.products_nm].map(|nm| format!("{nm:.6}"));
+        let [central, unrounded] = [it.central_nm, it.unrounded_nm].map(|nm| format!("{nm:.6}"));
+        vec![it.joint.to_string(), it.word_steps.to_string(), words, products, central, difference, unrounded]
+    });
     format!(
         "\nthe whole skin: the words of the frames added up, beside the central computation\n{}",
-        right(table, false)
+        table(head.map(str::to_owned).to_vec(), lines, false)
     )
 }

@@ -4,44 +4,41 @@ use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};
 use analysis::fit::verdict::{Answer, percent};
 use analysis::fit::{BusFit, Judged, Row, Whole, name};
-use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 
-use super::super::print::Rows;
+use crate::print::{self, Rows, count, decimals, list, or};
+
+/// The columns of the table over bit rates.
+const HEAD: [&str; 8] = [
+    "bit rates",
+    "packet\nµs",
+    "load\n%",
+    "last\nms",
+    "cells\na bus",
+    "buses\nneeded",
+    "roots:\nload %",
+    "roots:\nlast ms",
+];
 
 /// A line for each of several bit rates.
 pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     let Some(first) = rows.first() else { return String::new() };
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header([
-        "bit rates",
-        "packet\nµs",
-        "load\n%",
-        "last\nms",
-        "cells\na bus",
-        "buses\nneeded",
-        "roots:\nload %",
-        "roots:\nlast ms",
-    ]);
-    for row in rows {
+    let lines = rows.iter().map(|row| {
         let BusFit { judged, most, answers, .. } = &row.fullest;
         let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
-        table.add_row([
+        vec![
             name(judged.case.format, judged.case.rates),
             micros(judged.case.packet_ns()),
             tenths(judged.load.total()),
             ms(judged),
             most.in_time().to_string(),
             row.need.in_short(),
-            roots.map_or_else(String::new, |it| tenths(it.load.total())),
-            roots.map_or_else(String::new, ms),
-        ]);
-    }
-    for column in table.column_iter_mut().skip(1) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
+            or(roots.map(|it| tenths(it.load.total())), ""),
+            or(roots.map(ms), ""),
+        ]
+    });
+    let table = print::table(HEAD, lines, |column| column > 0);
     let case = &first.fullest.judged.case;
     let cells = skin.cells.len();
     let bus = match skin.buses.len() {
@@ -70,7 +67,7 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     let case = &first.judged.case;
     let period = format!("joints every {} ms", millis(case.period_ns));
     let computation = format!("a cell computes {} µs", micros(case.computation_ns));
-    let mut rows = Rows::new([skin.name.clone(), period, computation]).names_in_one_line();
+    let mut rows = Rows::new(&skin.name, period, computation).names_in_one_line();
     for bus in buses {
         section(&mut rows, bus);
     }
@@ -79,11 +76,11 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
         rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
         rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
         for (buses, judged) in &whole.spread {
-            let on = format!("{} of {} cells", count(*buses), judged.case.answers.cells());
+            let on = format!("{} of {} cells", count(*buses, "bus"), judged.case.answers.cells());
             rows.row(on, figures(judged), judged.verdict());
         }
     }
-    format!("{}\n", rows.table())
+    rows.text()
 }
 
 fn section(rows: &mut Rows, bus: &BusFit) {
@@ -100,13 +97,12 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     ];
     let parts =
         parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", tenths(*share)));
-    rows.row("  load", percent(load.total()), parts.collect::<Vec<_>>().join(", "));
+    rows.row("  load", percent(load.total()), list(parts));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let due = format!("due after {} ms", millis(case.deadline_ns()));
-    rows.row("last answer", last(judged), [due].into_iter().chain(bounds).collect::<Vec<_>>().join(", "));
-    let heartbeat =
-        times.heartbeat_ns.map_or_else(|| "no bound".to_owned(), |ns| format!("{} ms", millis(ns)));
+    rows.row("last answer", last(judged), list([due].into_iter().chain(bounds)));
+    let heartbeat = or(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
     rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.row("cells that fit", most.in_time().min(most.nodes), others);
@@ -162,31 +158,27 @@ fn last(judged: &Judged) -> String {
 /// The last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn ms(judged: &Judged) -> String {
-    judged.times.last_ns().map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
+    decimals(judged.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 
 fn needed(need: &Need) -> String {
-    let why: Vec<_> = need.binding().into_iter().map(Limit::name).collect();
-    need.buses().map_or_else(
-        || format!("none: {}", why.join(", ")),
-        |buses| if buses == 1 { "1".to_owned() } else { format!("{buses}: {}", why.join(", ")) },
-    )
+    let why = list(need.binding().into_iter().map(Limit::name));
+    match need.buses() {
+        None => format!("none: {why}"),
+        Some(1) => "1".to_owned(),
+        Some(buses) => format!("{buses}: {why}"),
+    }
 }
 
 fn each_need(need: &Need) -> String {
-    let of = |name: &str, buses: Option<u32>| {
-        buses.map_or_else(|| format!("{name} no number"), |buses| format!("{name} {buses}"))
-    };
-    [of("bandwidth", need.bandwidth), of("deadline", need.deadline), of("nodes", need.nodes)].join(", ")
-}
-
-fn count(buses: u32) -> String {
-    if buses == 1 { "1 bus".to_owned() } else { format!("{buses} buses") }
+    let needs = [("bandwidth", need.bandwidth), ("deadline", need.deadline), ("nodes", need.nodes)];
+    list(needs.map(|(name, buses)| format!("{name} {}", or(buses, "no number"))))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn millis(ns: u64) -> String {
-    trimmed(ns as f64 / 1e6, 2)
+    // Two decimals at most, and no zeros at the end.
+    format!("{:.2}", ns as f64 / 1e6).trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
@@ -197,10 +189,4 @@ fn micros(ns: u64) -> String {
 /// A share in %, in a column or a list of them.
 fn tenths(share: f64) -> String {
     format!("{:.1}", 100.0 * share)
-}
-
-/// So many decimals at most, and no zeros at the end.
-fn trimmed(value: f64, decimals: usize) -> String {
-    let text = format!("{value:.decimals$}");
-    text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }

@@ -9,7 +9,7 @@ use analysis::shadow::{
     Stretches,
 };
 
-use crate::print::Rows;
+use crate::print::{Rows, list, or};
 
 /// Writes the frames of which it is known what became of them, one object a line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -75,14 +75,12 @@ fn decimal(line: &mut Vec<u8>, mut number: u64, digits: usize) {
 pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
-    let mut rows = Rows::new([name.to_owned(), head, beside]).names_in_one_line();
+    let mut rows = Rows::new(name, head, beside).names_in_one_line();
     for bus in &report.buses {
         one(&mut rows, bus, report.bit_error_rate);
     }
-    if report.frames_of_other_buses > 0 {
-        rows.row("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
-    }
-    format!("{}\n", rows.table())
+    rows.any("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    rows.text()
 }
 
 fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
@@ -103,18 +101,10 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     bench(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    if bus.error_frames > 0 {
-        rows.row("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
-    }
-    if bus.out_of_order > 0 {
-        rows.row("out of order, and sorted", bus.out_of_order, of_all(bus.out_of_order));
-    }
-    if bus.too_late_to_sort > 0 {
-        rows.row("  too far for that", bus.too_late_to_sort, "they count at a later time");
-    }
-    if bus.no_room > 0 {
-        rows.row("never sent", bus.no_room, "4 million frames waited already");
-    }
+    rows.any("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
+    rows.any("out of order, and sorted", bus.out_of_order, of_all(bus.out_of_order));
+    rows.any("  too far for that", bus.too_late_to_sort, "they count at a later time");
+    rows.any("never sent", bus.no_room, "4 million frames waited already");
 }
 
 /// Whether it fits, at most and in this run.
@@ -179,7 +169,7 @@ fn bench(rows: &mut Rows, bus: &BusShadow) {
     let name = if bus.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
-    rows.row(name, format!("{} frames", bus.bench.total()), parts.collect::<Vec<_>>().join(", "));
+    rows.row(name, format!("{} frames", bus.bench.total()), list(parts));
 }
 
 fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
@@ -196,20 +186,18 @@ fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
 }
 
 fn share(share: Option<f64>) -> String {
-    share.map_or_else(|| "?".to_owned(), percent)
+    or(share.map(percent), "?")
 }
 
 fn answers(rows: &mut Rows, replies: &Replies) {
     let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
     rows.row("answers after joints, µs", delays(after_joints_us), "half / 99 % / greatest");
-    let mut beside = vec!["after the next joints".to_owned()];
-    if *late_when_ready > 0 {
-        beside.push(format!("{late_when_ready} were ready too late for any bus"));
-    }
-    if *late_before > 0 {
-        beside.push(format!("{late_before} more were late in the recording already"));
-    }
-    rows.row("  late", format!("{late} of {count}"), beside.join(", "));
+    let beside = [
+        Some("after the next joints".to_owned()),
+        (*late_when_ready > 0).then(|| format!("{late_when_ready} were ready too late for any bus")),
+        (*late_before > 0).then(|| format!("{late_before} more were late in the recording already")),
+    ];
+    rows.row("  late", format!("{late} of {count}"), list(beside.into_iter().flatten()));
 }
 
 fn delays(delays: &Delays) -> String {

@@ -39,6 +39,7 @@ pub struct Heartbeat {
 
 /// Page 1: what became of what was heard, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct Heard {
     /// Joints taken and answered if in contact.
     pub joints: u16,
@@ -56,6 +57,7 @@ pub struct Heard {
 
 /// Page 2: frames refused, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct Refused {
     /// Neither 16 bytes FD nor 8 bytes classic, as the bus has it.
     pub length: u16,

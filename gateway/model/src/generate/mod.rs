@@ -6,32 +6,26 @@
 mod arm;
 mod text;
 
-use clap::{Args, ValueEnum};
+pub use protocol::can::Format;
 use protocol::document::DocumentError;
 use protocol::id::CellId;
 use protocol::skin::Skin;
 use thiserror::Error;
 
 /// What to describe.
-#[derive(Args, Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Wanted {
-    /// The robot that wears the skin
-    #[arg(long, value_enum, default_value = "ur5")]
+    /// The robot that wears the skin.
     pub robot: Robot,
-    /// How many cells, 1 to 254 a bus
-    #[arg(long, default_value_t = 253)]
+    /// How many cells, 1 to 254 a bus.
     pub cells: usize,
-    /// How many buses; cells of one bus lie together
-    #[arg(long, default_value_t = 1)]
+    /// How many buses; cells of one bus lie together.
     pub buses: usize,
-    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop
-    #[arg(long, default_value_t = 62.5)]
+    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop.
     pub broadcast_hz: f64,
-    /// What the cells answer with
-    #[arg(long, value_enum, default_value = "torque")]
+    /// What the cells answer with.
     pub reply: Reply,
-    /// What their packets travel in
-    #[arg(long, value_enum, default_value = "fd")]
+    /// What their packets travel in.
     pub format: Format,
 }
 
@@ -49,28 +43,19 @@ impl Default for Wanted {
 }
 
 /// A robot whose arm is known.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Robot {
     /// Universal Robots UR5
     Ur5,
 }
 
 /// What the cells answer with.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reply {
     /// Each cell its own torque
     Torque,
     /// Sums along the tree
     Sum,
-}
-
-/// What a packet travels in.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, ValueEnum)]
-pub enum Format {
-    /// One CAN FD frame
-    Fd,
-    /// Two classic frames
-    Classic,
 }
 
 /// Why a skin cannot be described.

@@ -119,7 +119,7 @@ fn the_reply_and_the_format_are_the_wanted_ones() {
     let skin = skin(&wanted);
     assert_eq!(skin.timing.ticks_per_broadcast, 10);
     for bus in &skin.buses {
-        assert_eq!(bus.format, protocol::can::Format::Classic);
+        assert_eq!(bus.format, Format::Classic);
         // 15 ms for no more than 20 slots.
         assert!(
             matches!(bus.reply, protocol::skin::Reply::Sum { slot_us: 750..2_000, carry: true }),

@@ -39,6 +39,9 @@ const GRAIN_S: f64 = 0.002;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReportError {
+    /// It cannot be opened, or is something else.
+    #[error(transparent)]
+    Open(CaptureError),
     /// It cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
@@ -112,7 +115,7 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
 
 /// Reads it all; also why it has no proper end, if it has none.
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
-    let mut items = Items::open_all(paths)?;
+    let mut items = Items::open_all(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());

@@ -1,13 +1,14 @@
-//! The shell of one bus' commissioning: its clock and its socket. It decides nothing.
+//! Commissioning the buses of a skin, each by a thread of its own: clocks and sockets. It decides nothing.
 
-use std::sync::Arc;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use model::commission::{Commission, Progress, Report, Wish};
-use model::decode::{Decoded, Decoder};
+use model::decode::Decoded;
 use model::network::Uplinks;
-use protocol::bus::{Bus, BusError, Filter, GATEWAY_RECEIVE_BUFFER, Inbox, Kinds, Options};
+use protocol::bus::{BusError, Filter, GATEWAY_RECEIVE_BUFFER, Kinds, Options};
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::Message;
@@ -15,18 +16,22 @@ use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
 use protocol::wire::Lane;
 
+use crate::listen::{self, Listener, passing, send};
+
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
+/// How often it is looked how far the buses are.
+const TELL: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(20);
 /// Bytes that a waiting frame takes in a socket, as the kernel counts.
 const FRAME_BYTES: usize = 1_024;
 
 /// An open bus of a skin.
-#[derive(Clone, Debug)]
-pub(super) struct Bench {
+#[derive(Debug)]
+pub struct Bench {
     index: usize,
-    bus: Arc<Bus>,
+    listener: Listener,
     format: Format,
     /// Where this side speaks to the roots of a network, whose cells may have no numbers yet.
     roots: Vec<Lane>,
@@ -34,18 +39,24 @@ pub(super) struct Bench {
 
 /// What became of a bus.
 #[derive(Debug)]
-pub(super) struct Done {
-    pub(super) name: String,
-    pub(super) kind: String,
-    pub(super) report: Report,
+pub struct Done {
+    /// The bus.
+    pub name: String,
+    /// Its kind.
+    pub kind: String,
+    /// What became of its cells.
+    pub report: Report,
     /// Why it was ended: somebody else is there, or the bus is gone.
-    pub(super) failure: Option<String>,
+    pub failure: Option<String>,
     /// Frames that came faster than they were read.
-    pub(super) dropped: u32,
+    pub dropped: u32,
 }
 
 /// Opens a bus of a skin.
-pub(super) fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
+///
+/// # Errors
+/// When it cannot be opened.
+pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let sums = described.is_some_and(|bus| matches!(bus.reply, Reply::Sum { .. }));
@@ -53,63 +64,85 @@ pub(super) fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, Bu
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
     filters.extend(roots.iter().map(|lane| Filter::lane(lane.reversed())));
-    let options = Options {
-        filters,
-        fd: format == Format::Fd,
-        receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-        ..Options::default()
-    };
-    let bus = Bus::open(name, kinds.of(name), &options)?;
+    let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+    let options = Options { filters, receive_buffer, ..Options::default() };
+    let bus = listen::open(name, kinds.of(name), Some(format), options)?;
     if !roots.is_empty() && !bus.is_virtual()? {
         // Simulated wires have no place among real cells, which have real ones.
         roots.clear();
     }
-    Ok(Bench { index, bus: Arc::new(bus), format, roots })
+    Ok(Bench { index, listener: Listener::new(bus, Some(format)), format, roots })
+}
+
+/// Commissions the cells of all buses, or as many as it can until it is stopped; shows how far they are.
+pub fn commission(
+    benches: Vec<Bench>,
+    skin: &Skin,
+    wish: Wish,
+    stopped: &AtomicBool,
+    mut show: impl FnMut(&[Progress]),
+) -> Vec<Done> {
+    let far = Mutex::new(vec![None; benches.len()]);
+    thread::scope(|scope| {
+        let work = |(place, bench): (usize, Bench)| {
+            let far = &far;
+            scope.spawn(move || {
+                bench.work(skin, wish, stopped, |progress| {
+                    if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
+                        *own = Some(progress);
+                    }
+                })
+            })
+        };
+        let threads: Vec<_> = benches.into_iter().enumerate().map(work).collect();
+        while threads.iter().any(|thread| !thread.is_finished()) {
+            let now: Vec<Progress> =
+                far.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
+            if !now.is_empty() {
+                show(&now);
+            }
+            thread::sleep(TELL);
+        }
+        threads.into_iter().filter_map(|thread| thread.join().ok()).collect()
+    })
 }
 
 impl Bench {
     /// Commissions the bus' cells, or as many as it can until it is stopped; tells how far it is.
-    pub(super) fn work(
-        &self,
-        skin: &Skin,
-        wish: Wish,
-        stopped: &AtomicBool,
-        tell: impl FnMut(Progress),
-    ) -> Done {
+    fn work(mut self, skin: &Skin, wish: Wish, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> Done {
         let frames = match self.format {
             Format::Fd => 1,
             Format::Classic => 2,
         };
-        let room = self.bus.receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
+        let room = self.listener.bus().receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
         let began = Instant::now();
         let clock = || Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX));
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
-        let mut inbox = Inbox::new();
-        let lost = self.converse(&mut commission, &mut inbox, &clock, stopped, tell).err();
+        let lost = self.converse(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {
             commission.stop();
         }
+        let bus = self.listener.bus();
         let report = commission.report();
-        let trouble = report.trouble.map(|trouble| trouble.on(self.bus.name()));
+        let trouble = report.trouble.map(|trouble| trouble.on(bus.name()));
         Done {
-            name: self.bus.name().to_owned(),
-            kind: self.bus.kind().to_string(),
+            name: bus.name().to_owned(),
+            kind: bus.kind().to_string(),
             report,
             failure: lost.map(|lost| lost.to_string()).or(trouble),
-            dropped: inbox.dropped(),
+            dropped: self.listener.dropped(),
         }
     }
 
     fn converse(
-        &self,
+        &mut self,
         commission: &mut Commission,
-        inbox: &mut Inbox,
         clock: &impl Fn() -> Micros,
         stopped: &AtomicBool,
         mut tell: impl FnMut(Progress),
     ) -> Result<(), BusError> {
-        let mut decoder = Decoder::new(Some(self.format));
-        let mut network = Network::new(&self.roots, clock());
+        let Self { listener, roots, format, .. } = self;
+        let mut network = Network::new(roots, clock());
         loop {
             if stopped.load(Ordering::Relaxed) {
                 commission.stop();
@@ -118,28 +151,23 @@ impl Bench {
             tell(commission.progress());
             if commission.speaks() {
                 let frames = network.frames(clock());
-                passing(self.bus.send(&frames).map_err(BusError::from))?;
+                passing(listener.bus().send(&frames).map_err(BusError::from), DOWN)?;
             }
             while let Some(message) = commission.poll_transmit() {
-                let frames: Vec<Frame> = message.encode().frames(self.format).collect();
                 // What was not sent is not answered, and is sent again.
-                passing(self.bus.send(&frames).map_err(BusError::from))?;
+                passing(send(listener.bus(), &message, *format), DOWN)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
             let next = if commission.speaks() { next.min(network.due()) } else { next };
             let wait = Duration::from_micros(next.since(clock()).0).min(LOOK);
-            if passing(self.bus.wait(Some(wait)))?.unwrap_or(false) {
-                passing(self.bus.receive(inbox))?;
-                for received in inbox.frames() {
-                    let at = Micros(received.at_nanos / 1_000);
-                    if let Decoded::Message(message) = decoder.decode(at, self.bus.name(), &received.frame) {
-                        network.hear(&message);
-                        commission.handle_message(clock(), &message);
-                    } else {
-                        network.take(clock(), &received.frame);
-                    }
+            passing(listener.hear(wait), DOWN)?;
+            for (received, decoded) in listener.decoded() {
+                if let Decoded::Message(message) = decoded {
+                    network.hear(&message);
+                    commission.handle_message(clock(), &message);
+                } else {
+                    network.take(clock(), &received.frame);
                 }
-                inbox.clear();
             }
         }
     }
@@ -186,17 +214,5 @@ impl<'a> Network<'a> {
 
     fn due(&self) -> Micros {
         if self.roots.is_empty() { Micros(u64::MAX) } else { self.uplinks.poll_timeout() }
-    }
-}
-
-/// A bus that is down or full may be used again soon.
-fn passing<T>(done: Result<T, BusError>) -> Result<Option<T>, BusError> {
-    match done {
-        Ok(done) => Ok(Some(done)),
-        Err(error) if error.may_pass() => {
-            std::thread::sleep(DOWN);
-            Ok(None)
-        }
-        Err(error) => Err(error),
     }
 }

@@ -1,0 +1,122 @@
+//! Asking the cells of a bus what they are, and hearing what they say of themselves.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use model::decode::Decoded;
+use model::listing::Listing;
+use protocol::bus::{Bus, BusError, Choice, Filter, GATEWAY_RECEIVE_BUFFER, Options};
+use protocol::can::Format;
+use protocol::id::{Command, Id, Kind};
+use protocol::message::Message;
+use protocol::time::Micros;
+
+use crate::listen::{self, Listener, passing, send};
+
+/// Cells say a heartbeat four times a second, from which their frames' format is seen.
+const FORMAT: Duration = Duration::from_millis(300);
+/// How often all are asked anew.
+const ASK: Duration = Duration::from_secs(2);
+/// How long one look at the bus takes, when nothing comes.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// What is heard of the cells of a bus, and when they were asked.
+#[derive(Debug)]
+pub struct Watch {
+    listener: Listener,
+    began: Instant,
+    listing: Listing,
+    others: u64,
+    /// What packets travel in, where that is known before anybody is heard.
+    format: Option<Format>,
+    asked: Option<Instant>,
+}
+
+impl Watch {
+    /// Opens a bus to hear cells and gateways; a classic interface too. Packets that ask travel in this format, or
+    /// else in that of the cells.
+    ///
+    /// # Errors
+    /// When the bus cannot be opened.
+    pub fn open(name: &str, kind: Choice, format: Option<Format>) -> Result<Self, BusError> {
+        let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
+        let mut filters: Vec<_> = kinds.map(Filter::kind).collect();
+        filters.push(Filter::exact(Id::command(Command::Joints)));
+        let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+        let options = Options { filters, receive_buffer, ..Options::default() };
+        let listener = Listener::new(listen::open(name, kind, None, options)?, None);
+        let listing = Listing::new();
+        Ok(Self { listener, began: Instant::now(), listing, others: 0, format, asked: None })
+    }
+
+    /// The bus.
+    #[must_use]
+    pub const fn bus(&self) -> &Bus {
+        self.listener.bus()
+    }
+
+    /// What was heard.
+    #[must_use]
+    pub const fn listing(&self) -> &Listing {
+        &self.listing
+    }
+
+    /// Frames that no packet came of.
+    #[must_use]
+    pub const fn others(&self) -> u64 {
+        self.others
+    }
+
+    /// How long it has been heard.
+    #[must_use]
+    pub fn elapsed(&self) -> Duration {
+        self.began.elapsed()
+    }
+
+    /// The same as the time on the listing's clock.
+    #[must_use]
+    pub fn now(&self) -> Micros {
+        Micros(u64::try_from(self.elapsed().as_micros()).unwrap_or(u64::MAX))
+    }
+
+    /// Asks for everything, once it is known in which frames; again and again if wanted.
+    ///
+    /// # Errors
+    /// When the bus is gone or closed.
+    pub fn ask(&mut self, again: bool) -> Result<(), BusError> {
+        let due = self.asked.is_none_or(|asked| again && asked.elapsed() >= ASK);
+        let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
+        let Some(format) = self.format.or_else(|| self.listing.format()).or(waited).filter(|_| due) else {
+            return Ok(());
+        };
+        self.asked = Some(Instant::now());
+        let asked = [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
+        match asked {
+            // Who cannot be asked may be heard all the same.
+            Err(BusError::FdFrame { .. }) => Ok(()),
+            asked => passing(asked, Duration::ZERO).map(|_| ()),
+        }
+    }
+
+    /// Hears what comes within a moment. A bus that is down may come up again, unless somebody says stop.
+    ///
+    /// # Errors
+    /// When the bus is gone or closed.
+    pub fn hear(&mut self, stopped: &AtomicBool) -> Result<(), BusError> {
+        let heard = self.listener.hear(LOOK);
+        if stopped.load(Ordering::Relaxed) {
+            heard?;
+        } else {
+            passing(heard, LOOK)?;
+        }
+        let now = self.now();
+        for (received, decoded) in self.listener.decoded() {
+            if let Decoded::Message(message) = decoded {
+                self.listing.hear(now, received.frame.format(), &message);
+            } else {
+                self.others += 1;
+            }
+        }
+        Ok(())
+    }
+}

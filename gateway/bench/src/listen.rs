@@ -1,0 +1,99 @@
+//! An open bus on which others speak: hearing them, and saying a word.
+
+use std::time::Duration;
+
+use model::decode::{Decoded, Decoder};
+use protocol::bus::{Bus, BusError, Choice, Inbox, Options, Received};
+use protocol::can::{Format, Frame};
+use protocol::message::Message;
+use protocol::time::Micros;
+
+/// Opens a bus for frames of this format; with `None` for FD frames, or for classic frames alone where its interface
+/// takes no others.
+///
+/// # Errors
+/// When it cannot be opened.
+pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) -> Result<Bus, BusError> {
+    let options = Options { fd: format != Some(Format::Classic), ..options };
+    match Bus::open(name, kind, &options) {
+        Err(BusError::ClassicOnly { .. }) if format.is_none() => {
+            Bus::open(name, kind, &Options { fd: false, ..options })
+        }
+        opened => opened,
+    }
+}
+
+/// Sends one packet in frames of this format.
+///
+/// # Errors
+/// When the bus does not take it.
+pub fn send(bus: &Bus, message: &Message, format: Format) -> Result<(), BusError> {
+    let frames: Vec<Frame> = message.encode().frames(format).collect();
+    bus.send(&frames).map_err(BusError::from)
+}
+
+/// What comes on a bus.
+#[derive(Debug)]
+pub struct Listener {
+    bus: Bus,
+    inbox: Inbox,
+    decoder: Decoder,
+}
+
+impl Listener {
+    /// Listens to a bus whose packets travel in this format; with `None` each frame is taken for what it is.
+    #[must_use]
+    pub fn new(bus: Bus, format: Option<Format>) -> Self {
+        Self { bus, inbox: Inbox::new(), decoder: Decoder::new(format) }
+    }
+
+    /// The bus.
+    #[must_use]
+    pub const fn bus(&self) -> &Bus {
+        &self.bus
+    }
+
+    /// Frames that came faster than they were read.
+    #[must_use]
+    pub const fn dropped(&self) -> u32 {
+        self.inbox.dropped()
+    }
+
+    /// Takes the frames that are there, or come within this time; whether there are any.
+    ///
+    /// # Errors
+    /// When the bus is down, gone or closed.
+    pub fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
+        self.inbox.clear();
+        Ok(self.bus.wait(Some(wait))? && self.bus.receive(&mut self.inbox)? > 0)
+    }
+
+    /// The frames that were taken last.
+    pub fn frames(&self) -> impl Iterator<Item = Received> + '_ {
+        self.inbox.frames()
+    }
+
+    /// The same, and what each of them says.
+    pub fn decoded(&mut self) -> impl Iterator<Item = (Received, Decoded)> + '_ {
+        let Self { bus, inbox, decoder } = self;
+        inbox.frames().map(|received| {
+            let at = Micros(received.at_nanos / 1_000);
+            (received, decoder.decode(at, bus.name(), &received.frame))
+        })
+    }
+}
+
+/// What a bus that is down or full did not do is nothing, after this pause: it may be used again soon.
+///
+/// # Errors
+/// When it will not be.
+pub fn passing<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
+    match done {
+        Ok(done) => Ok(Some(done)),
+        Err(error) if error.may_pass() => {
+            std::thread::sleep(pause);
+            Ok(None)
+        }
+        Err(error) => Err(error),
+    }
+}

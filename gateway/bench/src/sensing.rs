@@ -1,0 +1,242 @@
+//! Telling the cells of a running bench when to say what they feel, until all that are there have confirmed it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use model::decode::Decoded;
+use protocol::bus::{Bus, BusError, Choice, Filter, Options};
+use protocol::can::Format;
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::{Answer, Message, NetworkPage, Request, State};
+use protocol::parameters::{Parameter, Sensing};
+use thiserror::Error;
+
+use crate::listen::{self, Listener, send};
+
+/// So long cells show that they are there: two heartbeats and some.
+const LISTEN: Duration = Duration::from_millis(600);
+/// From one word to a cell that does not answer to the next.
+const AGAIN: Duration = Duration::from_millis(250);
+/// Who has not answered by then will not.
+const PATIENCE: Duration = Duration::from_secs(3);
+/// Comes back in the answers, so that they are not taken for those to somebody else.
+const TAG: u8 = 0x57;
+
+/// Opens a bus on which cells are to be switched, whose packets travel in this format.
+///
+/// # Errors
+/// When it cannot be opened.
+pub fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
+    let filters = [Kind::Network, Kind::Configured].map(Filter::kind).to_vec();
+    listen::open(name, kind, Some(format), Options { filters, ..Options::default() })
+}
+
+/// Why not all cells that should be were switched.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum SensingError {
+    /// The bus failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// Nobody is there who understands.
+    #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
+    Nobody {
+        /// Who was asked.
+        who: String,
+        /// The bus.
+        bus: String,
+        /// The format that the bus may have instead.
+        other: &'static str,
+    },
+    /// Some do not want to.
+    #[error("{cells} on {bus} refused with reason {reason}: docs/protocol.md says what it means")]
+    Refused {
+        /// Those, in words.
+        cells: String,
+        /// The bus.
+        bus: String,
+        /// The first one's reason.
+        reason: i16,
+    },
+    /// Some are there and do not answer.
+    #[error("{cells} on {bus} did not answer, {done} did: switch them again when they are back")]
+    Silent {
+        /// Those, in words.
+        cells: String,
+        /// The bus.
+        bus: String,
+        /// How many others did.
+        done: usize,
+    },
+}
+
+/// Switches one cell, or all that are heard on a bus that [`open`] gave; says who was switched.
+///
+/// # Errors
+/// When not all of them confirm it, or the bus fails.
+pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> Result<String, SensingError> {
+    let mut answers = Answers { only, ..Answers::default() };
+    let mut listener = Listener::new(bus, Some(format));
+    let tell = |bus: &Bus, to| {
+        let request = Request::Write { number: Parameter::Sensing.number(), words: mode.words() };
+        send(bus, &Message::Configure { to, tag: TAG, request }, format)
+    };
+    tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
+    let began = Instant::now();
+    let mut told = began;
+    while began.elapsed() < PATIENCE && !answers.are_complete(began.elapsed() >= LISTEN) {
+        listener.hear(Duration::from_millis(20))?;
+        for (_, decoded) in listener.decoded() {
+            if let Decoded::Message(message) = decoded {
+                answers.take(&message);
+            }
+        }
+        if told.elapsed() >= AGAIN {
+            told = Instant::now();
+            for cell in answers.missing() {
+                tell(listener.bus(), Node::Cell(cell))?;
+            }
+        }
+    }
+    answers.verdict(listener.bus().name(), format)
+}
+
+/// Who is there, and what they answered.
+#[derive(Debug, Default)]
+struct Answers {
+    /// The one cell that is asked; else all.
+    only: Option<CellId>,
+    heard: BTreeSet<CellId>,
+    confirmed: BTreeSet<CellId>,
+    refused: BTreeMap<CellId, i16>,
+}
+
+impl Answers {
+    fn take(&mut self, message: &Message) {
+        let wanted = |cell: CellId| self.only.is_none_or(|only| only == cell);
+        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } =
+            *message
+            && wanted(cell)
+            && !heartbeat.state.has(State::CLAIMING)
+        {
+            self.heard.insert(cell);
+        }
+        if let Message::Configured { from, tag: TAG, answer } = *message
+            && wanted(from)
+        {
+            match answer {
+                Answer::Value { .. } => _ = self.confirmed.insert(from),
+                Answer::Refused { reason, .. } => _ = self.refused.insert(from, reason),
+            }
+            self.heard.insert(from);
+        }
+    }
+
+    /// Those that are there and have not answered, or the one that is asked.
+    fn missing(&self) -> Vec<CellId> {
+        let known = self.heard.iter().copied().chain(self.only).collect::<BTreeSet<_>>();
+        let answered = |cell: &CellId| self.confirmed.contains(cell) || self.refused.contains_key(cell);
+        known.into_iter().filter(|cell| !answered(cell)).collect()
+    }
+
+    /// Whether nobody is waited for any more; others than one cell show up as long as it is listened.
+    fn are_complete(&self, listened: bool) -> bool {
+        self.missing().is_empty() && (self.only.is_some() || (listened && !self.heard.is_empty()))
+    }
+
+    /// Who was switched, in words; or why not all that should be were.
+    fn verdict(&self, bus: &str, format: Format) -> Result<String, SensingError> {
+        let (bus, missing) = (bus.to_owned(), self.missing());
+        if self.confirmed.is_empty() && self.refused.is_empty() {
+            let who = self.only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
+            let other = match format {
+                Format::Fd => "classic",
+                Format::Classic => "fd",
+            };
+            return Err(SensingError::Nobody { who, bus, other });
+        }
+        if let Some((_, &reason)) = self.refused.iter().next() {
+            return Err(SensingError::Refused { cells: names(self.refused.keys()), bus, reason });
+        }
+        if !missing.is_empty() {
+            let (cells, done) = (names(missing.iter()), self.confirmed.len());
+            return Err(SensingError::Silent { cells, bus, done });
+        }
+        Ok(match self.confirmed.len() {
+            1 => names(self.confirmed.iter()),
+            count => format!("{count} cells"),
+        })
+    }
+}
+
+fn names<'a>(cells: impl Iterator<Item = &'a CellId>) -> String {
+    let names: Vec<_> = cells.map(ToString::to_string).collect();
+    match names.as_slice() {
+        [one] => format!("cell {one}"),
+        [first, .., last] if names.len() > 12 => format!("{} cells ({first} to {last})", names.len()),
+        several => format!("cells {}", several.join(", ")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::message::Heartbeat;
+    use protocol::packet::{Epoch, WORDS};
+
+    /// What is said at the end, on an FD bus.
+    fn verdict(answers: &Answers) -> Result<String, String> {
+        answers.verdict("vcan0", Format::Fd).map_err(|error| error.to_string())
+    }
+
+    fn cell(node: i64) -> CellId {
+        CellId::new(node).unwrap()
+    }
+
+    fn beat(node: i64) -> Message {
+        let page = NetworkPage::Heartbeat(Heartbeat::default());
+        Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page }
+    }
+
+    fn confirms(node: i64, tag: u8) -> Message {
+        let answer = Answer::Value { number: 7, written: true, words: [0; WORDS] };
+        Message::Configured { from: cell(node), tag, answer }
+    }
+
+    #[test]
+    fn all_who_are_heard_have_to_answer() {
+        let mut answers = Answers::default();
+        assert!(!answers.are_complete(true), "nobody is there yet");
+        for message in [beat(1), confirms(1, TAG), confirms(2, TAG), beat(3), confirms(3, TAG ^ 1)] {
+            answers.take(&message);
+        }
+        assert!(!answers.are_complete(true));
+        assert_eq!(answers.missing(), [cell(3)], "the answer to somebody else is none");
+        let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
+        assert_eq!(verdict(&answers), Err(why.to_owned()));
+        answers.take(&confirms(3, TAG));
+        assert!(!answers.are_complete(false) && answers.are_complete(true));
+        assert_eq!(verdict(&answers), Ok("3 cells".to_owned()));
+    }
+
+    #[test]
+    fn one_cell_is_asked_and_waited_for_alone() {
+        let mut answers = Answers { only: Some(cell(7)), ..Answers::default() };
+        answers.take(&confirms(1, TAG));
+        assert_eq!(answers.missing(), [cell(7)]);
+        let why = "no cell 7 answers on vcan0: start it, or name the bus' format with --format classic";
+        assert_eq!(verdict(&answers), Err(why.to_owned()));
+        answers.take(&confirms(7, TAG));
+        assert!(answers.are_complete(false));
+        assert_eq!(verdict(&answers), Ok("cell 7".to_owned()));
+    }
+
+    #[test]
+    fn who_refuses_is_named() {
+        let mut answers = Answers::default();
+        let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
+        answers.take(&Message::Configured { from: cell(9), tag: TAG, answer });
+        let why = "cell 9 on vcan0 refused with reason 18: docs/protocol.md says what it means";
+        assert_eq!(verdict(&answers), Err(why.to_owned()));
+    }
+}

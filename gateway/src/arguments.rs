@@ -1,0 +1,104 @@
+//! Arguments that several commands share, and how words become values.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use protocol::bus::{Choice, Kinds, OneKind};
+use protocol::can::Format;
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+
+/// A word that may be given, what it means where that is not plain, and its value.
+pub(crate) type Word<T> = (&'static str, &'static str, T);
+
+/// What a packet travels in.
+pub(crate) const FORMATS: &[Word<Format>] =
+    &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two classic frames", Format::Classic)];
+
+/// Parses one of a few words.
+pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
+    words: &'static [Word<T>],
+) -> impl TypedValueParser<Value = T> {
+    let allowed = words.iter().map(|(word, about, _)| match *about {
+        "" => PossibleValue::new(*word),
+        about => PossibleValue::new(*word).help(about),
+    });
+    PossibleValuesParser::new(allowed).try_map(|given| {
+        let found = words.iter().find(|(word, ..)| *word == given);
+        found.map(|(.., value)| *value).ok_or("not one of the words")
+    })
+}
+
+/// Seconds above 0, up to 1e7.
+pub(crate) fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if seconds > 0.0 && seconds <= 1e7 => Ok(seconds),
+        _ => Err("a number of seconds above 0, up to 1e7".to_owned()),
+    }
+}
+
+/// Seconds from 0 to 1e9, in ns.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
+pub(crate) fn nanos(text: &str) -> Result<u64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
+        _ => Err("a number of seconds from 0 to 1e9".to_owned()),
+    }
+}
+
+/// Of which kind a bus is.
+#[derive(Args, Clone, Copy, Debug)]
+pub(crate) struct BusKind {
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    pub(crate) bus_kind: Choice,
+}
+
+/// Of which kinds several buses are.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct BusKinds {
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// several BUS=KIND, as often as there are buses
+    #[arg(long, value_name = "[BUS=]KIND")]
+    bus_kind: Vec<OneKind>,
+}
+
+impl BusKinds {
+    /// The kinds of any buses.
+    pub(crate) fn of_any(&self) -> Result<Kinds, Failure> {
+        Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)
+    }
+
+    /// The kinds of these buses, and of no others.
+    pub(crate) fn of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<Kinds, Failure> {
+        self.of_any()?.only(buses).map_err(Failure::usage)
+    }
+}
+
+/// Which programs are started, and how many cells share one.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Programs {
+    /// Put up to N cells into one process
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
+    pub(crate) cells_per_process: u8,
+    /// The program of the cells, when it is not beside this one
+    #[arg(long, value_name = "PATH")]
+    pub(crate) cell_node: Option<PathBuf>,
+    /// The program that serves embedded buses, when it is not beside this one
+    #[arg(long, value_name = "PATH")]
+    pub(crate) vcan_setup: Option<PathBuf>,
+}
+
+/// The names of a skin's buses.
+pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
+    skin.buses.iter().map(|bus| bus.name.as_str())
+}
+
+/// The place of a bus in the skin that a file describes.
+pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
+    skin.bus_named(name).ok_or_else(|| {
+        let names = crate::print::list(bus_names(skin));
+        Failure::usage(format!("bus {name} is not in {file}, which has {names}"))
+    })
+}

@@ -1,0 +1,215 @@
+//! The table at the end of a run.
+
+use std::fmt::Display;
+
+use analysis::paper;
+use bench::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Processor, Summary};
+
+use crate::print::{Rows, count, list, quantiles, words};
+
+/// Halts that are told one by one.
+const HALTS: usize = 10;
+
+/// The whole run.
+pub(super) fn rows(summary: &Summary) -> Rows {
+    let cells = format!("{} cells, {:.1} s", summary.cells, summary.duration_s);
+    let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
+        Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
+        None => (format!("{cells}, {}", summary.outcome), String::new()),
+    };
+    let mut rows = Rows::new(&summary.skin, cells, ended);
+    halts(&mut rows, summary);
+    accuracy(&mut rows, summary);
+    control(&mut rows, summary);
+    for bus in &summary.buses {
+        replies(&mut rows, bus);
+        frames(&mut rows, bus);
+    }
+    costs(&mut rows, summary);
+    rows
+}
+
+fn halts(rows: &mut Rows, summary: &Summary) {
+    for Halted { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(HALTS) {
+        let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
+        rows.section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
+    }
+    let more = summary.halts.len().saturating_sub(HALTS) as u64 + summary.further_halts;
+    if more > 0 {
+        rows.section("halted", format!("{more} times more"), "--summary has when and why");
+    }
+}
+
+fn accuracy(rows: &mut Rows, summary: &Summary) {
+    let accuracy = &summary.accuracy;
+    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean_nm.is_some());
+    if !single && !sums {
+        return;
+    }
+    rows.section("accuracy", "mean (greatest) error, Nm", "distributed against central");
+    if single {
+        let paper = format!("paper {}", paper::SINGLE_NM);
+        rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
+        rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
+        rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
+    }
+    if sums {
+        let paper = format!("paper {}", paper::SUMMED_NM);
+        rows.row("sums, loaded joints", errors(&accuracy.sums), paper);
+        rows.row("  averaged over 32 epochs", errors(&accuracy.sums_averaged), "");
+    }
+    rows.any("saturated words, left out", accuracy.saturated, "above 8 Nm");
+}
+
+fn errors(errors: &ErrorsSummary) -> String {
+    errors.mean_nm.map_or_else(
+        || "nothing compared".to_owned(),
+        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max_nm, errors.count),
+    )
+}
+
+fn control(rows: &mut Rows, summary: &Summary) {
+    let control = &summary.control;
+    rows.section("control loop", "50 % / 90 % / 99 % / greatest, µs", "");
+    rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
+    if control.central_us.count > 0 {
+        rows.row("tick", quantiles(&control.took_us), "");
+        rows.row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
+    }
+    if control.took_distributed_us.count > 0 {
+        rows.row("tick, distributed", quantiles(&control.took_distributed_us), "");
+    }
+    rows.row("ticks", control.ticks, format!("{} skipped", control.ticks_skipped));
+    rows.row("broadcasts", control.broadcasts, format!("{} skipped", control.broadcasts_skipped));
+    let why = "the bus did not take them, or this machine was busy";
+    rows.any("frames not sent", control.unsent, why);
+    rows.any("records of ticks lost", control.records_lost, why);
+    for (name, count) in &control.controller {
+        rows.row("external controller", count, name);
+    }
+    for (reason, count) in &control.bad_cycles {
+        rows.row("bad cycles", count, reason);
+    }
+    let granted = |granted| if granted { "granted" } else { "refused" };
+    let locked = granted(control.memory_locked);
+    rows.row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+}
+
+fn replies(rows: &mut Rows, bus: &BusSummary) {
+    let replies = &bus.replies;
+    rows.section(format!("{} ({})", bus.name, bus.kind), each(&bus.cells), "");
+    if bus.outages.times > 0 {
+        let end = if bus.outages.at_end { ", also at the end" } else { "" };
+        let ticks = format!("{} ticks without it", bus.outages.ticks);
+        rows.row("lost", format!("{} times, {:.1} s{end}", bus.outages.times, bus.outages.lost_s), ticks);
+    }
+    if !bus.silent_cells.is_empty() {
+        rows.row("silent cells", words(&bus.silent_cells), "");
+    }
+    let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
+    if let Some(sums) = &bus.sums {
+        let parts = sums.contributions;
+        rows.row("cells due in sums", parts.due, complete);
+        rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
+        let more = format!("{} resent, {} overheard, {} stale", sums.resent, sums.overheard, sums.stale);
+        rows.row(format!("sums from {}", count(sums.roots, "root")), sums.first, more);
+        let on_the_bus = sums.received + bus.uplink.unheard;
+        let plainly =
+            format!("the gateway took {}: the tree spares it frames, and a shared bus none", sums.received);
+        rows.row("sums on the bus, of all cells", on_the_bus, plainly);
+        if let Some(network) = &bus.network {
+            let organised =
+                network.organised_s.map_or_else(|| "never whole".to_owned(), |s| format!("in {s:.2} s"));
+            let changes = format!("{organised}, {} changes of parents", network.parent_changes);
+            rows.row("tree, wires deep", network.deepest, changes);
+            if !network.without_way.is_empty() {
+                let without = words(&network.without_way);
+                rows.row("cells without a way to a root", without, "no sum holds them");
+            }
+            for difference in &network.differences {
+                rows.row("not as described", difference, "");
+            }
+        }
+        rows.row("last sum after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+        return;
+    }
+    rows.row("replies due", replies.due, complete);
+    rows.row("  in time", replies.in_time, format!("{} late", replies.late));
+    let missing = replies.due - replies.in_time - replies.late;
+    let reasons = [
+        (replies.too_late, "too late"),
+        (replies.skipped, "skipped by cells"),
+        (replies.not_heard, "not heard"),
+        (replies.lost, "lost"),
+        (replies.in_doubt, "in doubt"),
+    ];
+    rows.row("  missing", missing, explained(&reasons, replies.unknown));
+    rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+}
+
+/// How many there are of each kind.
+fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
+    list(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
+}
+
+/// The reasons that there were, and always how many nobody knows.
+fn explained(reasons: &[(u64, &str)], unknown: u64) -> String {
+    let known = reasons.iter().filter(|(count, _)| *count > 0);
+    list(known.chain([&(unknown, "unknown")]).map(|(count, why)| format!("{count} {why}")))
+}
+
+fn frames(rows: &mut Rows, bus: &BusSummary) {
+    let up = &bus.uplink;
+    let lost = up.dropped + up.backlog + up.outage + up.unknown;
+    rows.row("packets sent by cells", up.sent, "by their own count");
+    rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
+    rows.any("  for other cells", up.unheard, "sums that the gateway does not take");
+    let reasons = [
+        (up.dropped, "dropped by the bus"),
+        (up.backlog, "by the kernel's backlog"),
+        (up.outage, "with the bus"),
+    ];
+    rows.row("  lost", lost, explained(&reasons, up.unknown));
+    rows.any("  surplus", up.surplus, "");
+    rows.any("  in doubt", up.in_doubt, "");
+    rows.any("  after the last heartbeat", up.unsettled, "");
+    rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");
+    rows.row("received", each(&bus.received), "");
+    let sensors = &bus.sensors;
+    // A frame or two are answers to reports.
+    if let (Some(least), Some(mean), Some(greatest @ 1.0..)) =
+        (sensors.least_hz, sensors.mean_hz, sensors.greatest_hz)
+    {
+        let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
+        rows.row("  sensors of a cell, Hz", format!("{least:.1} / {mean:.1} / {greatest:.1}"), touches);
+    }
+    rows.row("sent", each(&bus.sent), "");
+    if !bus.events.is_empty() {
+        rows.row("odd", each(&bus.events), "");
+    }
+}
+
+fn costs(rows: &mut Rows, summary: &Summary) {
+    let Processor { gateway, cells, buses } = summary.processor;
+    rows.section("cost", "", "");
+    let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
+    rows.row("processor, cores", format!("{:.3}", gateway + cells + buses), parts);
+    if let Some(kib) = summary.cell_private_kib {
+        rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
+    }
+    rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
+    if let Some(recording) = &summary.recording {
+        for file in &recording.files {
+            rows.row("recording", &file.path, format!("{} frames, {}", file.frames, size(file.bytes)));
+        }
+        rows.row("  frames in every format", recording.frames, format!("{} lost", recording.lost));
+    }
+}
+
+fn size(bytes: u64) -> String {
+    match bytes {
+        0..10_000 => format!("{bytes} bytes"),
+        10_000..10_000_000 => format!("{} KB", bytes / 1_000),
+        _ => format!("{} MB", bytes / 1_000_000),
+    }
+}
