@@ -3,9 +3,10 @@
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Summary};
+use bench::summary::{BusSummary, Halted, Outcome, Summary};
 use comfy_table::{ColumnConstraint, ContentArrangement, Table, presets};
 use model::quantiles::Quantiles;
+use model::table::Errors;
 use protocol::usage::{Failure, print};
 
 /// A space before a name that stays when the name takes two lines.
@@ -91,7 +92,7 @@ fn halts(rows: &mut Rows, summary: &Summary) {
 
 fn accuracy(rows: &mut Rows, summary: &Summary) {
     let accuracy = &summary.accuracy;
-    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean_nm.is_some());
+    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean().is_some());
     if !single && !sums {
         return;
     }
@@ -112,10 +113,10 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
     }
 }
 
-fn errors(errors: &ErrorsSummary) -> String {
-    errors.mean_nm.map_or_else(
+fn errors(errors: &Errors) -> String {
+    errors.mean().map_or_else(
         || "nothing compared".to_owned(),
-        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max_nm, errors.count),
+        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max(), errors.count()),
     )
 }
 
@@ -165,14 +166,15 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     }
     let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
     if let Some(sums) = &bus.sums {
-        let parts = sums.contributions;
+        let (counts, parts) = (sums.counts, sums.contributions);
         rows.row("cells due in sums", parts.due, complete);
         rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
-        let more = format!("{} resent, {} overheard, {} stale", sums.resent, sums.overheard, sums.stale);
-        rows.row(format!("sums from {} roots", sums.roots), sums.first, more);
-        let on_the_bus = sums.received + bus.uplink.unheard;
+        let more =
+            format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
+        rows.row(format!("sums from {} roots", sums.roots), counts.first, more);
+        let on_the_bus = counts.received + bus.uplink.unheard;
         let plainly =
-            format!("the gateway took {}: the tree spares it frames, and a shared bus none", sums.received);
+            format!("the gateway took {}: the tree spares it frames, and a shared bus none", counts.received);
         rows.row("sums on the bus, of all cells", on_the_bus, plainly);
         if let Some(network) = &bus.network {
             let organised =
