@@ -6,7 +6,6 @@
 
 use std::hint::black_box;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use bench::run::realtime;
@@ -100,14 +99,7 @@ impl Bench {
             let snapshot = Snapshot { sums: Sums::default(), felt };
             let (snapshots, snapshot) = triple_buffer::triple_buffer(&snapshot);
             let (producer, positions) = rtrb::RingBuffer::new(64);
-            lines.push(Line {
-                format: bus.format,
-                snapshot,
-                positions: producer,
-                works: Arc::new(AtomicBool::new(true)),
-                commands: Arc::default(),
-                returned: Arc::default(),
-            });
+            lines.push(Line { format: bus.format, snapshot, positions: producer, state: Arc::default() });
             buses.push(Receiver { snapshots, positions });
         }
         let mode = if case == Case::Distributed { Mode::Distributed } else { Mode::Compare };

@@ -7,8 +7,7 @@ use bench::replay::player::Pace;
 use bench::replay::reel::Only;
 use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::Part;
-use bench::replay::{Options, Spawn, replay};
-use bench::run::RunError;
+use bench::replay::{Options, ReplayError, Spawn, replay};
 use clap::Args;
 use model::decode::pick::{self, Pick, Wanted};
 use protocol::id::Node;
@@ -140,7 +139,7 @@ impl Replay {
         apart([("--summary", self.summary.as_deref())], read)?;
         // Before the replay: nobody wants to hear after an hour that there is nowhere to write.
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
-        let failure = |error: RunError| Failure::with_code(error.exit_code(), error);
+        let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
         let json = json(&summary)?;
         if let Some((whole, file)) = file {

@@ -44,7 +44,7 @@ fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     let claimed = Outputs::claim(&options, &AtomicBool::new(false), |line| {
         said.push(line.replace(&format!("{}/", folder.display()), ""));
     });
-    (claimed, said)
+    (claimed.map_err(|error| error.to_string()), said)
 }
 
 #[test]

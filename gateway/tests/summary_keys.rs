@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bench::summary::{
-    AccuracySummary, BusSummary, ErrorsSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording,
-    RepliesSummary, Summary, SumsSummary, TickBefore, Written,
+    BusSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording, RepliesSummary, Summary,
+    SumsSummary, TickBefore, Written,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -84,7 +84,7 @@ fn summary(bus: BusSummary) -> Summary {
             records_lost: 0,
             unsent: 0,
         },
-        accuracy: AccuracySummary::from(Accuracy::default()),
+        accuracy: Accuracy::default(),
         backlog_dropped: Some(0),
         buses: vec![bus],
         processor: Processor::default(),
@@ -181,7 +181,7 @@ fn the_keys_of_quantiles_and_errors_are_documented() {
     };
     let quantiles = serde_json::to_value(Quantiles::default()).unwrap();
     assert_eq!(documented(|heading| heading == "Quantiles"), of(quantiles));
-    let errors = serde_json::to_value(ErrorsSummary::from(Accuracy::default().single)).unwrap();
+    let errors = serde_json::to_value(Accuracy::default().single).unwrap();
     assert_eq!(documented(|heading| heading == "Errors"), of(errors));
 }
 

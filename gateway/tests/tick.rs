@@ -8,12 +8,12 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use bench::run::link::Link;
 use bench::run::realtime;
 use control::controller::Kinesthetic;
-use control::cycle::turn::{Line, Shared, Turn};
+use control::cycle::turn::{BusState, Line, Shared, Turn};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{Wanted, generate};
@@ -62,30 +62,23 @@ fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<model::table::Sn
     (turn, input, table)
 }
 
-/// The same, and whether its bus works.
+/// The same, and how its bus is.
 fn turn_of(
     skin: &Skin,
     mode: Mode,
-) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table, Arc<AtomicBool>) {
+) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table, Arc<BusState>) {
     let table = Table::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, _) = rtrb::RingBuffer::new(4_096);
     let (records, _) = rtrb::RingBuffer::new(4_096);
-    let works = Arc::new(AtomicBool::new(true));
-    let line = Line {
-        format: protocol::can::Format::Fd,
-        snapshot,
-        positions,
-        works: Arc::clone(&works),
-        commands: Arc::default(),
-        returned: Arc::default(),
-    };
+    let state = Arc::<BusState>::default();
+    let line = Line { format: protocol::can::Format::Fd, snapshot, positions, state: Arc::clone(&state) };
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
     let controller = Box::new(Kinesthetic::new(skin).unwrap());
     let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, [0.1; WORDS])));
     let turn = Turn::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
-    (turn, input, table, works)
+    (turn, input, table, state)
 }
 
 #[test]
@@ -135,10 +128,10 @@ fn a_halt_that_a_bus_did_not_take_is_said_before_its_next_joints_and_then_every_
 
 #[test]
 fn a_bus_that_is_back_is_told_before_its_next_joints_to_be_as_the_robot_is() {
-    let (mut turn, mut snapshots, table, works) = turn_of(&skin(4), Mode::Distributed);
+    let (mut turn, mut snapshots, table, bus) = turn_of(&skin(4), Mode::Distributed);
     let mut said = Vec::new();
     for number in 0..64_u64 {
-        works.store(!(20..30).contains(&number), Ordering::Relaxed);
+        bus.works.store(!(20..30).contains(&number), Ordering::Relaxed);
         let snapshot = snapshots.input_buffer_mut();
         snapshot.take(table.snapshot(), false);
         snapshot.sums.read_back = number.checked_sub(1).map(|sent| Epoch((sent / 8).to_le_bytes()[0]));
@@ -181,12 +174,16 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
     assert_eq!(offer(), (true, 0));
     first.stop().unwrap();
     assert!(ear.lose(true) && !ear.lose(true), "news once");
-    assert_eq!((offer(), link.is_gone(), link.is_there()), ((false, 0), true, false));
+    assert_eq!((offer(), link.is_gone(), link.state.is_there()), ((false, 0), true, false));
     assert!(ear.reopen().is_err() && link.is_gone());
     let second = serve();
     ear.reopen().unwrap();
-    assert_eq!((link.is_gone(), link.is_there()), (false, false), "open, and nothing was heard on it yet");
-    assert!(ear.regain() && !ear.regain() && link.is_there());
+    assert_eq!(
+        (link.is_gone(), link.state.is_there()),
+        (false, false),
+        "open, and nothing was heard on it yet"
+    );
+    assert!(ear.regain() && !ear.regain() && link.state.is_there());
     assert_eq!(offer(), (true, 0));
     link.send(&frames).unwrap();
     assert_eq!(second.stop().unwrap().frames, 2);

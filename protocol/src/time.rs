@@ -18,6 +18,13 @@ impl Span {
     pub const fn from_millis(millis: u64) -> Self {
         Self(millis * 1_000)
     }
+
+    /// The same in seconds.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "lengths far below 2^53 us")]
+    pub const fn seconds(self) -> f64 {
+        self.0 as f64 / 1e6
+    }
 }
 
 impl Micros {

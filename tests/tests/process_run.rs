@@ -60,7 +60,7 @@ fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
 #[test]
 fn buses_of_classic_frames_carry_the_same_bench() {
     let place = Place::new();
-    place.write("skin.toml", &skin_of(9, 2, generate::Format::Classic));
+    place.write("skin.toml", &skin_of(9, 2, Format::Classic));
     place.scenario(PRESSED);
     place.bench(1.5, "").end().well();
     place.is_left_clean();

@@ -7,6 +7,7 @@
 //! | [`run`] | a run: processes, buses, loop, and what it came to ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
 //! | [`replay`] | a capture on a bus again, compared |
+//! | [`view`] | what a receiver shows of a bus' cells |
 //! | [`signals`] | signals that end a command |
 
 pub mod cells;
@@ -16,5 +17,7 @@ pub mod record;
 pub mod replay;
 pub mod run;
 pub mod sensing;
+mod setup;
 pub mod signals;
 pub mod summary;
+pub mod view;

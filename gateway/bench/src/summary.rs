@@ -11,13 +11,13 @@ use serde::Serialize;
 
 pub use self::outcome::{Halted, Outcome, TickBefore};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Contributions, Errors, Event, Replies, Status, SumCounts, Table, Uplink};
+use model::table::{Accuracy, Contributions, Event, Replies, Status, SumCounts, Table, Uplink};
 pub use trace::recording::account::{Recording, Written};
 
 mod outcome;
 
 /// A whole run.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Summary {
     /// The skin's name.
     pub skin: String,
@@ -45,7 +45,7 @@ pub struct Summary {
     #[serde(rename = "loop")]
     pub control: Loop,
     /// Distributed against central torques.
-    pub accuracy: AccuracySummary,
+    pub accuracy: Accuracy,
     /// Packets of the whole machine, any interface's, that the kernel dropped before they came to a socket,
     /// because a processor's backlog was full; none where it does not say.
     pub backlog_dropped: Option<u64>,
@@ -60,29 +60,21 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Of a run that failed before any bus was opened.
+    /// Of a run of which nothing is known yet.
     #[must_use]
-    pub fn of_no_run(skin: &Skin, why: String) -> Self {
+    pub fn empty(skin: &Skin) -> Self {
         Self {
             skin: skin.name.clone(),
             cells: skin.cells.len(),
-            outcome: Outcome::Failed,
-            failure: Some(why),
-            duration_s: 0.0,
-            interrupted: false,
-            halted: None,
-            halts: Vec::new(),
-            further_halts: 0,
-            before_halt: Vec::new(),
             first_broadcast_s: f64::NAN,
-            control: Loop::default(),
-            accuracy: Accuracy::default().into(),
-            backlog_dropped: None,
-            buses: Vec::new(),
-            processor: Processor::default(),
-            cell_private_kib: None,
-            recording: None,
+            ..Self::default()
         }
+    }
+
+    /// Of a run that failed before any bus was opened.
+    #[must_use]
+    pub fn of_no_run(skin: &Skin, why: String) -> Self {
+        Self::empty(skin).judged(Some(why))
     }
 
     /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
@@ -165,54 +157,6 @@ pub struct Loop {
     pub unsent: u64,
 }
 
-/// Some errors, in Nm.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub struct ErrorsSummary {
-    /// Mean absolute error; none when nothing was compared.
-    pub mean_nm: Option<f64>,
-    /// Greatest absolute error.
-    pub max_nm: f64,
-    /// Torques compared.
-    pub count: u64,
-}
-
-impl From<Errors> for ErrorsSummary {
-    fn from(errors: Errors) -> Self {
-        Self { mean_nm: errors.mean(), max_nm: errors.max(), count: errors.count() }
-    }
-}
-
-/// Distributed against central torques.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub struct AccuracySummary {
-    /// Single cells over loaded joints, on the same words.
-    pub single: ErrorsSummary,
-    /// Single cells over loaded joints, against unrounded angles, lengths and poses.
-    pub unquantised: ErrorsSummary,
-    /// The whole skin's torque, in epochs that all answered in time.
-    pub whole: ErrorsSummary,
-    /// A whole bus' torque that came as sums, over loaded joints, in epochs whose sums were complete in time.
-    pub sums: ErrorsSummary,
-    /// The same, averaged over 32 epochs in a row in which every cell felt the same.
-    pub sums_averaged: ErrorsSummary,
-    /// Words left out because they were saturated.
-    pub saturated: u64,
-}
-
-impl From<Accuracy> for AccuracySummary {
-    fn from(accuracy: Accuracy) -> Self {
-        let Accuracy { single, unquantised, whole, sums, sums_averaged, saturated, .. } = accuracy;
-        Self {
-            single: single.into(),
-            unquantised: unquantised.into(),
-            whole: whole.into(),
-            sums: sums.into(),
-            sums_averaged: sums_averaged.into(),
-            saturated,
-        }
-    }
-}
-
 /// Processor time while the loop ran, in cores.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Processor {
@@ -289,38 +233,16 @@ pub struct RepliesSummary {
     pub unasked: u64,
 }
 
-/// Sums along the cells' tree: received = first + resent + overheard + stale.
+/// Sums along the cells' tree.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SumsSummary {
     /// Cells that are wired to the gateway's side.
     pub roots: usize,
-    /// Sums that came.
-    pub received: u64,
-    /// A root's first one for an epoch.
-    pub first: u64,
-    /// A root's further ones for an epoch.
-    pub resent: u64,
-    /// Of cells that are no roots.
-    pub overheard: u64,
-    /// Of epochs that had passed.
-    pub stale: u64,
+    /// What became of those that came: received = first + resent + overheard + stale.
+    #[serde(flatten)]
+    pub counts: SumCounts,
     /// Cells that were to be in sums, and were: due = in time + late + missing.
-    pub contributions: ContributionsSummary,
-}
-
-/// Cells in sums: due = in time + late + missing.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct ContributionsSummary {
-    /// That were to be in an epoch's sums.
-    pub due: u64,
-    /// In them before the next joints.
-    pub in_time: u64,
-    /// In them after that.
-    pub late: u64,
-    /// Not in them.
-    pub missing: u64,
-    /// In them and not due.
-    pub unasked: u64,
+    pub contributions: Contributions,
 }
 
 /// How often a bus was lost, and for how long.
@@ -498,17 +420,8 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
 
 fn sums(table: &Table) -> Option<SumsSummary> {
     let (counts, contributions) = table.sums()?;
-    let SumCounts { received, first, resent, overheard, stale } = counts;
-    let Contributions { due, in_time, late, missing, unasked } = contributions;
-    Some(SumsSummary {
-        roots: table.cells().iter().filter(|cell| cell.root).count(),
-        received,
-        first,
-        resent,
-        overheard,
-        stale,
-        contributions: ContributionsSummary { due, in_time, late, missing, unasked },
-    })
+    let roots = table.cells().iter().filter(|cell| cell.root).count();
+    Some(SumsSummary { roots, counts, contributions })
 }
 
 /// Finds for each cell's missing replies what is known to have become of them.

@@ -15,6 +15,8 @@ use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
 
+use crate::robot::padded;
+
 /// What a controller is told in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Input {
@@ -208,11 +210,7 @@ pub(crate) struct Pace {
 
 impl Pace {
     pub(crate) fn of(skin: &Skin) -> Self {
-        let mut max_speed = [0.0; MAX_JOINTS];
-        for (max_speed, given) in max_speed.iter_mut().zip(&skin.controller.max_speed_rad_s) {
-            *max_speed = *given;
-        }
-        Self { tick: 1.0 / skin.timing.control_hz, max_speed }
+        Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed_rad_s) }
     }
 
     /// The velocities that bring the robot to `goal` by the next tick, as far as speed allows; none

@@ -3,6 +3,11 @@
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 
+/// What is given for each joint; nothing for joints that the robot does not have.
+pub(crate) fn padded<T: Copy + Default>(given: &[T]) -> [T; MAX_JOINTS] {
+    core::array::from_fn(|joint| given.get(joint).copied().unwrap_or_default())
+}
+
 /// A robot that is told joint velocities. Joints that it does not have stand at zero.
 pub trait Robot {
     /// Moves for `seconds` with these joint velocities in rad/s. Called once a tick: must not block,
@@ -37,11 +42,8 @@ impl SimulatedArm {
     /// The skin's robot, at rest at `start` (in rad), held within its limits.
     #[must_use]
     pub fn new(skin: &Skin, start: [f64; MAX_JOINTS]) -> Self {
-        let mut arm =
-            Self { positions: start, velocities: [0.0; MAX_JOINTS], limits: [[0.0; 2]; MAX_JOINTS] };
-        for (limits, given) in arm.limits.iter_mut().zip(&skin.robot.limits_rad) {
-            *limits = *given;
-        }
+        let limits = padded(&skin.robot.limits_rad);
+        let mut arm = Self { positions: start, velocities: [0.0; MAX_JOINTS], limits };
         for (position, [least, greatest]) in arm.positions.iter_mut().zip(arm.limits) {
             *position = position.clamp(least, greatest);
         }

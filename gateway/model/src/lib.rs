@@ -8,6 +8,7 @@
 //! | [`central`] | torques computed centrally, in double precision |
 //! | [`network`] | the tree of cells, and whether it is as the skin says |
 //! | [`commission`], [`listing`] | who is there, and giving it its number and configuration |
+//! | [`repeat`] | requests that are repeated until they are confirmed |
 //! | [`scenario`], [`generate`] | what a run does, and skins made from a recipe |
 
 pub mod central;
@@ -17,6 +18,7 @@ pub mod generate;
 pub mod listing;
 pub mod network;
 pub mod quantiles;
+pub mod repeat;
 pub mod scenario;
 pub mod stimuli;
 pub mod table;

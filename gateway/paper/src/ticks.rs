@@ -2,7 +2,6 @@
 //! are measured on.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q3_12};
@@ -140,9 +139,7 @@ impl Ticks {
                 format: Format::Fd,
                 snapshot: from_receiver,
                 positions: positions_in,
-                works: Arc::new(AtomicBool::new(true)),
-                commands: Arc::default(),
-                returned: Arc::default(),
+                state: Arc::default(),
             });
             inlets.push(Inlet { snapshot, to_loop, positions });
         }

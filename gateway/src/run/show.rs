@@ -3,7 +3,7 @@
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, ErrorsSummary, Halted, Outcome, Processor, Summary};
+use bench::summary::{BusSummary, Halted, Outcome, Processor, Summary};
 
 use crate::print::{Rows, count, list, quantiles, words};
 
@@ -42,7 +42,7 @@ fn halts(rows: &mut Rows, summary: &Summary) {
 
 fn accuracy(rows: &mut Rows, summary: &Summary) {
     let accuracy = &summary.accuracy;
-    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean_nm.is_some());
+    let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean().is_some());
     if !single && !sums {
         return;
     }
@@ -61,10 +61,10 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
     rows.any("saturated words, left out", accuracy.saturated, "above 8 Nm");
 }
 
-fn errors(errors: &ErrorsSummary) -> String {
-    errors.mean_nm.map_or_else(
+fn errors(errors: &Errors) -> String {
+    errors.mean().map_or_else(
         || "nothing compared".to_owned(),
-        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max_nm, errors.count),
+        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max(), errors.count()),
     )
 }
 
@@ -108,14 +108,15 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     }
     let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
     if let Some(sums) = &bus.sums {
-        let parts = sums.contributions;
+        let (counts, parts) = (sums.counts, sums.contributions);
         rows.row("cells due in sums", parts.due, complete);
         rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
-        let more = format!("{} resent, {} overheard, {} stale", sums.resent, sums.overheard, sums.stale);
-        rows.row(format!("sums from {}", count(sums.roots, "root")), sums.first, more);
-        let on_the_bus = sums.received + bus.uplink.unheard;
+        let more =
+            format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
+        rows.row(format!("sums from {}", count(sums.roots, "root")), counts.first, more);
+        let on_the_bus = counts.received + bus.uplink.unheard;
         let plainly =
-            format!("the gateway took {}: the tree spares it frames, and a shared bus none", sums.received);
+            format!("the gateway took {}: the tree spares it frames, and a shared bus none", counts.received);
         rows.row("sums on the bus, of all cells", on_the_bus, plainly);
         if let Some(network) = &bus.network {
             let organised =

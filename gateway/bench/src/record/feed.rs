@@ -1,14 +1,13 @@
 //! What is handed over to the recorder: bounded queues, one for each thread that fills one. Nobody waits for
 //! room; what does not fit is counted, and said in the recording where it is missing.
 
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use protocol::message::SkinSensors;
 
 use super::force::Seen;
-use crate::run::receiver::View;
-use control::cycle::turn::Timed;
+use crate::view::View;
+use control::cycle::turn::{BusState, Timed};
 use model::table::Status;
 
 /// Frames of a bus that may wait: more than a second of a full bus.
@@ -134,17 +133,17 @@ pub struct Lane {
     pub(super) touched: Option<rtrb::Consumer<Touched>>,
     /// How its cells are.
     pub(super) view: Arc<Mutex<View>>,
-    /// Whether it works.
-    pub(super) works: Arc<AtomicBool>,
+    /// How it is.
+    pub(super) state: Arc<BusState>,
 }
 
 /// The queues of a bus, both ends; `all` when not only frames are wanted.
 #[must_use]
-pub fn lane(all: bool, view: Arc<Mutex<View>>, works: Arc<AtomicBool>) -> (Outlet, Lane) {
+pub fn lane(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, Lane) {
     let (frames, taken) = rtrb::RingBuffer::new(FRAMES);
     let (touched, felt) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
     let outlet = Outlet { frames, touched, unrecorded: 0, untold: 0, untouched: 0 };
-    (outlet, Lane { frames: taken, touched: felt, view, works })
+    (outlet, Lane { frames: taken, touched: felt, view, state })
 }
 
 /// All that comes to the recorder.

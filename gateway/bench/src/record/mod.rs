@@ -25,12 +25,15 @@ use std::sync::mpsc;
 
 use feed::{Feed, Unrecorded};
 use text::Text;
+use thiserror::Error;
 use topics::Topics;
 use trace::recording::account::Recording;
 use trace::recording::layout::Layout;
 use trace::recording::repair;
 use trace::recording::series::{Attached, Head, Series, Split};
 
+use crate::run::RunError;
+use crate::setup::spawn;
 use trace::files::check_regular;
 
 /// What is to be recorded where.
@@ -66,6 +69,31 @@ pub struct Mcap {
     pub command_line: Vec<String>,
 }
 
+/// Why nothing can be recorded there.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum OutputError {
+    /// A log cannot be written.
+    #[error("--candump {}: {source}", .path.display())]
+    Candump {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A recording cannot be written.
+    #[error("--record {}: {source}", .path.display())]
+    Mcap {
+        /// The first file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A recording has another name.
+    #[error("--record {}: a recording's name ends in .mcap", .0.display())]
+    Name(PathBuf),
+}
+
 /// Files that are claimed, and not begun.
 #[derive(Debug)]
 pub struct Outputs {
@@ -80,21 +108,24 @@ impl Outputs {
     ///
     /// # Errors
     /// What cannot be written, and what to do.
-    pub fn claim(options: &Options, stopped: &AtomicBool, say: impl FnMut(&str)) -> Result<Self, String> {
+    pub fn claim(
+        options: &Options,
+        stopped: &AtomicBool,
+        say: impl FnMut(&str),
+    ) -> Result<Self, OutputError> {
         let text = options.candump.as_ref().map(|candump| {
-            let failed = |error| format!("--candump {}: {error}", candump.path.display());
+            let failed = |source| OutputError::Candump { path: candump.path.clone(), source };
             Text::create(candump, options.force, stopped).map_err(failed)
         });
         let text = text.transpose()?;
-        let series = options.mcap.as_ref().map(|mcap| {
-            let name = mcap.path.display();
-            if mcap.path.extension().is_none_or(|extension| extension != "mcap") {
-                return Err(format!("--record {name}: a recording's name ends in .mcap"));
+        let series = options.mcap.as_ref().map(|Mcap { path, split, .. }| {
+            let failed = |source| OutputError::Mcap { path: path.clone(), source };
+            if path.extension().is_none_or(|extension| extension != "mcap") {
+                return Err(OutputError::Name(path.clone()));
             }
-            check_regular(&mcap.path, options.force).map_err(|error| format!("--record {name}: {error}"))?;
-            repair::orphans(&mcap.path, say);
-            Series::claim(&mcap.path, options.force, mcap.split)
-                .map_err(|error| format!("--record {name}: {error}"))
+            check_regular(path, options.force).map_err(failed)?;
+            repair::orphans(path, say);
+            Series::claim(path, options.force, *split).map_err(failed)
         });
         Ok(Self { text, series: series.transpose()? })
     }
@@ -121,12 +152,12 @@ impl Outputs {
     ///
     /// # Errors
     /// When there is no thread for it.
-    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> io::Result<Recorder> {
+    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, RunError> {
         let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
         let work = thread::Work::new(self, feed, layout, tell);
-        let (ended, name) = (Arc::clone(&stop), "recorder".to_owned());
-        let thread = std::thread::Builder::new().name(name).spawn(move || work.run(head, &ended))?;
+        let ended = Arc::clone(&stop);
+        let thread = spawn("recorder", move || work.run(head, &ended))?;
         Ok(Recorder { thread, stop, said })
     }
 }

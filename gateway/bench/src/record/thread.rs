@@ -1,11 +1,12 @@
 //! The recorder's thread: takes what has come, writes it, flushes, looks around.
 
+use std::io;
 use std::mem;
 use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::thread;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use protocol::parameters::MAX_JOINTS;
 use rustix::time::{ClockId, clock_gettime};
@@ -17,11 +18,12 @@ use super::force::InForce;
 use super::text::Text;
 use super::topics::Topics;
 use super::{Outputs, Stop};
+use crate::run::realtime::wall;
 use trace::capture::{Note, NoteKind};
 use trace::files::sync;
 use trace::recording::account::{Recording, Written};
 use trace::recording::layout::Layout;
-use trace::recording::series::{Head, Said, Series, What};
+use trace::recording::series::{Head, Said, Series, What, Writer};
 use trace::ros2::skin::Felt;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
@@ -50,15 +52,20 @@ struct Seen {
     epochs: u64,
 }
 
-/// What the thread works on.
-pub(super) struct Work {
+/// The files, and what went wrong with them.
+struct Files {
     text: Option<Text>,
     series: Option<Series<Topics>>,
+    errors: Vec<Said>,
+}
+
+/// What the thread works on.
+pub(super) struct Work {
+    files: Files,
     feed: Feed,
     layout: Layout,
     tell: Sender<String>,
-    errors: Vec<Said>,
-    /// How many of them were told.
+    /// How many errors were told.
     told: usize,
     buses: Vec<Seen>,
     /// Joint positions at the last tick.
@@ -92,12 +99,10 @@ impl Work {
         let Outputs { text, series } = outputs;
         let buses = feed.lanes.iter().map(|_| Seen::default()).collect();
         Self {
-            text,
-            series,
+            files: Files { text, series, errors: Vec::new() },
             feed,
             layout,
             tell,
-            errors: Vec::new(),
             told: 0,
             buses,
             q: None,
@@ -111,7 +116,7 @@ impl Work {
 
     /// Records until someone says stop, and what has come until then.
     pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
-        if let Some(series) = &mut self.series {
+        if let Some(series) = &mut self.files.series {
             series.begin(head, |writer| Topics::new(writer, &self.layout));
         }
         let (mut flush, mut ask, mut diagnose) = (Every::new(FLUSH), Every::new(ASK), Every::new(DIAGNOSE));
@@ -168,28 +173,19 @@ impl Work {
                 Captured::Frame(frame) => {
                     seen.frames += 1;
                     seen.in_force.take(frame);
-                    if let Some(text) = &mut self.text
-                        && let Err(error) = text.frame(name, &frame)
-                    {
-                        self.errors.push(failed(text, &error));
-                    }
-                    if let Some(series) = &mut self.series {
-                        seen.missing += u64::from(!series.is_open());
-                        series.put(What::Frame, |writer, topics| topics.frame(writer, bus, name, &frame));
-                    }
+                    seen.missing += u64::from(self.files.is_between());
+                    self.files.text(|text| text.frame(name, &frame));
+                    self.files.put(What::Frame, |writer, topics| topics.frame(writer, bus, name, &frame));
                 }
                 Captured::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
-                    let (place, total) = (format!("CAN frames on '{name}' socket"), seen.dropped);
-                    let dropped = Dropped { at_nanos, interface: name, frames, place: &place, total };
-                    dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+                    let place = format!("CAN frames on '{name}' socket");
+                    self.files.dropped(at_nanos, name, frames, &place, seen.dropped);
                 }
                 Captured::Unrecorded { at_nanos, frames } => {
                     seen.unrecorded += frames;
                     let place = format!("CAN frames on '{name}' in the queue to the recorder");
-                    let (interface, total, place) = (name.as_str(), seen.unrecorded, place.as_str());
-                    let dropped = Dropped { at_nanos, interface, frames, place, total };
-                    dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+                    self.files.dropped(at_nanos, name, frames, &place, seen.unrecorded);
                 }
             }
         }
@@ -204,10 +200,8 @@ impl Work {
             self.ticks_skipped += timed.record.skipped;
             self.greatest_late_ns = self.greatest_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
-            if let Some(series) = &mut self.series {
-                series
-                    .put(What::Others(4), |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
-            }
+            let layout = &self.layout;
+            self.files.put(What::Others(4), |writer, topics| topics.tick(writer, layout, nanos, &timed));
         }
     }
 
@@ -215,7 +209,7 @@ impl Work {
         let (Some(lane), Some(seen)) = (self.feed.lanes.get_mut(bus), self.buses.get_mut(bus)) else {
             return;
         };
-        let (Some(queue), Some(series)) = (&mut lane.touched, &mut self.series) else { return };
+        let Some(queue) = &mut lane.touched else { return };
         while let Ok(touched) = queue.pop() {
             let cloud = seen.epochs.is_multiple_of(self.layout.epochs_per_cloud);
             let q = self.q.as_ref().filter(|_| cloud);
@@ -223,7 +217,7 @@ impl Work {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                series.put(What::Others(messages), |writer, topics| {
+                self.files.put(What::Others(messages), |writer, topics| {
                     topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -237,13 +231,12 @@ impl Work {
         self.backlog = Some(total);
         if frames > 0 {
             let place = "packets of any network in the kernel's backlog";
-            let dropped = Dropped { at_nanos: wall(), interface: "", frames, place, total };
-            dropped.write(&mut self.text, &mut self.series, &mut self.errors);
+            self.files.dropped(wall(), "", frames, place, total);
         }
     }
 
     fn diagnose(&mut self) {
-        let Some(series) = &mut self.series else { return };
+        let Some(series) = &mut self.files.series else { return };
         let mut parts = vec![Diagnosis {
             level: if self.ticks_skipped > 0 { Level::Warn } else { Level::Ok },
             name: "gateway: control loop".to_owned(),
@@ -275,12 +268,8 @@ impl Work {
     }
 
     fn flush(&mut self) {
-        if let Some(text) = &mut self.text
-            && let Err(error) = text.flush()
-        {
-            self.errors.push(failed(text, &error));
-        }
-        let Some(series) = &mut self.series else { return };
+        self.files.text(Text::flush);
+        let Some(series) = &mut self.files.series else { return };
         // Both halves of what the cells are told stand in one file.
         let now = wall();
         let holds = self.buses.iter().any(|bus| bus.in_force.is_within_a_packet(now));
@@ -298,43 +287,41 @@ impl Work {
             let frames = mem::take(&mut seen.missing);
             if frames > 0 {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
-                let dropped =
-                    Dropped { at_nanos: wall(), interface: name, frames, place: &place, total: frames };
-                dropped.write(&mut None, &mut self.series, &mut self.errors);
+                // The log has them.
+                self.files.note(wall(), name, frames, &dropped(frames, &place, frames));
             }
         }
     }
 
     /// Tells what people should know.
     fn say(&mut self) {
-        if let Some(series) = &mut self.series {
-            self.errors.extend(series.said());
-        }
-        for line in self.errors.get(self.told..).unwrap_or_default() {
+        let Files { series, errors, .. } = &mut self.files;
+        errors.extend(series.iter_mut().flat_map(Series::said));
+        for line in errors.get(self.told..).unwrap_or_default() {
             // Nobody listens any more when the run ends.
             let _ = self.tell.send(line.to_string());
         }
-        self.told = self.errors.len();
+        self.told = errors.len();
     }
 
     /// Leaves a log of what was heard, and else nothing.
     fn discard(mut self) -> Recording {
-        if let Some(series) = &mut self.series {
+        if let Some(series) = &mut self.files.series {
             series.discard();
         }
-        let files: Vec<_> = self.text.and_then(Text::discard).into_iter().collect();
+        let files: Vec<_> = self.files.text.and_then(Text::discard).into_iter().collect();
         Recording { frames: files.iter().map(|file| file.frames).sum(), files, ..Recording::default() }
     }
 
     fn finish(mut self) -> Recording {
         let mut recording = Recording::default();
         let mut lost = 0;
-        if let Some(mut series) = self.series.take() {
+        if let Some(mut series) = self.files.series.take() {
             let (files, unwritten) = series.finish();
             for Written { path, .. } in &files {
                 // While the run lasted the recorder waited for no disk; now nobody waits for the recorder.
                 if let Err(error) = sync(Path::new(path)) {
-                    self.errors.push(Said::Else(format!("{path}: {error}")));
+                    self.files.errors.push(Said::Else(format!("{path}: {error}")));
                 }
             }
             recording.files = files;
@@ -342,16 +329,16 @@ impl Work {
             if unwritten.others > 0 {
                 recording.messages_lost.insert("unwritten", unwritten.others);
             }
-            self.errors.extend(series.said());
+            self.files.errors.extend(series.said());
         }
-        if let Some(text) = self.text.take() {
+        if let Some(text) = self.files.text.take() {
             let path = text.path().display().to_string();
             let (file, unwritten, finished) = text.finish();
             recording.files.push(file);
             lost = lost.max(unwritten);
             // What was said before is the reason.
             if let Err(error) = finished {
-                self.errors.push(Said::BrokeOff(format!("{path}: {error}")));
+                self.files.errors.push(Said::BrokeOff(format!("{path}: {error}")));
             }
         }
         self.say();
@@ -361,47 +348,55 @@ impl Work {
         recording.lost = lost;
         let spent = Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default();
         recording.processor_s = spent.as_secs_f64();
-        recording.errors = self.errors.iter().map(|said| said.what().to_owned()).collect();
+        recording.errors = self.files.errors.iter().map(|said| said.what().to_owned()).collect();
         recording
     }
 }
 
-/// Frames that are missing from here on.
-struct Dropped<'a> {
-    at_nanos: u64,
-    /// The bus, if it is known.
-    interface: &'a str,
-    frames: u64,
-    /// Which frames, and where.
-    place: &'a str,
-    total: u64,
-}
+impl Files {
+    /// Whether one file of a recording has ended and the next has not begun.
+    fn is_between(&self) -> bool {
+        self.series.as_ref().is_some_and(|series| !series.is_open())
+    }
 
-impl Dropped<'_> {
-    /// Says it in every format.
-    fn write(&self, text: &mut Option<Text>, series: &mut Option<Series<Topics>>, errors: &mut Vec<Said>) {
-        let Self { at_nanos: nanos, interface, frames, place, total } = *self;
-        let line = format!("DROPCOUNT: dropped {frames} {place} (total drops {total})");
-        if let Some(text) = text
-            && let Err(error) = text.note(&line)
+    /// Writes to the log, if there is one.
+    fn text(&mut self, write: impl FnOnce(&mut Text) -> io::Result<()>) {
+        if let Some(text) = &mut self.text
+            && let Err(error) = write(text)
         {
-            errors.push(failed(text, &error));
+            self.errors.push(Said::BrokeOff(format!("{}: {error}", text.path().display())));
         }
-        if let Some(series) = series {
-            let kind = NoteKind::Dropped(frames);
-            let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-            series.put(What::Others(1), |writer, topics| topics.note(writer, &note));
+    }
+
+    /// Writes to the recording, if there is one.
+    fn put(&mut self, what: What, write: impl FnOnce(&mut Writer, &mut Topics) -> io::Result<()>) {
+        if let Some(series) = &mut self.series {
+            series.put(what, write);
         }
+    }
+
+    /// Says in every format that frames of a bus, if it is known, are missing from here on: which, and where.
+    fn dropped(&mut self, nanos: u64, interface: &str, frames: u64, place: &str, total: u64) {
+        let line = dropped(frames, place, total);
+        self.text(|text| text.note(&line));
+        self.note(nanos, interface, frames, &line);
+    }
+
+    /// Says it in the recording alone.
+    fn note(&mut self, nanos: u64, interface: &str, frames: u64, line: &str) {
+        let kind = NoteKind::Dropped(frames);
+        let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
+        self.put(What::Others(1), |writer, topics| topics.note(writer, &note));
     }
 }
 
-fn failed(text: &Text, error: &std::io::Error) -> Said {
-    Said::BrokeOff(format!("{}: {error}", text.path().display()))
+fn dropped(frames: u64, place: &str, total: u64) -> String {
+    format!("DROPCOUNT: dropped {frames} {place} (total drops {total})")
 }
 
 /// How a bus is.
 fn bus(lane: &Lane, name: &str, seen: &Seen) -> Diagnosis {
-    let works = lane.works.load(Ordering::Relaxed);
+    let works = lane.state.is_there();
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = lane.view.lock() {
         cells = view.cells.len();
@@ -424,10 +419,4 @@ fn bus(lane: &Lane, name: &str, seen: &Seen) -> Diagnosis {
             ("dropped", seen.dropped.to_string()),
         ],
     }
-}
-
-/// The wall clock in ns since 1970.
-fn wall() -> u64 {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }

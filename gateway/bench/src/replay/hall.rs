@@ -1,11 +1,23 @@
 //! Where those who send and those who hear meet.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::Sender;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::Duration;
 
+use protocol::bus::Inbox;
+use protocol::time::Micros;
+
 use super::judge::Judge;
+use super::start::Lane;
+use crate::run::realtime;
+use crate::run::roots::Roots;
+use model::decode::{Decoded, Decoder};
+
+/// How often it is looked whether to go on.
+const LOOK: Duration = Duration::from_millis(50);
+/// The pause while an interface is down.
+const DOWN: Duration = Duration::from_millis(20);
 
 /// What all threads of a replay look at.
 #[derive(Debug)]
@@ -53,15 +65,54 @@ impl Hall {
     pub(super) fn is_over(&self) -> bool {
         self.over.load(Ordering::Relaxed)
     }
-}
 
-/// What threads have to say to people.
-#[derive(Clone, Debug)]
-pub(super) struct Voice(pub(super) Sender<String>);
+    /// Takes in that a bus is down.
+    pub(super) fn is_down(&self, lane: usize) {
+        self.judge().is_down(lane);
+        self.has_heard();
+    }
 
-impl Voice {
-    pub(super) fn say(&self, text: String) {
-        // Nobody listens any more at the end.
-        let _ = self.0.send(text);
+    /// Hears a bus until it is over, and is the gateway's side of its roots' wires; returns how many frames came faster
+    /// than they were heard.
+    pub(super) fn hear(&self, index: usize, lane: &Lane, mut roots: Option<Roots>) -> u64 {
+        realtime::prepare_receiver();
+        let (bus, mut inbox, mut decoder) = (&lane.bus, Inbox::new(), Decoder::new(Some(lane.format)));
+        // Its cells may be there already, and organise themselves as they come.
+        roots.iter_mut().for_each(Roots::explore);
+        while !self.deaf.load(Ordering::Relaxed) {
+            if let Some(roots) = &mut roots {
+                roots.speak(bus);
+            }
+            let patience = roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
+            match bus
+                .wait(Some(patience))
+                .and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) })
+            {
+                Ok(0) => continue,
+                Ok(_) => {}
+                Err(error) => {
+                    self.is_down(index);
+                    if !error.may_pass() {
+                        // Whoever sends next hears it too, and says so.
+                        break;
+                    }
+                    thread::sleep(DOWN);
+                    continue;
+                }
+            }
+            let mut judge = self.judge();
+            for received in inbox.frames().filter(|received| !received.own) {
+                if roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
+                    continue;
+                }
+                let at = Micros(received.at_nanos / 1_000);
+                if let Decoded::Message(message) = decoder.decode(at, bus.name(), &received.frame) {
+                    judge.hear(index, &message);
+                }
+            }
+            drop(judge);
+            self.has_heard();
+        }
+        inbox.dropped().into()
     }
 }

@@ -3,19 +3,24 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError};
-use protocol::can::{Format, Frame};
+use protocol::bus::BusError;
+use protocol::can::Frame;
 use protocol::id::{CellId, Node};
-use protocol::message::{Message, Request, State as Flags};
-use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::Parameter;
+use protocol::message::{Message, State as Flags};
+use protocol::packet::Epoch;
 
-use super::hall::{Hall, Voice};
+use super::ReplayError;
+use super::checks::Checks;
+use super::hall::Hall;
+use super::judge::Present;
+use super::meet::mode;
 use super::player::{Open, Sent, Stage};
-use super::start::Checks;
+use super::start::Lane;
 use crate::run::realtime;
+use crate::setup::names;
 
 /// How often it is looked whether somebody has said stop.
 const LOOK_NS: u64 = 100_000_000;
@@ -34,39 +39,26 @@ const ANSWERS: Duration = Duration::from_millis(100);
 /// So many times as long at most.
 const LONGEST: u32 = 4;
 
-/// One bus.
-#[derive(Debug)]
-pub(super) struct Lane {
-    pub(super) bus: Arc<Bus>,
-    pub(super) format: Format,
-}
-
-impl Lane {
-    pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
-        message.encode().frames(self.format)
-    }
-}
-
 /// The machine's clock, and buses.
 #[derive(Debug)]
 pub(super) struct Live {
     pub(super) lanes: Arc<Vec<Lane>>,
     pub(super) hall: Arc<Hall>,
-    pub(super) voice: Voice,
+    /// For people.
+    pub(super) voice: Sender<String>,
     /// How long before its time a frame is waited for by spinning, in ns.
     pub(super) spin_ns: u64,
     /// Whether nothing is lost by waiting for an interface that is down.
     pub(super) may_wait: bool,
-    pub(super) expects: bool,
     /// What has to hold before the first frame is sent.
-    pub(super) checks: Checks,
+    pub(super) checks: Arc<Checks>,
     /// Cells that did not answer in lockstep, by bus.
     pub(super) silent: Vec<(usize, CellId)>,
     /// Joints that were asked again.
     pub(super) asked_again: u64,
     /// The buses on which that was in vain the last time.
     pub(super) in_vain: BTreeSet<usize>,
-    pub(super) down: Vec<bool>,
+    pub(super) down: BTreeSet<usize>,
 }
 
 impl Stage for Live {
@@ -101,25 +93,20 @@ impl Stage for Live {
     }
 
     fn send(&mut self, index: usize, frames: &[Frame]) -> Sent {
-        let (Some(lane), Some(down)) = (self.lanes.get(index), self.down.get_mut(index)) else {
-            return Sent::All;
-        };
+        let Some(lane) = self.lanes.get(index) else { return Sent::All };
         let sent = lane.bus.send(frames);
         let taken = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
         self.hall.sent.fetch_add(taken as u64, Ordering::Relaxed);
-        let name = lane.bus.name();
-        if *down && taken > 0 {
-            *down = false;
-            self.voice.say(format!("{name} works again"));
+        if taken > 0 && self.down.remove(&index) {
+            self.say(format!("{} works again", lane.bus.name()));
         }
         match sent.map_err(|error| error.cause) {
             Ok(()) => Sent::All,
             Err(BusError::Full { .. }) => Sent::Full(taken),
             Err(error @ BusError::Down { .. }) => {
-                if !*down {
-                    *down = true;
+                if self.down.insert(index) {
                     self.hall.judge().is_down(index);
-                    self.voice.say(format!("{error}; what is due meanwhile is lost, and counted"));
+                    self.say(format!("{error}; what is due meanwhile is lost, and counted"));
                 }
                 if self.may_wait {
                     std::thread::sleep(DOWN);
@@ -136,7 +123,7 @@ impl Stage for Live {
 
     fn wait_for_answers(&mut self, lane: usize, open: &Open) {
         self.wait_until_done(lane);
-        let Some(round) = open.round.filter(|_| self.expects) else { return };
+        let Some(round) = open.round.filter(|_| self.checks.expects) else { return };
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
         // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
         // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
@@ -175,9 +162,9 @@ impl Stage for Live {
         }
     }
 
-    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String> {
+    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
         for (lane, messages) in states {
-            self.settle(*lane)?;
+            self.finish(*lane, &[Message::Sync])?;
             self.hall.judge().mute(true);
             let mut all = self.forgetting(*lane);
             all.extend_from_slice(messages);
@@ -187,10 +174,10 @@ impl Stage for Live {
                 }
                 self.tell(*lane, core::slice::from_ref(message))?;
             }
-            self.settle(*lane)?;
+            self.finish(*lane, &[Message::Sync])?;
             self.hall.judge().mute(false);
         }
-        self.checks.hashes(&self.hall.judge())
+        Ok(self.checks.hashes(&self.hall.judge())?)
     }
 
     fn show(&mut self, at: u64) {
@@ -202,37 +189,32 @@ impl Live {
     /// What makes the cells of a bus that are there forget what they felt, and obey what comes.
     fn forgetting(&self, lane: usize) -> Vec<Message> {
         let judge = self.hall.judge();
-        let obeys =
-            |cell: &super::judge::Present| cell.claim.is_settled() && cell.claim.says(Flags::TEST_MODE);
+        let obeys = |cell: &Present| cell.claim.is_settled() && cell.claim.says(Flags::TEST_MODE);
         let obeying: Vec<_> =
             judge.present(lane).filter(|(_, cell)| obeys(cell)).map(|(cell, _)| cell).collect();
         obeying.into_iter().map(|cell| mode(Node::Cell(cell), true)).collect()
     }
 
-    /// Sends messages of this replay's own.
-    fn tell(&self, lane: usize, messages: &[Message]) -> Result<(), String> {
-        let Some(line) = self.lanes.get(lane) else { return Ok(()) };
-        let frames: Vec<_> = messages.iter().flat_map(|message| line.frames(message)).collect();
-        match line.bus.send(&frames).map_err(|error| error.cause) {
-            Ok(()) => Ok(()),
-            Err(error) => Err(error.to_string()),
-        }
+    fn tell(&self, lane: usize, messages: &[Message]) -> Result<(), BusError> {
+        self.lanes.get(lane).map_or(Ok(()), |lane| lane.send(messages))
     }
 
-    /// Waits until the cells of a bus have done all that was sent so far.
-    pub(super) fn settle(&mut self, lane: usize) -> Result<(), String> {
+    /// Says something to people; nobody listens any more at the end.
+    fn say(&self, text: String) {
+        let _ = self.voice.send(text);
+    }
+
+    /// Waits until the cells of a bus have done all that was sent so far, and this.
+    fn finish(&mut self, lane: usize, last: &[Message]) -> Result<(), BusError> {
         self.hall.judge().announce_again(lane);
-        self.tell(lane, &[Message::Sync])?;
+        self.tell(lane, last)?;
         self.wait_until_done(lane);
         Ok(())
     }
 
     /// Asks for counters, and waits for them.
-    pub(super) fn report(&mut self, lane: usize) -> Result<(), String> {
-        self.hall.judge().announce_again(lane);
-        self.tell(lane, &[Message::Report, Message::Sync])?;
-        self.wait_until_done(lane);
-        Ok(())
+    pub(super) fn report(&mut self, lane: usize) -> Result<(), BusError> {
+        self.finish(lane, &[Message::Report, Message::Sync])
     }
 
     fn wait_until_done(&mut self, lane: usize) {
@@ -251,10 +233,10 @@ impl Live {
             if progress.elapsed() > PATIENCE {
                 let late = judge.give_up(lane);
                 self.silent.extend(late.iter().map(|cell| (lane, *cell)));
-                let name = self.lanes.get(lane).map_or("", |lane| lane.bus.name());
-                let (cells, plural) = (super::start::names(&late), if late.len() == 1 { "" } else { "s" });
+                let name = self.checks.lane(lane);
+                let (cells, plural) = (names(&late, ""), if late.len() == 1 { "" } else { "s" });
                 let verb = if late.len() == 1 { "does" } else { "do" };
-                self.voice.say(format!(
+                self.say(format!(
                     "cell{plural} {cells} on {name} {verb} not answer within {} s: the replay goes on without",
                     PATIENCE.as_secs()
                 ));
@@ -263,14 +245,4 @@ impl Live {
             judge = self.hall.wait(judge, Duration::from_millis(20));
         }
     }
-}
-
-/// The message that makes cells obey stimuli, or measure; either way they forget all stimuli.
-pub(super) fn mode(to: Node, obeys: bool) -> Message {
-    let mut words = [0; WORDS];
-    if let Some(word) = words.first_mut() {
-        *word = i16::from(obeys);
-    }
-    let request = Request::Write { number: Parameter::Mode.number(), words };
-    Message::Configure { to, tag: 0, request }
 }

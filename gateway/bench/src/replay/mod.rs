@@ -13,52 +13,54 @@
 //! What decides is pure: [`survey`], [`state`], [`trace::order`], [`reel`], [`player`] (its clock and buses are a
 //! [`player::Stage`]), [`judge`] and [`difference`]. The rest is threads, sockets and the clock.
 
+mod checks;
 pub mod difference;
-mod ear;
-mod feed;
+mod error;
 mod hall;
 pub mod judge;
 mod live;
+mod meet;
 pub mod player;
 pub mod reel;
 pub mod report;
 mod session;
+mod source;
 mod start;
 pub mod state;
 pub mod survey;
-mod teller;
 pub mod touched;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::thread;
 use std::time::Duration;
 
-use hdrhistogram::Histogram;
 use protocol::bus::Kinds;
 use protocol::id::CellId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use crate::run::{RunError, realtime};
+use self::checks::Checks;
+pub use self::checks::Mismatch;
+pub use self::error::ReplayError;
+use self::hall::Hall;
+use self::judge::Judge;
+use self::player::Pace;
+use self::reel::Only;
+use self::report::Summary;
+use self::session::Session;
+use self::start::Routes;
+use self::survey::{Part, Survey};
+use crate::run::RunError;
+use crate::run::progress::Progress;
+use crate::run::realtime::idle_lateness;
+use crate::setup::names;
 use crate::signals::caught;
-use judge::Judge;
 use model::decode::BUSES;
 use model::decode::pick::Pick;
-use model::quantiles::histogram;
-use player::Pace;
-use reel::Only;
-use report::Summary;
-use session::Session;
-use start::{Checks, Routes};
-use survey::{Part, Survey};
-use teller::Teller;
-use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
+use trace::capture::{Entry, Extras, NoteKind, Reader};
 
 /// The period of wake-ups at which lateness is judged, in ns.
 const GRID_NS: u64 = 2_000_000;
-/// Wake-ups of the idle machine that are measured.
-const IDLE_WAKEUPS: u32 = 100;
 /// Lines of a log that cannot be read are named up to so many.
 const NAMED_LINES: u64 = 5;
 
@@ -121,93 +123,74 @@ pub struct Options {
 /// # Errors
 /// When it cannot begin, or could not be read to its end. What went wrong on the buses and in the comparison is in the
 /// summary.
-pub fn replay(options: &Options) -> Result<Summary, RunError> {
-    let teller = Teller::new(options.quiet);
-    let (survey, extras, name) = look_through(options, &teller)?;
-    let survey = Arc::new(survey);
+pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
+    let progress = Progress::lines(options.quiet);
+    let (survey, extras, name) = look_through(options, &progress)?;
     let routes = Routes::new(options, &survey, &name)?;
     let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
     let wearing = wearing.transpose()?;
     // Until now there was nothing that had to be put in order at an end.
-    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::Failed)?;
-    let idle = matches!(options.pace, Pace::Timed(_)).then(idle_lateness);
+    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::from)?;
+    let idle = matches!(options.pace, Pace::Timed(_)).then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;
     for lane in buses.lanes.iter() {
-        teller.say(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
+        progress.note(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
     }
     let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let heard = if speaks { buses.listen()? } else { Vec::new() };
+    let (expects, spawned) = (options.expect, options.spawn.is_some());
+    let checks = Arc::new(Checks { survey, routes, expects, spawned, name });
     if let (Some(spawn), Some(wearing)) = (&options.spawn, &wearing) {
         buses.start_cells(spawn, wearing, &heard)?;
     } else if options.only == Only::All {
-        warn_of_doubles(&survey, &routes, &heard, &teller);
+        warn_of_doubles(&checks, &heard, &progress);
     }
-
-    let checks = Checks {
-        survey: Arc::clone(&survey),
-        routes: routes.clone(),
-        expects: options.expect,
-        spawned: options.spawn.is_some(),
-        name,
-    };
-    let judged = routes
-        .names
-        .iter()
-        .filter_map(|(bus, name)| Some((name.clone(), survey.buses.get(*bus)?.cells.clone())));
-    let judge = Judge::new(judged, survey.first.unwrap_or(0), options.expect);
-    Session::new(options, checks, judge, buses, signalled, teller).run(idle.as_ref(), wearing.as_ref())
+    let judged = checks.lanes().filter_map(|(name, bus)| Some((name.to_owned(), bus?.cells.clone())));
+    let judge = Judge::new(judged, checks.survey.first.unwrap_or(0), expects);
+    let hall = Arc::new(Hall::new(judge));
+    let session = Session { options, checks, hall, buses, signalled, progress, measuring: Vec::new() };
+    session.run(idle.as_ref(), wearing.as_ref())
 }
 
 /// Reads the capture once, from end to end; also what it is called.
-fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, String), RunError> {
+fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extras, String), ReplayError> {
     if options.files.iter().any(|file| file.as_os_str() == "-") {
-        return Err(RunError::Usage(
-            "a capture is read twice, which standard input cannot be: write it to a file, and name that"
-                .to_owned(),
-        ));
+        return Err(ReplayError::StandardInput);
     }
-    if let Some(pipe) =
-        options.files.iter().find(|it| it.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
-    {
-        return Err(RunError::Usage(format!(
-            "{} is no regular file, and a capture is read twice: write it to a file, and name that",
-            pipe.display()
-        )));
+    let is_pipe = |file: &&PathBuf| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir());
+    if let Some(pipe) = options.files.iter().find(is_pipe) {
+        return Err(ReplayError::Pipe(pipe.clone()));
     }
-    let mut reader = Reader::open_all(&options.files).map_err(|error| RunError::Usage(error.to_string()))?;
+    let mut reader = Reader::open_all(&options.files).map_err(ReplayError::Open)?;
     let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    let too_many = |buses: usize| {
-        let why = "a replay sends to no more than that";
-        (buses > BUSES)
-            .then(|| RunError::Usage(format!("{name} has frames of more than {BUSES} buses: {why}")))
-    };
+    let few = |buses: usize| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     // What was in force stands before the first frame, and is known when it is open.
     let in_force = &reader.extras().in_force;
     let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
-    too_many(buses.len()).map_or(Ok(()), Err)?;
+    few(buses.len())?;
     survey.begin(in_force);
     let (mut unreadable, mut backwards) = (0_u64, None);
-    while let Some(entry) = reader.next().map_err(failed)? {
+    while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
         match entry {
             Entry::Frame(record) => {
                 if record.time.nanos < survey.last && backwards.is_none() {
                     backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
                 }
                 survey.take(&record);
-                too_many(survey.buses.len()).map_or(Ok(()), Err)?;
+                few(survey.buses.len())?;
             }
             Entry::Note(note) => match note.kind {
                 NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
                     if options.strict {
-                        return Err(RunError::Failed(line));
+                        return Err(ReplayError::Line(line));
                     }
                     unreadable += 1;
                     if unreadable <= NAMED_LINES {
-                        teller.say(&line);
+                        progress.note(&line);
                     }
                 }
                 NoteKind::Text | NoteKind::CanXl => {}
@@ -216,57 +199,41 @@ fn look_through(options: &Options, teller: &Teller) -> Result<(Survey, Extras, S
     }
     survey.finish();
     if unreadable > 0 {
-        teller.say(&format!("{name}: lines that could not be read and are left out: {unreadable}"));
+        progress.note(&format!("{name}: lines that could not be read and are left out: {unreadable}"));
     }
     if survey.dropped > 0 {
-        teller.say(&format!("{name}: {} frames are missing: whoever took it lost them", survey.dropped));
+        progress.note(&format!("{name}: {} frames are missing: whoever took it lost them", survey.dropped));
     }
     if let Some(what) = &reader.extras().unfinished {
-        teller.say(&format!("{name}: {what}"));
+        progress.note(&format!("{name}: {what}"));
     }
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
-        teller.say(&format!(
+        progress.note(&format!(
             "{name}: times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \
              before it is sent at once"
         ));
     }
     if survey.frames == 0 {
-        return Err(RunError::Usage(format!("{name}: there is no frame in it")));
+        return Err(ReplayError::Empty(name));
     }
     let (from, to) = survey.bounds();
     if from > survey.last || from >= to {
-        let length = Duration::from_nanos(survey.last - survey.first.unwrap_or(0)).as_secs_f64();
-        return Err(RunError::Usage(format!(
-            "nothing is left to be sent: {name} lasts {length:.3} s from its first frame on, and --from and --to \
-             leave none of it"
-        )));
+        let seconds = Duration::from_nanos(survey.last - survey.first.unwrap_or(0)).as_secs_f64();
+        return Err(ReplayError::NothingLeft { name, seconds });
     }
     Ok((survey, reader.extras().clone(), name))
 }
 
-fn failed(error: CaptureError) -> RunError {
-    RunError::Failed(error.to_string())
-}
-
-/// Measured in a thread as punctual as the player's.
-fn idle_lateness() -> Histogram<u64> {
-    let measure = || {
-        realtime::prepare();
-        realtime::idle_lateness(GRID_NS, IDLE_WAKEUPS)
-    };
-    thread::spawn(measure).join().unwrap_or_else(|_| histogram())
-}
-
 /// Cells that speak already are about to hear themselves.
-fn warn_of_doubles(survey: &Survey, routes: &Routes, heard: &[BTreeSet<CellId>], teller: &Teller) {
-    for ((bus, name), heard) in routes.names.iter().zip(heard) {
-        let Some(bus) = survey.buses.get(*bus) else { continue };
+fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
+    for ((name, bus), heard) in checks.lanes().zip(heard) {
+        let Some(bus) = bus else { continue };
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
-            teller.say(&format!(
+            progress.note(&format!(
                 "cells that are on {name} will hear their own words of the capture: {}; --only inputs leaves these out",
-                start::names(&both)
+                names(&both, "")
             ));
         }
     }

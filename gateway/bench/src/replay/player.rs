@@ -13,6 +13,7 @@ use protocol::message::{Joints, Message};
 use protocol::packet::Epoch;
 use serde::Serialize;
 
+use super::ReplayError;
 use super::reel::{Due, Role, Step};
 use model::quantiles::histogram;
 
@@ -65,14 +66,14 @@ pub trait Stage {
     ///
     /// # Errors
     /// When the cells are then not as they have to be, or a bus has ended.
-    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), String>;
+    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
     /// The replay is there, in ns after its first frame.
     fn show(&mut self, at: u64);
 }
 
 /// The next step.
 #[derive(Debug)]
-pub enum Next<'a> {
+enum Next<'a> {
     /// This.
     Step(&'a Step),
     /// It is not there yet.
@@ -81,12 +82,15 @@ pub enum Next<'a> {
     End,
 }
 
-/// Where steps come from.
-pub trait Feed {
-    /// The next step, which stays there.
-    fn peek(&mut self) -> Next<'_>;
-    /// Takes it away.
-    fn take(&mut self) -> Option<Step>;
+/// Looks at the next step, which stays there.
+fn next(steps: &rtrb::Consumer<Step>) -> Next<'_> {
+    // Looked at before the queue, or what is pushed between the two would be missed.
+    let is_last = steps.is_abandoned();
+    match steps.peek() {
+        Ok(step) => Next::Step(step),
+        Err(_) if is_last => Next::End,
+        Err(_) => Next::Later,
+    }
 }
 
 /// How fast.
@@ -163,25 +167,25 @@ impl Player {
     }
 
     /// Sends all, or until somebody says stop or a bus has ended.
-    pub fn play(mut self, feed: &mut impl Feed, stage: &mut impl Stage) -> Played {
+    pub fn play(mut self, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) -> Played {
         while self.played.failure.is_none() {
             if stage.is_over() {
                 self.played.was_stopped = true;
                 break;
             }
-            match feed.peek() {
+            match next(steps) {
                 Next::End => break,
                 Next::Later => stage.pause(),
                 Next::Step(Step::Restore(_)) => {
                     self.wait_for_all(stage);
-                    if let Some(Step::Restore(states)) = feed.take() {
-                        self.played.failure = stage.restore(&states).err();
+                    if let Ok(Step::Restore(states)) = steps.pop() {
+                        self.played.failure = stage.restore(&states).err().map(|error| error.to_string());
                         self.origin = None;
                     }
                 }
                 Next::Step(Step::Frame(due)) => {
                     let due = *due;
-                    self.frames_from(&due, feed, stage);
+                    self.frames_from(&due, steps, stage);
                 }
             }
         }
@@ -220,7 +224,7 @@ impl Player {
     }
 
     /// Sends a frame when it is due, and with it those behind it that are due by then on the same bus.
-    fn frames_from(&mut self, first: &Due, feed: &mut impl Feed, stage: &mut impl Stage) {
+    fn frames_from(&mut self, first: &Due, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) {
         let lane = first.lane;
         if self.syncs.is_some() && is_joints(first) {
             self.wait_for_answers(lane, stage);
@@ -230,7 +234,7 @@ impl Player {
         let deadline = self.deadline(first, stage.now());
         // Whoever hears the answer has to know the question, and afterwards there is no time for that.
         let mut open = self.push(first, stage);
-        let _ = feed.take();
+        let _ = steps.pop();
         if let Some(deadline) = deadline {
             stage.wait_until(deadline);
         }
@@ -239,8 +243,7 @@ impl Player {
         stage.show(first.at);
         // In lockstep joints end a batch: what comes next has to wait, or belongs to the next ones.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
-            let Next::Step(Step::Frame(next)) = feed.peek() else { break };
-            let next = *next;
+            let Next::Step(&Step::Frame(next)) = next(steps) else { break };
             let waits =
                 self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
             let deadline = self.deadline(&next, now);
@@ -249,7 +252,7 @@ impl Player {
             }
             self.was_late(deadline, now);
             open = self.push(&next, stage).or(open);
-            let _ = feed.take();
+            let _ = steps.pop();
         }
         let frames = self.batch.len();
         let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(lane)).filter(|_| open.is_some());
@@ -283,10 +286,12 @@ impl Player {
         };
         let (taken, is_down, failure) = match sent {
             Sent::All => (frames, false, None),
-            Sent::Full(taken) => (taken.min(frames), false, None),
-            Sent::Down(taken) => (taken.min(frames), true, None),
-            Sent::Ended(taken, why) => (taken.min(frames), true, Some(why)),
+            Sent::Full(taken) => (taken, false, None),
+            Sent::Down(taken) => (taken, true, None),
+            Sent::Ended(taken, why) => (taken, true, Some(why)),
         };
+        // A sync may be behind them.
+        let taken = taken.min(frames);
         let rest = (frames - taken) as u64;
         tally.sent += taken as u64;
         if is_down {

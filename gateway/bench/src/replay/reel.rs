@@ -103,8 +103,6 @@ pub struct Cut {
     pub skipped: Skipped,
     /// Frames that were older than one sent before them.
     pub late: u64,
-    /// The first of these: which frame of the capture it is, from 1, and by how many ns its time runs backwards.
-    pub first_late: Option<(u64, u64)>,
 }
 
 /// Whether there is more to come.
@@ -121,7 +119,6 @@ pub enum Flow {
 struct Waiting {
     bus: usize,
     frame: Frame,
-    number: u64,
 }
 
 /// One pass over a capture, or several.
@@ -132,7 +129,6 @@ pub struct Reel<'a> {
     order: Order<Waiting>,
     settler: Settler<Ordered<Waiting>>,
     cut: Cut,
-    read: u64,
     /// When this pass begins, in ns after the first one.
     offset: u64,
     /// The times of the first and the last frame of this pass that are sent.
@@ -151,7 +147,6 @@ impl<'a> Reel<'a> {
             order: Order::default(),
             settler: Settler::new(None),
             cut: Cut::default(),
-            read: 0,
             offset: 0,
             sent: None,
             counts: (0, 0),
@@ -160,12 +155,11 @@ impl<'a> Reel<'a> {
 
     /// Takes the capture's next frame.
     pub fn take(&mut self, record: &Record<'_>, judge: &mut Judge, mut out: impl FnMut(Step)) -> Flow {
-        self.read += 1;
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
             return Flow::More;
         };
-        self.order.push(bus, record.time.nanos, Waiting { bus, frame: record.frame, number: self.read });
+        self.order.push(bus, record.time.nanos, Waiting { bus, frame: record.frame });
         while let Some(next) = self.order.pop() {
             self.settle(next);
             if self.place_settled(judge, &mut out) == Flow::Enough {
@@ -208,7 +202,6 @@ impl<'a> Reel<'a> {
             self.offset += last - first + gap;
         }
         self.counts = (0, 0);
-        self.read = 0;
     }
 
     /// The messages that bring about the state in force where the part begins.
@@ -245,7 +238,7 @@ impl<'a> Reel<'a> {
         if next.at >= to.saturating_add(LATE_REPLIES_NS) {
             return Flow::Enough;
         }
-        let Waiting { bus, frame, number } = next.item;
+        let Waiting { bus, frame } = next.item;
         let is_in_part = (from..to).contains(&next.nanos);
         let unwanted = if next.nanos < from {
             Some(reason::BEFORE)
@@ -260,11 +253,7 @@ impl<'a> Reel<'a> {
             return Flow::More;
         }
         let Some(lane) = self.selection.lanes.get(bus).copied().flatten() else { return Flow::More };
-        if next.is_late {
-            self.cut.late += 1;
-            let back = next.at - next.nanos;
-            self.cut.first_late.get_or_insert((number, back));
-        }
+        self.cut.late += u64::from(next.is_late);
         let (first, last) = self.sent.get_or_insert((next.at, next.at));
         *last = next.at;
         let at = self.offset + (next.at - *first);

@@ -5,7 +5,7 @@
 use std::collections::VecDeque;
 
 use protocol::skin::Skin;
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 
 use crate::summary::{Halted, TickBefore};
 use control::cycle::Halt;
@@ -118,9 +118,8 @@ fn reason(why: Halt) -> String {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "times far below 2^53 us")]
 fn seconds(time: Micros) -> f64 {
-    time.0 as f64 / 1e6
+    Span(time.0).seconds()
 }
 
 #[cfg(test)]

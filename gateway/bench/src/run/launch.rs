@@ -1,6 +1,7 @@
 //! The processes of a bench: embedded buses and cells. All of them end with the gateway, however it
 //! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
 
+use std::fmt::{self, Display, Formatter};
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -89,7 +90,7 @@ impl ServedBus {
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
         apart(&mut command, directory);
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
-        let mut served = Self { bus: bus.to_owned(), child: command.spawn().map_err(start)? };
+        let mut served = Self { bus: bus.to_owned(), child: spawn(&mut command)? };
         let mut line = String::new();
         if let Some(out) = served.child.stdout.take() {
             BufReader::new(out).read_line(&mut line).map_err(start)?;
@@ -147,25 +148,18 @@ impl Drop for ServedBus {
     }
 }
 
-/// How a process is told which cells it is.
-#[derive(Clone, Debug)]
-struct Start {
-    program: PathBuf,
-    arguments: Vec<String>,
-    directory: Option<PathBuf>,
-}
-
 /// The process of one cell or of several.
 #[derive(Debug)]
 struct Process {
-    start: Start,
+    /// What started it, and does so again.
+    command: Command,
     bus: usize,
     nodes: (u8, u8),
     child: Child,
     ended: bool,
 }
 
-/// A process that ended by itself or was killed.
+/// A process that ended by itself or was killed; displayed as its cells.
 #[derive(Clone, Copy, Debug)]
 pub struct Ended {
     /// Its bus.
@@ -174,6 +168,15 @@ pub struct Ended {
     pub nodes: (u8, u8),
     /// How it ended.
     pub status: ExitStatus,
+}
+
+impl Display for Ended {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match self.nodes {
+            (first, last) if first == last => write!(f, "cell {first}"),
+            (first, last) => write!(f, "cells {first} to {last}"),
+        }
+    }
 }
 
 /// All cells' processes.
@@ -216,9 +219,9 @@ impl Processes {
             let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
             nodes.sort_unstable();
             for nodes in groups(&nodes, plan.per_process) {
-                let start = plan.of(&described.name, nodes);
-                let child = start.spawn()?;
-                processes.all.push(Process { start, bus, nodes, child, ended: false });
+                let mut command = plan.of(&described.name, nodes);
+                let child = spawn(&mut command)?;
+                processes.all.push(Process { command, bus, nodes, child, ended: false });
             }
         }
         Ok(processes)
@@ -259,7 +262,7 @@ impl Processes {
             ProcessAction::Restart => {
                 process.signal(Signal::KILL);
                 let _ = process.child.wait();
-                process.child = process.start.spawn()?;
+                process.child = spawn(&mut process.command)?;
                 process.ended = false;
             }
         }
@@ -289,33 +292,29 @@ impl Drop for Processes {
 }
 
 impl Plan<'_> {
-    fn of(&self, bus: &str, (first, last): (u8, u8)) -> Start {
-        let mut arguments = vec!["--bus".to_owned(), bus.to_owned()];
+    fn of(&self, bus: &str, (first, last): (u8, u8)) -> Command {
+        let mut command = Command::new(self.program);
+        command.args(["--bus", bus]);
         if first == last {
-            arguments.extend(["--node".to_owned(), first.to_string()]);
+            command.args(["--node", &first.to_string()]);
         } else {
-            arguments.extend(["--nodes".to_owned(), format!("{first}-{last}")]);
+            command.args(["--nodes", &format!("{first}-{last}")]);
         }
-        arguments.extend(["--skin".to_owned(), self.skin_file.display().to_string()]);
         // A bus that is lost is served or made again, and the cells on it are the same.
-        arguments.push("--reconnect".to_owned());
-        arguments.extend(["--bus-kind".to_owned(), self.kinds.of(bus).to_string()]);
-        arguments.extend(["--with-parent".to_owned(), std::process::id().to_string()]);
+        command.arg("--skin").arg(self.skin_file).arg("--reconnect");
+        command.args(["--bus-kind", &self.kinds.of(bus).to_string()]);
+        command.args(["--with-parent", &std::process::id().to_string()]);
         if let Some(flash) = self.flash {
-            arguments.extend(["--flash".to_owned(), flash.display().to_string()]);
+            command.arg("--flash").arg(flash);
         }
-        let directory = self.directory.map(Path::to_owned);
-        Start { program: self.program.to_owned(), arguments, directory }
+        command.stdin(Stdio::null()).stdout(Stdio::null());
+        apart(&mut command, self.directory);
+        command
     }
 }
 
-impl Start {
-    fn spawn(&self) -> Result<Child, LaunchError> {
-        let mut command = Command::new(&self.program);
-        command.args(&self.arguments).stdin(Stdio::null()).stdout(Stdio::null());
-        apart(&mut command, self.directory.as_deref());
-        command.spawn().map_err(|source| LaunchError::Start { path: self.program.clone(), source })
-    }
+fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
+    command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
 }
 
 /// Ctrl-C on a terminal goes to everyone in its process group, and is meant for the gateway alone: cells and

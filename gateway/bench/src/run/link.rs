@@ -3,26 +3,30 @@
 //! The receiver opens a bus that is gone anew. The loop finds the new one in a triple buffer, where it neither waits nor
 //! frees anything; whoever has more time asks [`Link::send`].
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, BusKind, Choice, Options, SendError};
 use protocol::can::Frame;
 
+use control::cycle::turn::BusState;
+
 /// One bus.
 #[derive(Debug)]
 pub struct Link {
-    name: String,
-    kind: BusKind,
-    receive_buffer: usize,
+    /// Its name.
+    pub name: String,
+    /// What carries its frames.
+    pub kind: BusKind,
+    /// How many bytes may wait unread, as they were granted when it was first opened.
+    pub receive_buffer: usize,
+    /// How it is.
+    pub state: Arc<BusState>,
     /// How it was opened, and is again.
     wanted: Options,
     bus: Mutex<Arc<Bus>>,
-    works: Arc<AtomicBool>,
     gone: AtomicBool,
-    commands: Arc<AtomicU64>,
-    returned: Arc<AtomicBool>,
 }
 
 /// Where the loop finds the bus.
@@ -42,69 +46,24 @@ impl Link {
     /// A bus that was opened so.
     #[must_use]
     pub fn new(bus: Bus, wanted: Options) -> (Arc<Self>, Ear, Slot) {
-        let (name, kind, receive_buffer) = (bus.name().to_owned(), bus.kind(), bus.receive_buffer());
         let bus = Arc::new(bus);
         let link = Arc::new(Self {
-            name,
-            kind,
-            receive_buffer,
+            name: bus.name().to_owned(),
+            kind: bus.kind(),
+            receive_buffer: bus.receive_buffer(),
+            state: Arc::default(),
             wanted,
             bus: Mutex::new(Arc::clone(&bus)),
-            works: Arc::new(AtomicBool::new(true)),
             gone: AtomicBool::new(false),
-            commands: Arc::default(),
-            returned: Arc::default(),
         });
         let (slot, output) = triple_buffer::triple_buffer(&bus);
         (Arc::clone(&link), Ear { link, bus, slot }, output)
-    }
-
-    /// Its name.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// What carries its frames.
-    #[must_use]
-    pub const fn kind(&self) -> BusKind {
-        self.kind
-    }
-
-    /// How many bytes may wait unread, as they were granted when it was first opened.
-    #[must_use]
-    pub const fn receive_buffer(&self) -> usize {
-        self.receive_buffer
-    }
-
-    /// Whether it works, as its receiver sees it.
-    #[must_use]
-    pub const fn works(&self) -> &Arc<AtomicBool> {
-        &self.works
-    }
-
-    /// Whether it works now.
-    #[must_use]
-    pub fn is_there(&self) -> bool {
-        self.works.load(Ordering::Relaxed)
     }
 
     /// Whether it has to be opened anew.
     #[must_use]
     pub fn is_gone(&self) -> bool {
         self.gone.load(Ordering::Relaxed)
-    }
-
-    /// Commands of this gateway's that it took.
-    #[must_use]
-    pub const fn commands(&self) -> &Arc<AtomicU64> {
-        &self.commands
-    }
-
-    /// Set when cells are back on it after it was lost; the loop then says whether the robot is halted.
-    #[must_use]
-    pub const fn returned(&self) -> &Arc<AtomicBool> {
-        &self.returned
     }
 
     /// Sends frames; not for the loop, for a bus that is being exchanged is waited for.
@@ -127,12 +86,12 @@ impl Ear {
     /// Notes that it does not work; `gone` if it has to be opened anew. Whether that is news.
     pub fn lose(&self, gone: bool) -> bool {
         let news = gone && !self.link.gone.swap(true, Ordering::Relaxed);
-        self.link.works.swap(false, Ordering::Relaxed) || news
+        self.link.state.works.swap(false, Ordering::Relaxed) || news
     }
 
     /// Notes that it works. Whether that is news.
     pub fn regain(&self) -> bool {
-        !self.link.works.swap(true, Ordering::Relaxed)
+        !self.link.state.works.swap(true, Ordering::Relaxed)
     }
 
     /// Opens a bus that is gone anew, and hands it to everybody.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
+use protocol::time::Span;
 
 use super::halts::Halts;
 use control::cycle::turn::Timed;
@@ -70,15 +71,13 @@ impl Measured {
     /// How it goes: what matters most first, for a narrow terminal shows no more.
     pub(super) fn line(
         &self,
-        started: Instant,
-        duration_us: u64,
-        cells: usize,
+        elapsed: Duration,
+        (duration, cells): (Span, usize),
         comparing: bool,
         lost: &[&str],
     ) -> String {
         let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
-        let seconds = started.elapsed().as_secs_f64();
-        let of = Duration::from_micros(duration_us).as_secs_f64();
+        let (seconds, of) = (elapsed.as_secs_f64(), duration.seconds());
         let mode = if comparing { "compare" } else { "distributed" };
         let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
         let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };

@@ -11,6 +11,10 @@
 //!       └─ progress line, summary              recorder: what all of them hand over, into files
 //! ```
 
+mod begin;
+mod bench;
+mod end;
+mod error;
 mod halts;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
@@ -24,17 +28,16 @@ pub mod realtime;
 pub mod receiver;
 pub mod roots;
 mod start;
-mod switching;
 mod usage;
 mod watch;
 
 use std::path::PathBuf;
 
-use protocol::bus::{BusError, Kinds};
-use protocol::document::DocumentError;
+use protocol::bus::Kinds;
 use protocol::skin::Skin;
-use thiserror::Error;
 
+pub use self::error::RunError;
+pub use self::network::TooDeep;
 use crate::summary::Summary;
 use model::scenario::Scenario;
 
@@ -67,46 +70,6 @@ pub struct Options {
     pub record: crate::record::Options,
     /// Whether progress is shown.
     pub quiet: bool,
-}
-
-/// Why a run did not come to its end.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RunError {
-    /// A file says something that cannot be.
-    #[error(transparent)]
-    Document(#[from] DocumentError),
-    /// A bus does not open.
-    #[error(transparent)]
-    Bus(#[from] BusError),
-    /// A program does not start.
-    #[error(transparent)]
-    Launch(#[from] launch::LaunchError),
-    /// What was asked for cannot be done.
-    #[error("{0}")]
-    Usage(String),
-    /// It began and failed.
-    #[error("{0}")]
-    Failed(String),
-    /// A file cannot be written.
-    #[error("{path}: {source}")]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-}
-
-impl RunError {
-    /// 2 for wrong use or configuration, 1 for a run that failed.
-    #[must_use]
-    pub const fn exit_code(&self) -> u8 {
-        match self {
-            Self::Document(_) | Self::Bus(_) | Self::Launch(_) | Self::Usage(_) => 2,
-            Self::Failed(_) | Self::Write { .. } => 1,
-        }
-    }
 }
 
 /// Runs a bench to its end, or until SIGINT or SIGTERM. Of a run that fails there is a summary too, which says why.

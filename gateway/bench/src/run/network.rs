@@ -1,23 +1,26 @@
 //! The networks of a run's cells, as the main thread sees them: who has no way, and who is to be told when to speak.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::time::{Duration, Instant};
 
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
 use protocol::parameters::{Cuts, Parameter, Reply as Words, Slots};
 use protocol::skin::{Reply, Skin, Wires};
+use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
+use thiserror::Error;
 
-use super::receiver::View;
 use model::network::check::{self, Difference};
 use model::network::tree::{Places, places};
+use model::repeat::Repeats;
+
+use crate::view::View;
 
 /// A cell that does not answer is told again after this.
-const AGAIN: Duration = Duration::from_millis(200);
+const AGAIN: Span = Span::from_millis(200);
 /// Cells have so long to find another way before people hear of it.
-const GRACE: Duration = Duration::from_millis(300);
+const GRACE: Span = Span::from_millis(300);
 
 /// The network of one bus.
 #[derive(Debug)]
@@ -26,21 +29,44 @@ pub(super) struct Network {
     wires: Wires,
     slots: Slots,
     period_us: u16,
-    /// When each cell was told last.
-    told: BTreeMap<CellId, Instant>,
-    /// Ports that are to hear nothing, a bit each, and when their cell was told last.
-    deaf: BTreeMap<CellId, (u8, Option<Instant>)>,
+    /// Cells that are told when they speak.
+    told: Repeats<CellId>,
+    /// Ports that are to hear nothing, a bit each, and cells that are told so.
+    deaf: BTreeMap<CellId, u8>,
+    told_cuts: Repeats<CellId>,
     /// Cells that speak and have no way, and since when.
-    without: BTreeMap<CellId, Instant>,
+    without: BTreeMap<CellId, Micros>,
     /// Cells that people have heard of as without a way, and since when they are; until they have one again.
-    said: BTreeMap<CellId, Instant>,
+    said: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
     /// How long a cell was without a way, at most.
-    pub(super) longest: Duration,
+    pub(super) longest: Span,
     /// From the time when all cells were ready until all had a way.
-    pub(super) organised: Option<Duration>,
+    pub(super) organised: Option<Span>,
     /// What was different from the description at the start.
     pub(super) differences: Vec<Difference>,
+}
+
+/// A tree for which there is no time between two joints.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[error(
+    "the tree of {bus} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the {period_us} us \
+     from joints to joints; slot_us = {} would, or more roots, so that no cell is deeper than {}",
+    .period_us.checked_div(*.slots).unwrap_or(0),
+    .period_us.checked_div(*.slot_us).unwrap_or(0).saturating_sub(1),
+    slots = .slots
+)]
+pub struct TooDeep {
+    /// The bus.
+    pub bus: String,
+    /// The depth of its deepest cell.
+    pub deepest: u8,
+    /// How many slots that needs.
+    pub slots: u32,
+    /// How long each is.
+    pub slot_us: u32,
+    /// From joints to joints.
+    pub period_us: u32,
 }
 
 /// What a look at a network comes to.
@@ -62,12 +88,13 @@ impl Network {
             wires: skin.wires(bus),
             slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
-            told: BTreeMap::new(),
+            told: Repeats::new(AGAIN),
             deaf: BTreeMap::new(),
+            told_cuts: Repeats::new(AGAIN),
             without: BTreeMap::new(),
             said: BTreeMap::new(),
             said_too_deep: false,
-            longest: Duration::ZERO,
+            longest: Span(0),
             organised: None,
             differences: Vec::new(),
         })
@@ -107,19 +134,12 @@ impl Network {
     ///
     /// # Errors
     /// When they do not fit between two joints; says what would.
-    pub(super) fn fit(&mut self, view: &View) -> Result<(), String> {
+    pub(super) fn fit(&mut self, view: &View) -> Result<(), TooDeep> {
         let deepest = Self::places(view).deepest().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
-        let (slot_us, period) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
-        if slots * slot_us > period {
-            let greatest = period.checked_div(slots).unwrap_or(0);
-            let at_most = period.checked_div(slot_us).unwrap_or(0).saturating_sub(1);
-            return Err(format!(
-                "the tree of {} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the \
-                 {period} us from joints to joints; slot_us = {greatest} would, or more roots, so that no cell is \
-                 deeper than {at_most}",
-                self.name
-            ));
+        let (slot_us, period_us) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
+        if slots * slot_us > period_us {
+            return Err(TooDeep { bus: self.name.clone(), deepest, slots, slot_us, period_us });
         }
         self.slots.deepest = deepest;
         Ok(())
@@ -135,8 +155,8 @@ impl Network {
     }
 
     /// Tells everyone how deep the tree is.
-    pub(super) fn tell_everyone(&mut self, now: Instant, view: &View) -> Message {
-        self.told.extend(view.network.iter().map(|cell| (cell.node, now)));
+    pub(super) fn tell_everyone(&mut self, now: Micros) -> Message {
+        self.told.said_to_all(now);
         self.tell(Node::Everyone)
     }
 
@@ -144,15 +164,12 @@ impl Network {
     pub(super) fn untold(&self, view: &View) -> Vec<CellId> {
         let words = Some(self.words());
         let untold = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
-        untold.filter_map(|cell| CellId::new(cell.node.into()).ok()).collect()
+        untold.map(|cell| cell.node).collect()
     }
 
     /// What is to be said to those who have not answered for a while.
-    pub(super) fn tell_again(&mut self, now: Instant, view: &View) -> Vec<Message> {
-        let untold = self.untold(view);
-        let due = |cell: &CellId| self.told.get(cell).is_none_or(|at| now.duration_since(*at) >= AGAIN);
-        let due: Vec<_> = untold.into_iter().filter(due).collect();
-        self.told.extend(due.iter().map(|&cell| (cell, now)));
+    pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
+        let due = self.told.due(now, self.untold(view));
         due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
     }
 
@@ -162,36 +179,32 @@ impl Network {
             .zip(0..PORTS)
             .filter(|&(_, port)| self.wires.other_end(to, port).is_some_and(|(other, _)| other == from));
         let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
-        let (deaf, told) = self.deaf.entry(to).or_insert((0, None));
+        let deaf = self.deaf.entry(to).or_default();
         *deaf = if cut { *deaf | bits } else { *deaf & !bits };
-        *told = None;
+        self.told_cuts.renew(to);
     }
 
     /// What is to be said to those whose ports are to hear nothing, or to hear again.
-    fn tell_cuts(&mut self, now: Instant, view: &View) -> Vec<Message> {
-        let mut messages = Vec::new();
-        for (&cell, (deaf, told)) in &mut self.deaf {
-            let Some(known) = view.cells.iter().find(|it| it.node == cell.get() && it.ready) else {
-                continue;
-            };
-            let waits = told.is_some_and(|at| now.duration_since(at) < AGAIN);
-            if known.deaf != *deaf && !waits {
-                *told = Some(now);
-                let words = Cuts { deaf: *deaf }.words();
-                let request = Request::Write { number: Parameter::Cuts.number(), words };
-                messages.push(Message::Configure { to: Node::Cell(cell), tag: *deaf, request });
-            }
-        }
-        messages
+    fn tell_cuts(&mut self, now: Micros, view: &View) -> Vec<Message> {
+        let wanted = |node: &CellId| self.deaf.get(node).copied();
+        let ready = view.cells.iter().filter(|cell| cell.ready);
+        let open = ready.filter(|cell| wanted(&cell.node).is_some_and(|deaf| deaf != cell.deaf));
+        let due = self.told_cuts.due(now, open.map(|cell| cell.node));
+        let message = |cell: CellId| {
+            let deaf = wanted(&cell)?;
+            let request = Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
+            Some(Message::Configure { to: Node::Cell(cell), tag: deaf, request })
+        };
+        due.into_iter().filter_map(message).collect()
     }
 
     /// Looks at the network while the loop runs.
-    pub(super) fn look(&mut self, now: Instant, view: &View) -> Look {
+    pub(super) fn look(&mut self, now: Micros, view: &View) -> Look {
         let mut look = Look::default();
         let places = Self::places(view);
         if places.deepest().is_some_and(|deepest| deepest > self.slots.deepest) {
             match self.fit(view) {
-                Ok(()) => look.messages.push(self.tell_everyone(now, view)),
+                Ok(()) => look.messages.push(self.tell_everyone(now)),
                 Err(why) if !self.said_too_deep => {
                     self.said_too_deep = true;
                     look.notes.push(format!("{why}; what is deeper speaks too early, and is late"));
@@ -203,25 +216,25 @@ impl Network {
         look.messages.extend(self.tell_cuts(now, view));
         let without: BTreeSet<_> = places.without_way.into_iter().collect();
         self.without.retain(|cell, since| {
-            self.longest = self.longest.max(now.duration_since(*since));
+            self.longest = self.longest.max(now.since(*since));
             without.contains(cell)
         });
         let mut back = Vec::new();
         self.said.retain(|cell, since| {
             let has_one = places.depths.contains_key(cell);
             if has_one {
-                back.push((*cell, now.duration_since(*since)));
+                back.push((*cell, now.since(*since)));
             }
             !has_one
         });
         for &cell in &without {
             self.without.entry(cell).or_insert(now);
         }
-        let news = |(cell, since): (&CellId, &Instant)| {
-            (now.duration_since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
+        let news = |(cell, since): (&CellId, &Micros)| {
+            (now.since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
         };
         let news: Vec<_> = self.without.iter().filter_map(news).collect();
-        if let Some(oldest) = news.iter().map(|(_, since)| now.duration_since(*since)).max() {
+        if let Some(oldest) = news.iter().map(|(_, since)| now.since(*since)).max() {
             self.said.extend(news.iter().copied());
             let cells: Vec<_> = news.into_iter().map(|(cell, _)| cell).collect();
             let (has, them) = if cells.len() == 1 { ("has", "it") } else { ("have", "them") };
@@ -229,7 +242,7 @@ impl Network {
                 "{} on {} {has} no way to a root: no sum holds {them} since {:.1} s",
                 check::names(&cells),
                 self.name,
-                oldest.as_secs_f64()
+                oldest.seconds()
             ));
         }
         if let Some(longest) = back.iter().map(|(_, length)| *length).max() {
@@ -239,7 +252,7 @@ impl Network {
                 "{} on {} {has} a way to a root again, after {:.1} s",
                 check::names(&cells),
                 self.name,
-                longest.as_secs_f64()
+                longest.seconds()
             ));
         }
         look
@@ -249,7 +262,7 @@ impl Network {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::receiver::CellView;
+    use crate::view::CellView;
     use model::network::check::Seen;
     use model::table::{SWITCHES, Said};
     use protocol::message::Tree;
@@ -270,7 +283,7 @@ mod tests {
     /// Cells that say who their parents are and how deep they are; one that says nothing is dead.
     fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
         let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
-            node: u8::try_from(at + 1).unwrap(),
+            node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
             heard: true,
             dead: tree.is_none(),
             ready: tree.is_some(),
@@ -303,7 +316,8 @@ mod tests {
         let mut network = network();
         let flat = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(1), 1))];
         network.fit(&view(&flat, None)).unwrap();
-        let now = Instant::now();
+        let at = |rounds: u64| Micros(rounds * AGAIN.0);
+        let now = at(1);
         let words = Some(network.words());
         assert_eq!(network.look(now, &view(&flat, words)), Look::default());
         let deep = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
@@ -313,16 +327,16 @@ mod tests {
         assert_eq!(network.deepest(), 2);
         // Who has not answered is told alone, and not at once.
         assert_eq!(network.look(now, &view(&deep, words)), Look::default());
-        let look = network.look(now + AGAIN, &view(&deep, words));
+        let look = network.look(at(2), &view(&deep, words));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         let new = Some(network.words());
-        assert_eq!(network.look(now + AGAIN * 2, &view(&deep, new)), Look::default());
+        assert_eq!(network.look(at(3), &view(&deep, new)), Look::default());
         // A cell that started anew has forgotten it.
-        let look = network.look(now + AGAIN * 3, &view(&deep, None));
+        let look = network.look(at(4), &view(&deep, None));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         // 4 slots of 5 ms are more than 16 ms.
         let deeper = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2)), Some((Some(3), 3))];
-        let look = network.look(now + AGAIN * 3, &view(&deeper, new));
+        let look = network.look(at(4), &view(&deeper, new));
         let [note] = look.notes.as_slice() else { panic!("{look:?}") };
         assert!(note.contains("slot_us = 4000 would") && note.contains("deeper than 2"), "{note}");
     }
@@ -334,9 +348,9 @@ mod tests {
         network.fit(&view(&trees, None)).unwrap();
         let words = Some(network.words());
         let cell = |number| CellId::new(number).unwrap();
-        let mut now = Instant::now();
+        let mut now = Micros(0);
         let mut look = |network: &mut Network, deaf| {
-            now += AGAIN;
+            now = now + AGAIN;
             let mut view = view(&trees, words);
             view.cells[1].deaf = deaf;
             let told = |message: &Message| {
@@ -370,9 +384,9 @@ mod tests {
         let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&whole, None)).unwrap();
         let words = Some(network.words());
-        let mut at = Instant::now();
+        let mut at = Micros(0);
         let mut look = |network: &mut Network, trees: &[_]| {
-            at += Duration::from_millis(200);
+            at = at + Span::from_millis(200);
             network.look(at, &view(trees, words)).notes
         };
         assert_eq!(look(&mut network, &whole), Vec::<String>::new());
@@ -390,6 +404,6 @@ mod tests {
         assert_eq!(look(&mut network, &half), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
         assert_eq!(network.without_way().count(), 0);
         assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a way to a root again, after 1.0 s"]);
-        assert_eq!(network.longest, Duration::from_millis(800));
+        assert_eq!(network.longest, Span::from_millis(800));
     }
 }

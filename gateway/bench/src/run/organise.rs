@@ -2,74 +2,47 @@
 //! everyone is told when to speak.
 
 use std::sync::atomic::Ordering;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use protocol::bus::BusError;
-use protocol::can::Frame;
 use protocol::message::Message;
+use protocol::time::Micros;
 
 use super::RunError;
-use super::launch::STARTING;
-use super::link::may_return;
+use super::begin::SHOWING;
+use super::bench::Bench;
 use super::network::Network;
 use super::progress::say;
-use super::receiver::View;
-use super::start::{Bench, SHOWING};
-use model::network::check::Difference;
+use crate::view::View;
 
 /// Differences that stay for so long are there: a hello and a heartbeat come four times a second.
 const SETTLING: Duration = Duration::from_millis(1_500);
-/// Between two looks.
-const LOOK: Duration = Duration::from_millis(5);
 
 impl Bench<'_> {
     /// Waits until cells that answer with sums are a tree, and tells them when to speak.
     pub(super) fn organise(&mut self) -> Result<(), RunError> {
-        if self.networks.iter().all(Option::is_none) {
-            return Ok(());
-        }
         self.shared.explore.store(true, Ordering::Relaxed);
-        let began = Instant::now();
-        let patience = if self.options.spawn { STARTING } else { SHOWING };
-        let (mut most, mut progress) = (0, began);
-        loop {
-            let mut have_ways = 0;
-            let mut whole = true;
-            self.each_network(|network, view| {
-                let (count, all) = Network::progress(view);
+        let began = self.now();
+        self.wait(self.patience(), |bench, patience| {
+            let (mut have_ways, mut whole, now) = (0, true, bench.now());
+            for (network, view) in bench.networks() {
+                let (count, all) = Network::progress(&view);
                 have_ways += count;
-                if all {
-                    network.organised.get_or_insert_with(|| began.elapsed());
-                } else {
-                    (network.organised, whole) = (None, false);
-                }
-            });
-            if have_ways > most {
-                (most, progress) = (have_ways, Instant::now());
+                whole &= all;
+                network.organised = all.then(|| network.organised.unwrap_or_else(|| now.since(began)));
             }
-            if whole || progress.elapsed() > patience {
-                break;
-            }
-            self.wait_a_little()?;
-        }
+            Ok(whole || patience.is_over(have_ways))
+        })?;
         self.check_networks()?;
-        let mut unfit = None;
-        self.each_network(|network, view| {
-            if let Err(why) = network.fit(view) {
-                unfit.get_or_insert(why);
-            }
-        });
-        if let Some(why) = unfit {
-            return Err(RunError::Usage(why));
+        for (network, view) in self.networks() {
+            network.fit(&view)?;
         }
         self.tell_networks()?;
-        if !self.options.quiet {
-            for network in self.networks.iter().flatten() {
-                let (name, deepest) = (network.name(), network.deepest());
-                let organised = network.organised.unwrap_or_default().as_secs_f64();
-                say(&format!("the cells of {name} are a tree, {deepest} wires deep, after {organised:.2} s"));
-            }
+        for network in
+            self.lanes.iter().filter_map(|lane| lane.network.as_ref()).filter(|_| !self.options.quiet)
+        {
+            let (name, deepest) = (network.name(), network.deepest());
+            let organised = network.organised.unwrap_or_default().seconds();
+            say(&format!("the cells of {name} are a tree, {deepest} wires deep, after {organised:.2} s"));
         }
         Ok(())
     }
@@ -78,26 +51,19 @@ impl Bench<'_> {
     fn check_networks(&mut self) -> Result<(), RunError> {
         // Pages of ports come with heartbeats, if they are not asked for.
         self.say(&Message::Report)?;
-        let mut since = Instant::now();
-        loop {
-            let mut changed = false;
+        let mut changes = 0;
+        self.wait(SETTLING, |bench, patience| {
             let mut none = true;
-            self.each_network(|network, view| {
-                let differences = network.check(view);
+            for (network, view) in bench.networks() {
+                let differences = network.check(&view);
                 none &= differences.is_empty();
-                changed |= differences != network.differences;
+                changes += usize::from(differences != network.differences);
                 network.differences = differences;
-            });
-            if changed {
-                since = Instant::now();
             }
-            if none || since.elapsed() > SETTLING {
-                break;
-            }
-            self.wait_a_little()?;
-        }
+            Ok(none || patience.is_over(changes))
+        })?;
         let mut broken = None;
-        for network in self.networks.iter().flatten() {
+        for network in self.lanes.iter().filter_map(|lane| lane.network.as_ref()) {
             for difference in &network.differences {
                 let line = format!("{}: {difference}", network.name());
                 if !self.options.quiet {
@@ -108,86 +74,49 @@ impl Bench<'_> {
                 }
             }
         }
-        match broken.filter(|_| self.options.spawn) {
-            Some(line) => Err(RunError::Failed(line)),
-            None => Ok(()),
-        }
+        broken.filter(|_| self.options.spawn).map_or(Ok(()), |line| Err(RunError::BrokenTree(line)))
     }
 
     /// Tells all cells in which slots they speak, and sees that they have heard it.
     fn tell_networks(&mut self) -> Result<(), RunError> {
-        let began = Instant::now();
-        let messages = self.messages_of_networks(|network, now, view| vec![network.tell_everyone(now, view)]);
-        self.say_on(&messages)?;
-        loop {
-            let mut untold = Vec::new();
-            self.each_network(|network, view| {
-                untold.extend(
-                    network.untold(view).into_iter().map(|cell| format!("{cell} on {}", network.name())),
-                );
-            });
-            if untold.is_empty() {
-                return Ok(());
+        self.send_to_networks(|network, now, _| vec![network.tell_everyone(now)])?;
+        let mut untold = Vec::new();
+        self.wait(SHOWING, |bench, patience| {
+            untold.clear();
+            for (network, view) in bench.networks() {
+                untold
+                    .extend(network.untold(&view).iter().map(|cell| format!("{cell} on {}", network.name())));
             }
-            if began.elapsed() > SHOWING {
-                let why = format!(
-                    "cells that do not take up sums (parameter 6): {}; give them firmware that does",
-                    untold.join(", ")
-                );
-                if self.options.spawn {
-                    return Err(RunError::Failed(why));
-                }
-                say(&why);
-                return Ok(());
+            let is_last = untold.is_empty() || patience.is_over(0);
+            if !is_last {
+                bench.send_to_networks(Network::tell_again)?;
             }
-            self.wait_a_little()?;
-            let messages = self.messages_of_networks(Network::tell_again);
-            self.say_on(&messages)?;
+            Ok(is_last)
+        })?;
+        if untold.is_empty() {
+            return Ok(());
         }
-    }
-
-    fn wait_a_little(&mut self) -> Result<(), RunError> {
-        thread::sleep(LOOK);
-        self.hear_while_starting()
-    }
-
-    /// Looks at each network with what its receiver shows.
-    pub(super) fn each_network(&mut self, mut look: impl FnMut(&mut Network, &View)) {
-        for (lane, network) in self.lanes.iter().zip(&mut self.networks) {
-            if let (Some(network), Ok(view)) = (network, lane.view.lock()) {
-                look(network, &view);
-            }
+        let error = RunError::NoSums(untold.join(", "));
+        if self.options.spawn {
+            return Err(error);
         }
+        say(&error.to_string());
+        Ok(())
     }
 
-    /// What is to be said on each bus.
-    fn messages_of_networks(
+    /// Looks at each network with what its receiver shows, and sends what that comes to.
+    fn send_to_networks(
         &mut self,
-        mut say: impl FnMut(&mut Network, Instant, &View) -> Vec<Message>,
-    ) -> Vec<(usize, Message)> {
-        let mut messages = Vec::new();
-        let now = Instant::now();
-        for (bus, (lane, network)) in self.lanes.iter().zip(&mut self.networks).enumerate() {
-            if let (Some(network), Ok(view)) = (network, lane.view.lock()) {
-                messages.extend(say(network, now, &view).into_iter().map(|message| (bus, message)));
-            }
-        }
-        messages
-    }
-
-    /// Says something on some buses; one that is down for a while misses it, and it is said again.
-    pub(super) fn say_on(&self, messages: &[(usize, Message)]) -> Result<(), RunError> {
-        for (bus, message) in messages {
-            let Some((lane, described)) = self.lanes.iter().zip(&self.options.skin.buses).nth(*bus) else {
-                continue;
+        mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,
+    ) -> Result<(), RunError> {
+        let now = self.now();
+        for lane in &mut self.lanes {
+            let messages = match (&mut lane.network, lane.view.lock()) {
+                (Some(network), Ok(view)) => messages(network, now, &view),
+                _ => continue,
             };
-            let frames: Vec<Frame> = message.encode().frames(described.format).collect();
-            match lane.link.send(&frames).map_err(BusError::from) {
-                Err(error) if may_return(&error) => {
-                    let unsent = &self.shared.unsent;
-                    unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
-                }
-                sent => sent?,
+            for message in messages {
+                lane.send(&message)?;
             }
         }
         Ok(())
@@ -196,17 +125,11 @@ impl Bench<'_> {
     /// Looks at all networks while the loop runs: what people are to know.
     pub(super) fn watch_networks(&mut self) -> Result<Vec<String>, RunError> {
         let mut notes = Vec::new();
-        let messages = self.messages_of_networks(|network, now, view| {
+        self.send_to_networks(|network, now, view| {
             let look = network.look(now, view);
             notes.extend(look.notes);
             look.messages
-        });
-        self.say_on(&messages)?;
+        })?;
         Ok(notes)
     }
-}
-
-/// The lines of differences, for a summary.
-pub(super) fn lines(differences: &[Difference]) -> Vec<String> {
-    differences.iter().map(ToString::to_string).collect()
 }

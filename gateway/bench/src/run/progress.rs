@@ -18,8 +18,8 @@ pub fn say(line: &str) {
 /// The progress line, on standard error.
 #[derive(Debug)]
 pub struct Progress {
-    /// Where there is a terminal.
-    line: Option<ProgressBar>,
+    /// Hidden where there is no terminal.
+    bar: ProgressBar,
     quiet: bool,
     due: Instant,
 }
@@ -29,7 +29,25 @@ impl Progress {
     #[must_use]
     pub fn new(quiet: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && !quiet;
-        Self { line: terminal.then(line), quiet, due: Instant::now() }
+        Self { bar: if terminal { line() } else { ProgressBar::hidden() }, ..Self::lines(quiet) }
+    }
+
+    /// Nothing but notes, as long as there is no [`Progress::bar`].
+    #[must_use]
+    pub fn lines(quiet: bool) -> Self {
+        Self { bar: ProgressBar::hidden(), quiet, due: Instant::now() }
+    }
+
+    /// A bar of this length, or something that turns when it has no end; only a terminal shows it.
+    pub fn bar(&mut self, length: Option<u64>) -> ProgressBar {
+        if !self.quiet {
+            let (bar, style) = match length {
+                Some(length) => (ProgressBar::new(length), "{wide_bar} {percent}%  {msg} frames  {eta}"),
+                None => (ProgressBar::new_spinner(), "{spinner} {elapsed}  {msg} frames"),
+            };
+            self.bar = styled(bar, style);
+        }
+        self.bar.clone()
     }
 
     /// Shows the line when its time has come.
@@ -39,42 +57,33 @@ impl Progress {
             return;
         }
         let [here, elsewhere] = PERIODS;
-        match &self.line {
-            Some(line) => {
-                self.due = now + here;
-                line.set_message(text());
-                line.tick();
-            }
-            None => {
-                self.due = now + elsewhere;
-                say(&text());
-            }
+        if self.bar.is_hidden() {
+            self.due = now + elsewhere;
+            return say(&text());
         }
+        self.due = now + here;
+        self.bar.set_message(text());
+        self.bar.tick();
     }
 
     /// Writes something above the line.
-    pub fn note(&mut self, text: &str) {
-        if self.quiet {
-            return;
-        }
-        match &self.line {
-            Some(line) => line.suspend(|| say(text)),
-            None => say(text),
+    pub fn note(&self, text: &str) {
+        if !self.quiet {
+            self.bar.suspend(|| say(text));
         }
     }
 
     /// Takes the line away.
-    pub fn clear(&mut self) {
-        if let Some(line) = &self.line {
-            line.finish_and_clear();
-        }
+    pub fn clear(&self) {
+        self.bar.finish_and_clear();
     }
 }
 
 /// A line that is cut where the terminal ends.
 fn line() -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-    bar.with_style(
-        ProgressStyle::with_template("{wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar()),
-    )
+    styled(ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr()), "{wide_msg}")
+}
+
+fn styled(bar: ProgressBar, style: &str) -> ProgressBar {
+    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }

@@ -2,6 +2,8 @@
 //! them.
 
 use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use hdrhistogram::Histogram;
 use protocol::can::Frame;
@@ -10,6 +12,7 @@ use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{ClockId, clock_nanosleep_absolute};
 use rustix::time::{Timespec, clock_gettime};
 
+use super::io;
 use control::cycle::Tick;
 use control::cycle::turn::{Shared, Turn};
 use model::quantiles::histogram;
@@ -18,6 +21,9 @@ use model::quantiles::histogram;
 const PRIORITY: i32 = 40;
 /// A receiver's: simulated cells that share its processor must not keep it from reading what they send.
 const RECEIVER_PRIORITY: i32 = 30;
+
+/// Wake-ups of the idle machine that are measured.
+const IDLE_WAKEUPS: u32 = 100;
 
 /// What the machine granted.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -31,17 +37,17 @@ pub struct Granted {
 /// Makes the calling thread as punctual as the machine allows.
 pub fn prepare() -> Granted {
     let granted = Granted {
-        fifo: super::io::set_fifo(PRIORITY),
+        fifo: io::set_fifo(PRIORITY),
         // Only what is touched is locked, or every thread's whole stack would count.
         locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
     };
-    super::io::set_timer_slack(1);
+    io::set_timer_slack(1);
     granted
 }
 
 /// The same for a receiver's thread, which may be a little late.
 pub(crate) fn prepare_receiver() {
-    super::io::set_fifo(RECEIVER_PRIORITY);
+    io::set_fifo(RECEIVER_PRIORITY);
 }
 
 /// The monotonic clock in ns.
@@ -49,6 +55,13 @@ pub(crate) fn prepare_receiver() {
 pub fn now() -> u64 {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic);
     u64::try_from(tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(tv_nsec).unwrap_or(0)
+}
+
+/// The wall clock in ns since 1970.
+#[must_use]
+pub fn wall() -> u64 {
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Sleeps until the monotonic clock reads `deadline` ns; a signal wakes nobody early.
@@ -61,18 +74,20 @@ pub(crate) fn sleep_until(deadline: u64) {
     {}
 }
 
-/// How late this machine wakes a thread that has nothing to do, in ns, `count` times.
-#[must_use]
-pub fn idle_lateness(period_ns: u64, count: u32) -> Histogram<u64> {
-    let mut histogram = histogram();
-    let mut deadline = now();
-    for _ in 0..count {
-        deadline += period_ns;
-        sleep_until(deadline);
-        // It grows by itself; it cannot refuse.
-        let _ = histogram.record(now().saturating_sub(deadline));
-    }
-    histogram
+/// How late this machine wakes a punctual thread that has nothing to do, in ns, at the period of a loop.
+pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
+    let measure = move || {
+        prepare();
+        let (mut histogram, mut deadline) = (histogram(), now());
+        for _ in 0..IDLE_WAKEUPS {
+            deadline += period_ns;
+            sleep_until(deadline);
+            // It grows by itself; it cannot refuse.
+            let _ = histogram.record(now().saturating_sub(deadline));
+        }
+        histogram
+    };
+    thread::spawn(measure).join().unwrap_or_else(|_| histogram())
 }
 
 /// Runs ticks until there were `ticks` of them or someone says stop. Whole periods that were missed are

@@ -3,22 +3,22 @@
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use protocol::bus::batch::BATCH;
 use protocol::bus::{BusError, Inbox, Received};
 use protocol::id::Kind;
-use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
 use super::link::{Ear, Outages};
+use super::realtime::wall;
 use super::roots::Roots;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;
+use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
-use model::network::check::Seen as SeenCell;
-use model::table::{Notice, SWITCHES, Said, Snapshot, Status, Switch, Table};
+use model::table::{Notice, Snapshot, Table};
 
 /// How often time is let pass when nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
@@ -28,59 +28,18 @@ const DOWN: Duration = Duration::from_millis(50);
 const REOPEN: Duration = Duration::from_millis(100);
 
 /// What a receiver tells the main thread at once.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Debug)]
 pub enum News {
     /// Of a cell, or another gateway.
     Notice(Notice),
     /// The bus does not work for now.
-    Down(String),
+    Down(BusError),
     /// It works again.
     Up,
     /// The bus is gone: it has to be opened anew, which its receiver tries.
-    Lost(String),
+    Lost(BusError),
     /// It is there and cannot be opened.
-    Refused(String),
-}
-
-/// The state of a bus' cells, renewed every 20 ms.
-#[derive(Clone, Debug, Default)]
-pub struct View {
-    /// Each cell, in the bus' order.
-    pub cells: Vec<CellView>,
-    /// Commands of our own that were read back from the bus, or were lost with it.
-    pub commands: u64,
-    /// What is known of the network's cells, those that are not described among them; nobody where cells answer
-    /// with their own torques.
-    pub network: Vec<SeenCell>,
-}
-
-/// The state of one cell.
-#[derive(Clone, Copy, Debug)]
-pub struct CellView {
-    /// Its number.
-    pub node: u8,
-    /// Whether it has been heard of.
-    pub heard: bool,
-    /// Whether it has fallen silent.
-    pub dead: bool,
-    /// Whether it can be expected to answer, once nobody halts it.
-    pub ready: bool,
-    /// Whether it waits for a resume.
-    pub halted: bool,
-    /// Whether it is there for good and has no parameters to compute with.
-    pub unconfigured: bool,
-    /// Whether its configuration is not the skin's.
-    pub other: bool,
-    /// The joints that it had taken last.
-    pub last_joints: Epoch,
-    /// What it has said since it was asked.
-    pub said: Said,
-    /// What it answers joints with, as it said last.
-    pub reply: Option<[i16; WORDS]>,
-    /// Ports that hear nothing because it was told so, as it said last.
-    pub deaf: u8,
-    /// What it is to be switched to and has not confirmed.
-    pub lacks: [Option<Switch>; SWITCHES],
+    Refused(BusError),
 }
 
 /// One bus, as its receiver sees it.
@@ -119,8 +78,6 @@ pub struct Left {
     pub dropped: u64,
     /// What did not fit into the recorder's queues.
     pub unrecorded: Unrecorded,
-    /// Bytes that were no frame.
-    pub unreadable: u64,
     /// How often the bus was lost, and for how long.
     pub outages: Outages,
 }
@@ -128,8 +85,8 @@ pub struct Left {
 /// What came through the sockets of a bus so far.
 #[derive(Debug, Default)]
 struct Account {
-    /// Frames that the bus dropped, and bytes that were no frame, on sockets before this one.
-    before: (u64, u64),
+    /// Frames that the bus dropped on sockets before this one.
+    dropped_before: u64,
     /// What this socket had dropped when it was last told to the recorder.
     told: u32,
     /// The newest joints whose feelings the recorder has.
@@ -183,9 +140,8 @@ impl Receiver {
         }
         self.table.finish();
         let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
-        let (dropped, unreadable) = account.before;
-        let (dropped, unreadable) = (dropped + u64::from(inbox.dropped()), unreadable + inbox.unreadable());
-        Left { table: self.table, dropped, unrecorded, unreadable, outages: account.outages }
+        let dropped = account.dropped_before + u64::from(inbox.dropped());
+        Left { table: self.table, dropped, unrecorded, outages: account.outages }
     }
 
     /// Waits for frames and takes them; how many.
@@ -195,13 +151,13 @@ impl Receiver {
         let patience = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
         let came = bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
         came.unwrap_or_else(|error| {
-            self.lose(inbox, account, &error);
+            self.lose(inbox, account, error);
             0
         })
     }
 
     /// The bus is lost, for a while or until it is opened again.
-    fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: &BusError) {
+    fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: BusError) {
         let gone = !error.may_pass();
         if gone {
             account.retry = Some(Instant::now());
@@ -209,7 +165,7 @@ impl Receiver {
         }
         if self.ear.lose(gone) {
             account.outages.begin(Instant::now());
-            self.tell(if gone { News::Lost(error.to_string()) } else { News::Down(error.to_string()) });
+            self.tell(if gone { News::Lost(error) } else { News::Down(error) });
         }
         if gone {
             inbox.clear();
@@ -224,7 +180,7 @@ impl Receiver {
                     self.record(inbox, account);
                 }
                 // An interface goes down before it is removed, and each is said once.
-                Err(error) if !error.may_pass() => return self.lose(inbox, account, &error),
+                Err(error) if !error.may_pass() => return self.lose(inbox, account, error),
                 Ok(0) | Err(_) => break,
             }
         }
@@ -240,9 +196,7 @@ impl Receiver {
         }
         match self.ear.reopen() {
             Ok(()) => {
-                let (dropped, unreadable) = &mut account.before;
-                *dropped += u64::from(inbox.dropped());
-                *unreadable += inbox.unreadable();
+                account.dropped_before += u64::from(inbox.dropped());
                 *inbox = Inbox::new();
                 (account.told, account.retry) = (0, None);
             }
@@ -250,7 +204,7 @@ impl Receiver {
                 account.retry = Some(now + REOPEN);
                 let why = error.to_string();
                 if !is_absent(&error) && account.refused != why {
-                    self.tell(News::Refused(why.clone()));
+                    self.tell(News::Refused(error));
                 }
                 account.refused = why;
             }
@@ -286,7 +240,7 @@ impl Receiver {
         let more = inbox.dropped().wrapping_sub(account.told);
         if more > 0 {
             account.told = inbox.dropped();
-            outlet.dropped(wall_nanos(), more.into());
+            outlet.dropped(wall(), more.into());
         }
         let Some((number, epoch, at)) = self.table.newest() else { return };
         if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
@@ -303,38 +257,17 @@ impl Receiver {
 
     /// Lets time pass, and shows the main thread how things are.
     fn look(&mut self, account: &mut Account) {
-        let now = Micros(wall_nanos() / 1_000);
+        let now = Micros(wall() / 1_000);
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
             self.tell(News::Notice(notice));
         }
-        let cells = self.table.statuses(now).map(|(cell, status)| {
-            let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
-            let alive = !matches!(status, Status::Dead | Status::Unknown);
-            let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
-            let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
-            CellView {
-                node: cell.node.get(),
-                heard: state.is_some(),
-                dead: status == Status::Dead,
-                ready,
-                halted: ready && !cell.is_ready(),
-                unconfigured: settled.is_some() && !ready,
-                other: cell
-                    .heartbeat()
-                    .is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
-                last_joints: cell.last_joints,
-                said: cell.said(),
-                reply: cell.reply,
-                deaf: cell.deaf,
-                lacks: cell.lacks(),
-            }
-        });
+        let cells = self.table.statuses(now).map(|(cell, status)| CellView::of(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
-        if !self.ear.link.is_there() {
+        if !self.ear.link.state.is_there() {
             // What it took and has not carried by now it will not carry.
-            account.unread = self.ear.link.commands().load(Ordering::Relaxed).saturating_sub(read);
+            account.unread = self.ear.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
         }
         let commands = read + account.unread;
         let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
@@ -364,16 +297,10 @@ const fn is_absent(error: &BusError) -> bool {
 /// Says what did not fit; the recorder makes room as long as a receiver is there.
 fn last_words(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
-    while !outlet.tell(wall_nanos()) && Instant::now() < give_up {
+    while !outlet.tell(wall()) && Instant::now() < give_up {
         std::thread::sleep(Duration::from_millis(1));
     }
     outlet.unrecorded()
-}
-
-/// The wall clock in ns since 1970.
-fn wall_nanos() -> u64 {
-    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.

@@ -1,12 +1,15 @@
 //! What processes cost, as the kernel counts it.
 
+use std::collections::HashMap;
 use std::fs;
 
 use rustix::time::{ClockId, clock_gettime};
 
+use super::launch::{Processes, ServedBus};
+use crate::summary::Processor;
+
 /// Processor time of this process so far, in s.
-#[must_use]
-pub(super) fn own_seconds() -> f64 {
+fn own_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     std::time::Duration::try_from(time).map_or(0.0, |time| time.as_secs_f64())
 }
@@ -15,8 +18,7 @@ pub(super) fn own_seconds() -> f64 {
 ///
 /// From `schedstat`, which counts ns: the usual figures are sampled a hundred times a second, and miss
 /// cells that all wake up together for some µs.
-#[must_use]
-pub(super) fn processor_seconds(pid: u32) -> f64 {
+fn processor_seconds(pid: u32) -> f64 {
     let Ok(threads) = fs::read_dir(format!("/proc/{pid}/task")) else { return 0.0 };
     let nanos = threads.flatten().filter_map(|thread| {
         let text = fs::read_to_string(thread.path().join("schedstat")).ok()?;
@@ -31,4 +33,39 @@ pub(super) fn private_kib(pid: u32) -> Option<u64> {
     let map = fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?;
     let kib = |line: &str| line.split_whitespace().nth(1)?.parse::<u64>().ok();
     Some(map.lines().filter(|line| line.starts_with("Private_")).filter_map(kib).sum())
+}
+
+/// Processor time so far, in s.
+pub(super) struct Spent {
+    gateway: f64,
+    /// Of each cell's process.
+    cells: HashMap<u32, f64>,
+    /// Of each process that serves a bus.
+    buses: HashMap<u32, f64>,
+}
+
+impl Spent {
+    /// By this program, cells and buses.
+    pub(super) fn by(cells: &Processes, buses: &[ServedBus]) -> Self {
+        let of = |pid: u32| (pid, processor_seconds(pid));
+        Self {
+            gateway: own_seconds(),
+            cells: cells.pids().map(of).collect(),
+            buses: buses.iter().map(|bus| of(bus.pid())).collect(),
+        }
+    }
+
+    /// What was spent since, in cores; of processes that are still there.
+    pub(super) fn since(&self, before: &Self, seconds: f64) -> Processor {
+        let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
+            let one = |(pid, spent): (&u32, &f64)| spent - before.get(pid).copied().unwrap_or(0.0);
+            // Not sum(), which is -0.0 of no processes.
+            now.iter().map(one).fold(0.0, |all, one| all + one) / seconds
+        };
+        Processor {
+            gateway: (self.gateway - before.gateway) / seconds,
+            cells: since(&self.cells, &before.cells),
+            buses: since(&self.buses, &before.buses),
+        }
+    }
 }

@@ -3,10 +3,11 @@
 use serde::Serialize;
 
 /// How a run ended.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Outcome {
     /// It ran for its whole duration.
+    #[default]
     Done,
     /// A signal ended it early.
     Interrupted,

@@ -56,6 +56,31 @@ pub struct Timed {
     pub central: Option<(u64, Felt)>,
 }
 
+/// How a bus is, for all threads.
+#[derive(Debug)]
+pub struct BusState {
+    /// Whether it works, as its receiver sees it.
+    pub works: AtomicBool,
+    /// Commands that it took, joints among them.
+    pub commands: AtomicU64,
+    /// Set when cells are back on it after it was lost; the loop then says whether the robot is halted.
+    pub returned: AtomicBool,
+}
+
+impl Default for BusState {
+    fn default() -> Self {
+        Self { works: AtomicBool::new(true), commands: AtomicU64::new(0), returned: AtomicBool::new(false) }
+    }
+}
+
+impl BusState {
+    /// Whether it works now.
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        self.works.load(Ordering::Relaxed)
+    }
+}
+
 /// One bus, as a tick sees it.
 #[derive(Debug)]
 pub struct Line {
@@ -65,12 +90,8 @@ pub struct Line {
     pub snapshot: triple_buffer::Output<Snapshot>,
     /// Positions in rad of each broadcast, for the receiver to compare with.
     pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
-    /// Whether the bus works, as the receiver sees it.
-    pub works: Arc<AtomicBool>,
-    /// Commands that the bus took, joints among them.
-    pub commands: Arc<AtomicU64>,
-    /// Set when cells are back on the bus after it was lost.
-    pub returned: Arc<AtomicBool>,
+    /// How it is.
+    pub state: Arc<BusState>,
 }
 
 /// The control loop between two looks at the clock.
@@ -133,10 +154,10 @@ impl Turn {
             line.snapshot.update();
         }
         let snapshots = || self.lines.iter().map(|line| line.snapshot.output_buffer());
-        let heard = self.lines.iter().map(|line| Heard {
-            sums: &line.snapshot.output_buffer().sums,
-            works: line.works.load(Ordering::Relaxed),
-        });
+        let heard = self
+            .lines
+            .iter()
+            .map(|line| Heard { sums: &line.snapshot.output_buffer().sums, works: line.state.is_there() });
         let outcome = self.cycle.tick(tick, skipped, heard);
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
@@ -185,8 +206,8 @@ impl Turn {
     /// and once more when they are heard they are told to be as the robot is.
     fn owe_to_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
-            let works = line.works.load(Ordering::Relaxed);
-            let returned = line.returned.swap(false, Ordering::Relaxed);
+            let works = line.state.is_there();
+            let returned = line.state.returned.swap(false, Ordering::Relaxed);
             if (works && !*worked) || returned {
                 *owed = Some(if halted { Message::Halt } else { Message::Resume });
             }
@@ -227,7 +248,7 @@ impl Line {
         let frames = frames.get(..count).unwrap_or_default();
         let taken = send(bus, frames);
         if taken {
-            self.commands.fetch_add(1, Ordering::Relaxed);
+            self.state.commands.fetch_add(1, Ordering::Relaxed);
         } else {
             shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
         }

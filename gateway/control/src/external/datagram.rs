@@ -172,58 +172,11 @@ impl State {
         out.joints(input.torque);
         bytes
     }
-
-    /// Reads a state, as a controller does. Never panics.
-    ///
-    /// # Errors
-    /// When it is not one.
-    pub fn decode(bytes: &[u8]) -> Result<Self, Nonsense> {
-        let mut from = Reader(bytes);
-        if from.head()? != STATE {
-            return Err(Nonsense::Kind);
-        }
-        if bytes.len() != STATE_BYTES {
-            return Err(Nonsense::Length);
-        }
-        let mut input = Input {
-            tick: u64::from_le_bytes(from.take()),
-            time: protocol::time::Micros(u64::from_le_bytes(from.take())),
-            age: u32::from_le_bytes(from.take()),
-            contributing: u32::from_le_bytes(from.take()),
-            ..Input::default()
-        };
-        let flags = u32::from_le_bytes(from.take());
-        input.valid = flags & Self::VALID != 0;
-        input.halted = flags & Self::HALTED != 0;
-        input.missing = flags >> Self::MISSING;
-        let joints = u32::from_le_bytes(from.take());
-        input.q = from.joints();
-        input.qdot = from.joints();
-        input.torque = from.joints();
-        Ok(Self { input, joints })
-    }
 }
 
 impl Answer {
     const VELOCITY: u32 = 1;
     const POSITION: u32 = 2;
-
-    /// The bytes, as a controller writes them.
-    #[must_use]
-    pub fn encode(&self) -> [u8; ANSWER_BYTES] {
-        let mut bytes = [0; ANSWER_BYTES];
-        let mut out = Writer(&mut bytes);
-        out.head(ANSWER);
-        out.put(self.tick.to_le_bytes());
-        let (command, values) = match self.command {
-            Command::Velocity(values) => (Self::VELOCITY, values),
-            Command::Position(values) => (Self::POSITION, values),
-        };
-        out.put(command.to_le_bytes());
-        out.put([0; 4]);
-        out.joints(values);
-        bytes
-    }
 }
 
 impl Heard {
@@ -257,5 +210,58 @@ impl Heard {
             _ => return Err(Nonsense::Command),
         };
         Ok(Self::Answer(Answer { tick, command }))
+    }
+}
+
+/// The same as the other program reads and writes it.
+#[cfg(test)]
+mod peer {
+    use super::*;
+
+    impl State {
+        /// Reads a state. Never panics.
+        pub(crate) fn decode(bytes: &[u8]) -> Result<Self, Nonsense> {
+            let mut from = Reader(bytes);
+            if from.head()? != STATE {
+                return Err(Nonsense::Kind);
+            }
+            if bytes.len() != STATE_BYTES {
+                return Err(Nonsense::Length);
+            }
+            let mut input = Input {
+                tick: u64::from_le_bytes(from.take()),
+                time: protocol::time::Micros(u64::from_le_bytes(from.take())),
+                age: u32::from_le_bytes(from.take()),
+                contributing: u32::from_le_bytes(from.take()),
+                ..Input::default()
+            };
+            let flags = u32::from_le_bytes(from.take());
+            input.valid = flags & Self::VALID != 0;
+            input.halted = flags & Self::HALTED != 0;
+            input.missing = flags >> Self::MISSING;
+            let joints = u32::from_le_bytes(from.take());
+            input.q = from.joints();
+            input.qdot = from.joints();
+            input.torque = from.joints();
+            Ok(Self { input, joints })
+        }
+    }
+
+    impl Answer {
+        /// The bytes.
+        pub(crate) fn encode(&self) -> [u8; ANSWER_BYTES] {
+            let mut bytes = [0; ANSWER_BYTES];
+            let mut out = Writer(&mut bytes);
+            out.head(ANSWER);
+            out.put(self.tick.to_le_bytes());
+            let (command, values) = match self.command {
+                Command::Velocity(values) => (Self::VELOCITY, values),
+                Command::Position(values) => (Self::POSITION, values),
+            };
+            out.put(command.to_le_bytes());
+            out.put([0; 4]);
+            out.joints(values);
+            bytes
+        }
     }
 }

@@ -61,17 +61,10 @@ impl External {
     /// # Errors
     /// When somebody listens there already, something else has that name, or the system refuses.
     pub fn listen(path: &Path, skin: &Skin) -> Result<Self, SocketError> {
-        let path = path.to_owned();
-        let socket = match bind(&path) {
-            Ok(socket) => socket,
-            Err(Refused::Live) => return Err(SocketError::Live { path }),
-            Err(Refused::NotASocket) => return Err(SocketError::NotASocket { path }),
-            Err(Refused::System(source)) => return Err(SocketError::System { path, source }),
-        };
         Ok(Self {
-            socket,
-            file: file(&path),
-            path,
+            socket: bind(path)?,
+            file: file(path),
+            path: path.to_owned(),
             peer: None,
             exchange: Exchange::default(),
             pace: Pace::of(skin),
@@ -140,30 +133,24 @@ impl Drop for External {
     }
 }
 
-enum Refused {
-    Live,
-    NotASocket,
-    System(io::Error),
-}
-
-fn bind(path: &Path) -> Result<UnixDatagram, Refused> {
+fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
+    let system = |source| SocketError::System { path: path.to_owned(), source };
     let socket = match UnixDatagram::bind(path) {
         Err(error) if error.kind() == ErrorKind::AddrInUse => {
-            let kind = std::fs::symlink_metadata(path).map_err(Refused::System)?.file_type();
-            if !kind.is_socket() {
-                return Err(Refused::NotASocket);
+            if !std::fs::symlink_metadata(path).map_err(system)?.file_type().is_socket() {
+                return Err(SocketError::NotASocket { path: path.to_owned() });
             }
             match UnixDatagram::unbound().and_then(|probe| probe.connect(path)) {
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => {
                     std::fs::remove_file(path).and_then(|()| UnixDatagram::bind(path))
                 }
-                Ok(()) | Err(_) => return Err(Refused::Live),
+                Ok(()) | Err(_) => return Err(SocketError::Live { path: path.to_owned() }),
             }
         }
         bound => bound,
     };
-    let socket = socket.map_err(Refused::System)?;
-    socket.set_nonblocking(true).map_err(Refused::System)?;
+    let socket = socket.map_err(system)?;
+    socket.set_nonblocking(true).map_err(system)?;
     Ok(socket)
 }
 

@@ -17,6 +17,7 @@
 
 pub mod numbers;
 mod outcome;
+mod report;
 mod roster;
 mod task;
 
@@ -32,7 +33,9 @@ use protocol::time::{Micros, Span};
 use roster::Roster;
 use task::{Stage, Task};
 
+use crate::repeat::{Attempt, Limits, Turn};
 pub use outcome::{Ask, Outcome, Reason, Trouble};
+pub use report::{CellReport, Progress, Report, Stranger};
 pub use task::Wish;
 
 /// How long a bus is listened to before anything is said: two gateways notice each other in this time.
@@ -41,10 +44,10 @@ pub const LISTEN: Span = Span::from_millis(500);
 const SHOWING: Span = Span::from_millis(3_000);
 /// Cells that are asked by themselves at the same time.
 const WINDOW: usize = 16;
-/// How long nobody may answer a request to everyone before it is over, and what remains is asked of each.
+/// How often everyone is asked the same, when most do not answer; and how long nobody may answer before it is over,
+/// and what remains is asked of each.
+const CALLS: Limits = Limits { first: QUIET, longest: QUIET, tries: 3 };
 const QUIET: Span = Span::from_millis(150);
-/// How often everyone is asked the same, when most do not answer.
-const CALLS: u8 = 3;
 /// From one sync to the next while heartbeats are awaited.
 const SYNC: Span = Span::from_millis(300);
 /// How often a gateway says that it is there: nobody begins beside it.
@@ -76,63 +79,8 @@ struct Call {
     tag: u8,
     /// Cells that needed it at first.
     needed: usize,
-    tries: u8,
     /// When it is over, unless somebody answers before that.
-    due: Micros,
-}
-
-/// How far it is, for people.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Progress {
-    /// What is being done: listening, looking for cells, writing, reading back, waiting for heartbeats.
-    pub doing: &'static str,
-    /// Cells of the description on this bus.
-    pub cells: usize,
-    /// Of these, heard.
-    pub found: usize,
-    /// Of these, finished well.
-    pub done: usize,
-    /// Of these, given up.
-    pub failed: usize,
-}
-
-/// What became of one cell.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CellReport {
-    /// Its number in the description.
-    pub described: CellId,
-    /// Its serial number.
-    pub serial: u32,
-    /// Its number on the bus, if it was heard.
-    pub number: Option<CellId>,
-    /// What became of it.
-    pub outcome: Outcome,
-}
-
-/// A cell that the description does not have on this bus.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Stranger {
-    /// Its number on the bus.
-    pub number: CellId,
-    /// Its serial number.
-    pub serial: u32,
-    /// The bus on which the description has it.
-    pub belongs: Option<String>,
-}
-
-/// What became of one bus.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Report {
-    /// The described cells, in the file's order.
-    pub cells: Vec<CellReport>,
-    /// The others, by number; they were left alone.
-    pub strangers: Vec<Stranger>,
-    /// Requests to one cell or to everyone.
-    pub requests: u64,
-    /// Of these, said again because nobody answered.
-    pub repeated: u64,
-    /// Why the bus was left alone from some moment on.
-    pub trouble: Option<Trouble>,
+    attempt: Attempt,
 }
 
 /// The commissioning of one bus.
@@ -218,7 +166,7 @@ impl Commission {
                 let Some(task) = self.holder(from) else { return };
                 task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
                 if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
-                    call.due = now + QUIET;
+                    call.attempt.extend(now);
                 }
             }
             Message::Network { .. }
@@ -397,21 +345,20 @@ impl Commission {
     /// Goes on with requests to everyone; whether one is under way.
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
-            if let Some(call) = self.call {
+            if let Some(call) = &mut self.call {
                 let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.ask));
                 let first = waiting.next().map(|(place, _)| place);
-                if first.is_some() && now < call.due {
-                    return true;
-                }
                 // When most have not heard it, to say it again costs less than to ask each.
-                let lost = first.filter(|_| 2 * (waiting.count() + 1) > call.needed && call.tries < CALLS);
-                if let Some(place) = lost {
-                    self.call = Some(Call { due: now + QUIET, tries: call.tries + 1, ..call });
-                    self.repeated += 1;
-                    self.request(place, Node::Everyone, call.ask, call.tag);
-                    return true;
+                match first.map(|place| (place, call.attempt.turn(now))) {
+                    Some((_, Turn::Wait)) => return true,
+                    Some((place, Turn::Again)) if 2 * (waiting.count() + 1) > call.needed => {
+                        let Call { ask, tag, .. } = *call;
+                        self.repeated += 1;
+                        self.request(place, Node::Everyone, ask, tag);
+                        return true;
+                    }
+                    Some((_, Turn::Again | Turn::GiveUp)) | None => self.call = None,
                 }
-                self.call = None;
             }
             let Some(ask) = self.calls.pop_front() else { return false };
             let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(ask));
@@ -424,7 +371,7 @@ impl Commission {
             // There are fewer of them than tags.
             let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
             self.called.push((ask, tag));
-            self.call = Some(Call { ask, tag, needed, tries: 1, due: now + QUIET });
+            self.call = Some(Call { ask, tag, needed, attempt: Attempt::new(now, CALLS) });
             self.request(place, Node::Everyone, ask, tag);
         }
     }
@@ -479,61 +426,10 @@ impl Commission {
             Phase::Beat(synced) => Some(synced + SYNC),
             Phase::Write | Phase::Read => None,
         };
-        let call = self.call.map(|call| call.due);
+        let call = self.call.map(|call| call.attempt.due());
         let announcement = self.announced.map(|at| at + ANNOUNCE);
         let tasks = self.tasks.iter().filter_map(Task::due);
         tasks.chain([phase, call, announcement].into_iter().flatten()).min()
-    }
-
-    /// How far it is.
-    #[must_use]
-    pub fn progress(&self) -> Progress {
-        let count = |is: &dyn Fn(&Task) -> bool| self.tasks.iter().filter(|task| is(task)).count();
-        let failed = count(&|task| is_failed(task.stage));
-        let doing = match self.phase {
-            Phase::Listen(_) => "listening",
-            Phase::Find(_) => "looking for cells",
-            Phase::Write => "writing",
-            Phase::Read => "reading back",
-            Phase::Beat(_) => "waiting for heartbeats",
-            Phase::Over => "done",
-        };
-        Progress {
-            doing,
-            cells: self.tasks.len(),
-            found: count(&|task| task.number.is_some()),
-            done: count(&|task| task.is_done()) - failed,
-            failed,
-        }
-    }
-
-    /// What has become of everybody; of cells that are not done, as if it were stopped now.
-    #[must_use]
-    pub fn report(&self) -> Report {
-        let cell = |task: &Task| CellReport {
-            described: task.described,
-            serial: task.serial,
-            number: task.number,
-            outcome: match task.stage {
-                Stage::Done(outcome) => outcome,
-                Stage::Missing | Stage::Write | Stage::Read | Stage::Beat(_) => {
-                    Outcome::Failed(Reason::Stopped)
-                }
-            },
-        };
-        let stranger = |(number, serial): (CellId, u32)| Stranger {
-            number,
-            serial,
-            belongs: self.elsewhere.get(&serial).cloned(),
-        };
-        let unknown = self.roster.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
-        Report {
-            cells: self.tasks.iter().map(cell).collect(),
-            strangers: unknown.map(stranger).collect(),
-            requests: self.requests,
-            repeated: self.repeated,
-            trouble: self.trouble,
-        }
     }
 }
 

@@ -7,13 +7,12 @@ use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
 use super::outcome::{Ask, Outcome, Reason};
+use crate::repeat::{Attempt, Limits, Turn};
 
-/// How long an answer may take at first, and at most after it did not come; a commit writes flash, which takes longer.
-const ANSWER: Span = Span::from_millis(100);
-const COMMIT: Span = Span::from_millis(400);
-const LONGEST: Span = Span::from_millis(800);
-/// How often a cell is asked the same before it is given up.
-const TRIES: u8 = 6;
+/// How often a cell is asked the same before it is given up, and how long its answer may take.
+const ANSWER: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
+/// A commit writes flash, which takes longer.
+const COMMIT: Limits = Limits { first: Span::from_millis(400), ..ANSWER };
 /// How often a cell is written anew, after it was switched off and on in the middle.
 const ROUNDS: u8 = 6;
 /// How long a cell that has started or fallen out may take to settle.
@@ -41,8 +40,7 @@ pub(super) enum Stage {
 struct Asked {
     ask: Ask,
     tag: u8,
-    tries: u8,
-    due: Micros,
+    attempt: Attempt,
 }
 
 /// A cell of the description.
@@ -226,7 +224,8 @@ impl Task {
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // What a commit that is not answered leads to is in use all the same.
         self.touched |= ask == Ask::Commit;
-        self.asked = Some(Asked { ask, tag: self.tag, tries: 1, due: now + patience(ask, 1) });
+        let attempt = Attempt::new(now, if ask == Ask::Commit { COMMIT } else { ANSWER });
+        self.asked = Some(Asked { ask, tag: self.tag, attempt });
         Some((ask, self.tag))
     }
 
@@ -240,22 +239,23 @@ impl Task {
         {
             self.fail(Reason::Hash { wanted: self.hash, got: self.said_hash });
         }
-        let asked = self.asked.as_mut().filter(|asked| asked.due <= now)?;
-        let Asked { ask, tag, tries, .. } = *asked;
-        if tries == TRIES {
-            self.fail(Reason::Silent { ask, tries });
-            return None;
+        let Asked { ask, tag, attempt } = self.asked.as_mut()?;
+        let (ask, tag, tries) = (*ask, *tag, attempt.tries());
+        match attempt.turn(now) {
+            Turn::Wait => None,
+            Turn::Again => Some((ask, tag)),
+            Turn::GiveUp => {
+                self.fail(Reason::Silent { ask, tries });
+                None
+            }
         }
-        asked.tries += 1;
-        asked.due = now + patience(ask, asked.tries);
-        Some((ask, tag))
     }
 
     /// When [`Task::time`] has something to do.
     pub(super) fn due(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLING);
         let beat = if let Stage::Beat(since) = self.stage { Some(since + BEAT) } else { None };
-        [self.asked.map(|asked| asked.due), settled, beat].into_iter().flatten().min()
+        [self.asked.map(|asked| asked.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
     /// Takes an answer: to what it was asked itself, or to `call`, which everyone was asked with this tag.
@@ -322,9 +322,4 @@ impl Task {
         }
         (self.written, self.read, self.stage) = (0, 0, Stage::Write);
     }
-}
-
-fn patience(ask: Ask, tries: u8) -> Span {
-    let first = if ask == Ask::Commit { COMMIT } else { ANSWER };
-    Span((first.0 << (tries - 1)).min(LONGEST.0))
 }

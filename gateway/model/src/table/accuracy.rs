@@ -1,6 +1,7 @@
 //! How far distributed torques are from central ones.
 
 use protocol::packet::WORDS;
+use serde::ser::{Serialize, SerializeStruct, Serializer};
 
 use super::held::word_to_nm;
 use super::replies::Expected;
@@ -9,12 +10,22 @@ use super::trunk;
 /// Epochs over which errors of sums are averaged.
 const AVERAGED: u32 = 32;
 
-/// Mean and greatest of some absolute errors, in Nm.
+/// Mean and greatest of some absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
     sum: f64,
     max: f64,
     count: u64,
+}
+
+impl Serialize for Errors {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut errors = serializer.serialize_struct("Errors", 3)?;
+        errors.serialize_field("mean_nm", &self.mean())?;
+        errors.serialize_field("max_nm", &self.max)?;
+        errors.serialize_field("count", &self.count)?;
+        errors.end()
+    }
 }
 
 impl Errors {
@@ -51,7 +62,7 @@ impl Errors {
 }
 
 /// Distributed against central torques, over the joints that a contact loads (l <= k).
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Accuracy {
     /// Single cells, against the central computation on the same words.
     pub single: Errors,
@@ -67,8 +78,10 @@ pub struct Accuracy {
     /// Words that were left out because they were saturated.
     pub saturated: u64,
     /// `single` joint by joint.
+    #[serde(skip)]
     pub single_by_joint: [Errors; WORDS],
     /// `whole` joint by joint.
+    #[serde(skip)]
     pub whole_by_joint: [Errors; WORDS],
 }
 

@@ -1,12 +1,13 @@
 //! Sums along the cells' tree: what the roots say in each epoch, and what should come of it.
 
 use protocol::packet::WORDS;
+use serde::Serialize;
 
 use super::accuracy::SumError;
 use crate::tracker::LATEST;
 
 /// What became of sums.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct SumCounts {
     /// Sums that came, of all cells.
     pub received: u64,
@@ -24,7 +25,7 @@ pub struct SumCounts {
 ///
 /// Due are the cells that feel a force by Algorithm 1 and can be expected to answer. A cell that only passes on
 /// what others feel is not.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Contributions {
     /// Cells that were to be in it, all epochs together.
     pub due: u64,

@@ -46,24 +46,12 @@ impl Stage for Fake {
     fn wait_for_answers(&mut self, lane: usize, _: &Open) {
         self.waited.push((self.sent.len(), lane));
     }
-    fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), String> {
+    fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
         self.restored += 1;
         self.clock += 1_000_000_000;
         Ok(())
     }
     fn show(&mut self, _: u64) {}
-}
-
-/// Steps that are all there.
-struct All(std::collections::VecDeque<Step>);
-
-impl Feed for All {
-    fn peek(&mut self) -> Next<'_> {
-        self.0.front().map_or(Next::End, Next::Step)
-    }
-    fn take(&mut self) -> Option<Step> {
-        self.0.pop_front()
-    }
 }
 
 fn frame(id: u32) -> Frame {
@@ -80,7 +68,10 @@ fn joints(at_us: u64, lane: usize, round: u64) -> Step {
 }
 
 fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = Step>) -> Played {
-    player.play(&mut All(steps.into_iter().collect()), stage)
+    let (mut all, mut queue) = rtrb::RingBuffer::new(1_024);
+    steps.into_iter().for_each(|step| all.push(step).unwrap());
+    drop(all);
+    player.play(&mut queue, stage)
 }
 
 fn identifiers(stage: &Fake) -> Vec<Vec<u32>> {

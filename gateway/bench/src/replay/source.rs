@@ -5,10 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use super::checks::Checks;
 use super::hall::Hall;
-use super::player::{Feed, Next};
 use super::reel::{Cut, Flow, Reel, Selection, Step, reason};
-use super::survey::Survey;
 use trace::capture::{CaptureError, Entry, Reader};
 
 /// Steps that are read ahead: some tenths of a second of a full bus.
@@ -19,7 +18,7 @@ const PAUSE: Duration = Duration::from_millis(2);
 /// Reads a capture so many times (without end when there is no number), and hands on what is to be done.
 #[derive(Debug)]
 pub(super) struct Source {
-    pub(super) survey: Arc<Survey>,
+    pub(super) checks: Arc<Checks>,
     pub(super) selection: Selection,
     pub(super) passes: Option<u32>,
     /// Whether the state in force is brought about before the first pass, and before the others.
@@ -32,7 +31,7 @@ pub(super) struct Source {
 impl Source {
     /// Reads to the end, or until nobody wants more.
     pub(super) fn run(self, files: &[PathBuf], mut queue: rtrb::Producer<Step>) -> Result<Cut, CaptureError> {
-        let mut reel = Reel::new(&self.survey, &self.selection);
+        let mut reel = Reel::new(&self.checks.survey, &self.selection);
         let mut pass = 0_u32;
         while self.passes.is_none_or(|passes| pass < passes) && !self.is_over(&queue) {
             if if pass == 0 { self.restores.0 } else { self.restores.1 } {
@@ -40,7 +39,7 @@ impl Source {
             }
             let mut judge = self.hall.judge();
             judge.record_begin();
-            for (bus, lane) in self.survey.buses.iter().zip(&self.selection.lanes) {
+            for (bus, lane) in self.checks.survey.buses.iter().zip(&self.selection.lanes) {
                 let in_force =
                     lane.iter().flat_map(|lane| bus.in_force.iter().map(|message| (*lane, message)));
                 in_force.for_each(|(lane, message)| judge.record(lane, message, false));
@@ -95,25 +94,5 @@ impl Source {
 
     fn is_over(&self, queue: &rtrb::Producer<Step>) -> bool {
         self.hall.is_over() || queue.is_abandoned()
-    }
-}
-
-/// The other end of the queue.
-#[derive(Debug)]
-pub(super) struct Queue(pub(super) rtrb::Consumer<Step>);
-
-impl Feed for Queue {
-    fn peek(&mut self) -> Next<'_> {
-        // Looked at before the queue, or what is pushed between the two would be missed.
-        let is_last = self.0.is_abandoned();
-        match self.0.peek() {
-            Ok(step) => Next::Step(step),
-            Err(_) if is_last => Next::End,
-            Err(_) => Next::Later,
-        }
-    }
-
-    fn take(&mut self) -> Option<Step> {
-        self.0.pop().ok()
     }
 }

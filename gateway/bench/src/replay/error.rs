@@ -1,0 +1,171 @@
+//! Why a replay cannot begin, or could not go on.
+
+use std::path::PathBuf;
+use std::process::ExitStatus;
+
+use protocol::bus::{BusError, KindsError};
+use protocol::document::DocumentError;
+use thiserror::Error;
+
+use super::checks::Mismatch;
+use crate::run::RunError;
+use crate::run::launch::LaunchError;
+use model::decode::BUSES;
+use trace::capture::CaptureError;
+
+/// Why a replay cannot begin, or could not go on.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ReplayError {
+    /// As of a run.
+    #[error(transparent)]
+    Run(#[from] RunError),
+    /// A skin says something that cannot be.
+    #[error(transparent)]
+    Document(#[from] DocumentError),
+    /// A bus does not open.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A program does not start.
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    /// Another kind is named for a bus than it can have.
+    #[error(transparent)]
+    Kinds(#[from] KindsError),
+    /// Standard input cannot be read twice.
+    #[error("a capture is read twice, which standard input cannot be: write it to a file, and name that")]
+    StandardInput,
+    /// Neither can a pipe.
+    #[error("{} is no regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
+    Pipe(PathBuf),
+    /// The capture does not open.
+    #[error(transparent)]
+    Open(CaptureError),
+    /// The capture cannot be read to its end.
+    #[error(transparent)]
+    Read(CaptureError),
+    /// A line cannot be read, and no such line is wanted.
+    #[error("{0}")]
+    Line(String),
+    /// The capture has too many buses.
+    #[error("{0} has frames of more than {BUSES} buses: a replay sends to no more than that")]
+    Buses(String),
+    /// There is nothing to be sent.
+    #[error("{0}: there is no frame in it")]
+    Empty(String),
+    /// Nor in the part that is wanted.
+    #[error(
+        "nothing is left to be sent: {name} lasts {seconds:.3} s from its first frame on, and --from and --to leave none \
+         of it"
+    )]
+    NothingLeft {
+        /// What the capture is called.
+        name: String,
+        /// How long it is.
+        seconds: f64,
+    },
+    /// An option names a bus that the capture does not have.
+    #[error("{option}: {capture} has no bus {bus}; it has {buses}")]
+    NoBus {
+        /// The option and its value.
+        option: String,
+        /// What the capture is called.
+        capture: String,
+        /// The bus.
+        bus: String,
+        /// The capture's.
+        buses: String,
+    },
+    /// A bus would go to two.
+    #[error("--map names {0} twice: a bus goes to one other bus")]
+    MapTwice(String),
+    /// Two buses would go to one.
+    #[error(
+        "two buses of the capture go to one: whose cells would answer? give each a bus of its own, or leave out --expect, \
+         --lockstep and --only inputs"
+    )]
+    Merged,
+    /// There is no skin for the cells that are to be started.
+    #[error(
+        "--spawn: {0} has no skin attached, as recordings of `gateway run --record` have: name it with --skin SKIN.toml"
+    )]
+    NoSkin(String),
+    /// The skin does not have a bus.
+    #[error("--spawn: the capture goes to {bus}, and the skin {skin} has {buses}: send it there with --map")]
+    NotOfSkin {
+        /// The bus.
+        bus: String,
+        /// The skin's name.
+        skin: String,
+        /// Its buses.
+        buses: String,
+    },
+    /// Cells are where some were to be started.
+    #[error("cells are on {bus} already: {cells}; leave out --spawn to use them, or stop them")]
+    CellsThere {
+        /// The bus.
+        bus: String,
+        /// Which.
+        cells: String,
+    },
+    /// A process of cells ended too early.
+    #[error("the process of {cells} ended while starting ({status}); see its message above")]
+    Ended {
+        /// Its cells.
+        cells: String,
+        /// How.
+        status: ExitStatus,
+    },
+    /// Another gateway is on a bus.
+    #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]
+    Rival(String),
+    /// Nobody is there.
+    #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
+    NoCell(String),
+    /// The cells are not as they were.
+    #[error(transparent)]
+    Mismatch(#[from] Mismatch),
+    /// Cells do not do what they are told.
+    #[error("cells do not go into test mode: {0}")]
+    NoTestMode(String),
+    /// Cells measure, and stimuli mean nothing to them.
+    #[error(
+        "cells measure and do not obey stimuli, as they did in the recording: {0}; --test-mode lets them obey while the \
+         replay lasts"
+    )]
+    Measuring(String),
+}
+
+impl ReplayError {
+    /// 2 for wrong use or configuration, 1 for a replay that failed.
+    #[must_use]
+    pub const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Run(error) => error.exit_code(),
+            Self::Document(_)
+            | Self::Bus(_)
+            | Self::Launch(_)
+            | Self::Kinds(_)
+            | Self::StandardInput
+            | Self::Pipe(_)
+            | Self::Open(_)
+            | Self::Buses(_)
+            | Self::Empty(_)
+            | Self::NothingLeft { .. }
+            | Self::NoBus { .. }
+            | Self::MapTwice(_)
+            | Self::Merged
+            | Self::NoSkin(_)
+            | Self::NotOfSkin { .. } => 2,
+            Self::Read(_)
+            | Self::Line(_)
+            | Self::CellsThere { .. }
+            | Self::Ended { .. }
+            | Self::Rival(_)
+            | Self::NoCell(_)
+            | Self::Mismatch(_)
+            | Self::NoTestMode(_)
+            | Self::Measuring(_) => 1,
+        }
+    }
+}

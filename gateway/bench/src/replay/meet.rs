@@ -1,0 +1,175 @@
+//! Before anything is sent: the cells are there, organised, and as they have to be.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, Request, State};
+use protocol::parameters::Parameter;
+
+use super::ReplayError;
+use super::judge::Judge;
+use super::session::Session;
+use super::start::Wearing;
+use crate::run::RunError;
+use crate::run::launch::STARTING;
+use crate::setup::{Patience, names};
+
+/// Cells that were there before say something within this time, by heartbeats alone.
+const SHOWING: Duration = Duration::from_secs(1);
+/// Cells of which none more finds a way up for so long have none: two hellos, and a search.
+const ORGANISING: Duration = Duration::from_secs(2);
+/// How often it is looked.
+const LOOK: Duration = Duration::from_millis(5);
+
+impl Session<'_> {
+    /// Calls the cells, and sees that they are as they have to be.
+    pub(super) fn meet(&mut self, wearing: Option<&Wearing>) -> Result<(), ReplayError> {
+        let options = self.options;
+        if !options.hears() {
+            return Ok(());
+        }
+        let worn = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
+            let bus = skin.bus_named(name);
+            bus.into_iter().flat_map(|bus| skin.cells_of(bus)).map(|cell| cell.node).collect()
+        };
+        let wanted = match wearing {
+            None => self.checks.recorded(),
+            Some(wearing) => self.checks.lanes().map(|(name, _)| worn(&wearing.skin, name)).collect(),
+        };
+        self.call_the_roll(&wanted)?;
+        self.let_them_organise()?;
+        let judge = self.hall.judge();
+        let settled = |lane| judge.present(lane).filter(|(_, cell)| cell.claim.is_settled()).count();
+        let there: usize = (0..self.buses.lanes.len()).map(settled).sum();
+        if there == 0 && (options.expect || options.lockstep || wearing.is_some()) {
+            let names: Vec<_> = self.checks.lanes().map(|(name, _)| name).collect();
+            return Err(ReplayError::NoCell(names.join(", ")));
+        }
+        if !self.checks.configures() {
+            self.checks.hashes(&judge)?;
+        }
+        let measuring = self.checks.measuring(&judge);
+        drop(judge);
+        let all = measuring.concat();
+        if all.is_empty() {
+            return Ok(());
+        }
+        if options.test_mode {
+            self.set_test_mode(&measuring)?;
+            self.measuring = measuring;
+            return Ok(());
+        }
+        let error = ReplayError::Measuring(names(&all, ""));
+        if options.expect {
+            return Err(error);
+        }
+        self.progress.note(&error.to_string());
+        Ok(())
+    }
+
+    /// Looks again and again at who is there, until a look is the last one.
+    fn wait(
+        &mut self,
+        mut is_last: impl FnMut(&mut Self, &Judge) -> Result<bool, ReplayError>,
+    ) -> Result<(), ReplayError> {
+        let hall = std::sync::Arc::clone(&self.hall);
+        while !is_last(self, &hall.judge())? {
+            thread::sleep(LOOK);
+        }
+        Ok(())
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.signalled.load(Ordering::Relaxed)
+    }
+
+    /// Waits until the cells that have to be there answer, or nobody more does.
+    fn call_the_roll(&mut self, wanted: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
+        let spawned = self.buses.processes.pids().next().is_some();
+        for lane in self.buses.lanes.iter() {
+            lane.send(&[Message::Sync])?;
+        }
+        let all = wanted.iter().map(BTreeSet::len).sum::<usize>();
+        let mut patience = Patience::new(if spawned { STARTING } else { SHOWING });
+        self.wait(|session, judge| {
+            if session.is_interrupted() {
+                return Err(RunError::Interrupted.into());
+            }
+            if let Some(ended) = session.buses.processes.ended().first() {
+                return Err(ReplayError::Ended { cells: ended.to_string(), status: ended.status });
+            }
+            if let Some(lane) = judge.rival() {
+                return Err(ReplayError::Rival(session.checks.lane(lane).to_owned()));
+            }
+            let there = |(lane, cells): (usize, &BTreeSet<CellId>)| {
+                let present = judge.present(lane);
+                present.filter(|(cell, present)| cells.contains(cell) && present.claim.is_settled()).count()
+            };
+            let there = wanted.iter().enumerate().map(there).sum();
+            Ok(there == all || patience.is_over(there))
+        })
+    }
+
+    /// Waits until all cells that reply with sums have a way to the gateway, or nobody more finds one.
+    fn let_them_organise(&mut self) -> Result<(), ReplayError> {
+        for lane in self.buses.lanes.iter().filter(|lane| lane.wired) {
+            lane.send(&[Message::Report])?;
+        }
+        let mut patience = Patience::new(ORGANISING);
+        self.wait(|session, judge| {
+            let wired = session.buses.lanes.iter().enumerate().filter(|(_, lane)| lane.wired);
+            let without: Vec<_> = wired.map(|(index, lane)| (lane, judge.without_a_way(index))).collect();
+            let count: usize = without.iter().map(|(_, cells)| cells.len()).sum();
+            if count == 0 || session.is_interrupted() {
+                return Ok(true);
+            }
+            let is_over = patience.is_over(usize::MAX - count);
+            for (lane, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
+                let (name, cells) = (lane.bus.name(), names(cells, ""));
+                session.progress.note(&format!("cells on {name} have no way to the gateway's side: {cells}"));
+            }
+            Ok(is_over)
+        })
+    }
+
+    /// Puts cells that measure into test mode.
+    fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
+        for (lane, cells) in self.buses.lanes.iter().zip(measuring).filter(|(_, cells)| !cells.is_empty()) {
+            let told = cells.iter().map(|cell| mode(Node::Cell(*cell), true));
+            lane.send(&told.chain([Message::Sync]).collect::<Vec<_>>())?;
+        }
+        let give_up = Instant::now() + SHOWING;
+        self.wait(|_, judge| {
+            let obeys = |(lane, cells): (usize, &Vec<CellId>)| {
+                cells.iter().all(|cell| {
+                    let mut present = judge.present(lane).filter(|(it, _)| it == cell);
+                    present.any(|(_, it)| it.claim.says(State::TEST_MODE))
+                })
+            };
+            let all_obey = measuring.iter().enumerate().all(obeys);
+            if !all_obey && Instant::now() > give_up {
+                return Err(ReplayError::NoTestMode(names(&measuring.concat(), "")));
+            }
+            Ok(all_obey)
+        })
+    }
+
+    /// Leaves cells as they were met.
+    pub(super) fn leave(&self) -> Result<(), ReplayError> {
+        for (lane, cells) in
+            self.buses.lanes.iter().zip(&self.measuring).filter(|(_, cells)| !cells.is_empty())
+        {
+            lane.send(&cells.iter().map(|cell| mode(Node::Cell(*cell), false)).collect::<Vec<_>>())?;
+        }
+        Ok(())
+    }
+}
+
+/// The message that makes cells obey stimuli, or measure; either way they forget all stimuli.
+pub(super) fn mode(to: Node, obeys: bool) -> Message {
+    let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
+    Message::Configure { to, tag: 0, request: Request::Write { number: Parameter::Mode.number(), words } }
+}

@@ -1,0 +1,127 @@
+//! A bench: its buses, its cells' processes, and what all of its threads share.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Receiver as Inlet;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use hdrhistogram::Histogram;
+use protocol::bus::BusError;
+use protocol::can::{Format, Frame};
+use protocol::id::Node;
+use protocol::message::{Message, Request};
+use protocol::packet::Epoch;
+use protocol::time::Micros;
+
+use super::Options;
+use super::launch::{Processes, ServedBus};
+use super::link::{Link, Slot, may_return};
+use super::network::Network;
+use super::receiver::{Left, News};
+use crate::record::Recorder;
+use crate::setup::names;
+use crate::view::{CellView, View};
+use control::cycle::Cycle;
+use control::cycle::turn::{Line, Shared, Timed};
+use model::table::Switch;
+
+/// Between two looks, until the loop begins.
+pub(super) const LOOK: Duration = Duration::from_millis(5);
+
+/// The tag of requests to switch cells.
+const SWITCH: u8 = 0x5E;
+
+/// One bus of a bench.
+#[derive(Debug)]
+pub(super) struct Lane {
+    pub(super) link: Arc<Link>,
+    pub(super) format: Format,
+    /// What the loop has of the bus, until it begins.
+    pub(super) line: Option<(Line, Slot)>,
+    pub(super) view: Arc<Mutex<View>>,
+    pub(super) receiver: Option<JoinHandle<Left>>,
+    /// Its cells' network, where they answer with sums.
+    pub(super) network: Option<Network>,
+    pub(super) shared: Arc<Shared>,
+}
+
+impl Lane {
+    /// Sends a message. A bus that is lost for a while does not take it, which is counted, and costs no run its end.
+    pub(super) fn send(&self, message: &Message) -> Result<bool, BusError> {
+        let frames: Vec<Frame> = message.encode().frames(self.format).collect();
+        match self.link.send(&frames).map_err(BusError::from) {
+            Err(error) if may_return(&error) => {
+                self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
+                Ok(false)
+            }
+            sent => sent.map(|()| true),
+        }
+    }
+
+    /// Switches a cell, or all; who does not confirm it is told again.
+    pub(super) fn switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
+        self.send(&Message::Configure { to, tag: SWITCH, request: Request::Write { number, words } })
+    }
+}
+
+/// A bench whose cells are ready and whose loop has not begun.
+#[derive(Debug)]
+pub(super) struct Bench<'a> {
+    pub(super) options: &'a Options,
+    pub(super) began: Instant,
+    pub(super) idle: Histogram<u64>,
+    /// What the kernel's backlog had dropped before the first bus was opened.
+    pub(super) backlog_dropped: Option<u64>,
+    pub(super) shared: Arc<Shared>,
+    pub(super) lanes: Vec<Lane>,
+    pub(super) news: Inlet<(usize, News)>,
+    pub(super) signalled: Arc<AtomicBool>,
+    pub(super) cycle: Option<Cycle>,
+    /// The epoch of the first broadcast.
+    pub(super) first_epoch: Epoch,
+    pub(super) recorder: Option<Recorder>,
+    /// Where the loop's records go that are to be recorded.
+    pub(super) recorded: Option<rtrb::Producer<Timed>>,
+    // In this order they end: the cells before their buses.
+    pub(super) processes: Processes,
+    pub(super) served: Vec<ServedBus>,
+}
+
+impl Bench<'_> {
+    /// The time since it began.
+    pub(super) fn now(&self) -> Micros {
+        Micros(u64::try_from(self.began.elapsed().as_micros()).unwrap_or(u64::MAX))
+    }
+
+    /// The name of a bus of the skin.
+    pub(super) fn name(&self, bus: usize) -> &str {
+        self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str())
+    }
+
+    /// What each receiver shows.
+    pub(super) fn views(&self) -> impl Iterator<Item = (&Lane, MutexGuard<'_, View>)> {
+        self.lanes.iter().filter_map(|lane| Some((lane, lane.view.lock().ok()?)))
+    }
+
+    /// The networks of the cells that answer with sums, with what their receivers show.
+    pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
+        self.lanes
+            .iter_mut()
+            .filter_map(|Lane { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
+    }
+
+    /// How many cells are so.
+    pub(super) fn count(&self, is: impl Fn(&CellView) -> bool) -> usize {
+        self.views().map(|(_, view)| view.cells.iter().filter(|cell| is(cell)).count()).sum()
+    }
+
+    /// The names of some cells, for people: `1, 2, 5 on vcan0`.
+    pub(super) fn names(&self, wanted: impl Fn(&CellView) -> bool) -> String {
+        let names = self.views().filter_map(|(lane, view)| {
+            let nodes: Vec<_> = view.cells.iter().filter(|cell| wanted(cell)).map(|cell| cell.node).collect();
+            (!nodes.is_empty()).then(|| names(&nodes, &format!(" on {}", lane.link.name)))
+        });
+        names.collect::<Vec<_>>().join("; ")
+    }
+}

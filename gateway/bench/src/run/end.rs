@@ -1,0 +1,197 @@
+//! The end of a bench: last words of the cells, the recording, the summary.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::bus::BusKind;
+use protocol::message::Message;
+use protocol::time::Micros;
+
+use super::RunError;
+use super::bench::{Bench, Lane};
+use super::measured::Measured;
+use super::progress::say;
+use super::realtime::wall;
+use super::receiver::Left;
+use super::watch::LOOK;
+use crate::record::feed::Unrecorded;
+use crate::record::{Recorder, backlog};
+use crate::summary::{BusSummary, Loop, NetworkSummary, OutagesSummary, Summary};
+use crate::view::View;
+use model::quantiles::Quantiles;
+use model::table::{Accuracy, Said};
+use trace::recording::account::Recording;
+
+/// How long the cells may take to say their last words; a machine that is overloaded needs it.
+const LAST_WORDS: Duration = Duration::from_secs(3);
+
+impl Bench<'_> {
+    /// Runs the loop to its end, or as far as it comes.
+    pub(super) fn watch(mut self) -> Summary {
+        let mut summary = Summary::empty(&self.options.skin);
+        let mut measured = Measured::new();
+        let failure = self.drive(&mut summary, &mut measured).err().map(|error| error.to_string());
+        let received = self.stop_receivers();
+        summary.recording = self.finish_recording(&received);
+        if failure.is_some() {
+            self.say_what_is_kept(summary.recording.as_ref());
+        }
+        self.summarise(summary, &measured, &received).judged(failure)
+    }
+
+    /// Ends a bench whose loop never began.
+    pub(super) fn give_up(mut self, error: RunError) -> Result<Summary, RunError> {
+        let mut summary = Summary::empty(&self.options.skin);
+        let received = self.stop_receivers();
+        summary.recording = self.recorder.take().map(Recorder::discard);
+        self.say_what_is_kept(summary.recording.as_ref());
+        if error.exit_code() != 1 {
+            return Err(error);
+        }
+        Ok(self.summarise(summary, &Measured::new(), &received).judged(Some(error.to_string())))
+    }
+
+    /// Where the frames are that were heard before a failure.
+    fn say_what_is_kept(&self, recording: Option<&Recording>) {
+        if self.options.quiet {
+            return;
+        }
+        for file in recording.into_iter().flat_map(|recording| &recording.files) {
+            say(&format!("{} frames until then are in {}", file.frames, file.path));
+        }
+    }
+
+    /// Lets late replies come in, and asks all cells for their counters and a last heartbeat.
+    pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
+        thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
+        self.wait_until(|bench| bench.has_caught_up())?;
+        self.say(&Message::Report)?;
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters))?;
+        if interrupted {
+            self.say(&Message::Halt)?;
+        }
+        // Last of all, so that each cell's own count covers everything else that it has sent.
+        self.say(&Message::Sync)?;
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat))
+    }
+
+    /// Whether the receivers have read everything that was sent; what came before it they have read too. Of a bus
+    /// that is lost nothing is waited for.
+    fn has_caught_up(&self) -> bool {
+        self.lanes.iter().all(|lane| {
+            let read = lane.view.lock().map_or(u64::MAX, |view| view.commands);
+            !lane.link.state.is_there() || read >= lane.link.state.commands.load(Ordering::Relaxed)
+        })
+    }
+
+    /// Whether all cells have said it that can be expected to, on buses that work.
+    fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
+        self.lanes.iter().filter(|lane| lane.link.state.is_there()).all(|lane| {
+            let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
+            lane.view.lock().map_or(true, |view| all(&view))
+        })
+    }
+
+    /// Waits for something, but not for ever; what is missing then shows in the accounts.
+    fn wait_until(&self, done: impl Fn(&Self) -> bool) -> Result<(), RunError> {
+        let give_up = Instant::now() + LAST_WORDS;
+        while !done(self) && Instant::now() < give_up {
+            thread::sleep(LOOK);
+        }
+        Ok(())
+    }
+
+    /// Lets the receivers end and takes what they leave.
+    fn stop_receivers(&mut self) -> Vec<Option<Left>> {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        let end = |lane: &mut Lane| lane.receiver.take().and_then(|thread| thread.join().ok());
+        self.lanes.iter_mut().map(end).collect()
+    }
+
+    /// Ends the recording, when nobody hands over more.
+    fn finish_recording(&mut self, received: &[Option<Left>]) -> Option<Recording> {
+        let add = |all: Unrecorded, one: &Left| Unrecorded {
+            frames: all.frames + one.unrecorded.frames,
+            epochs: all.epochs + one.unrecorded.epochs,
+        };
+        let unrecorded = received.iter().flatten().fold(Unrecorded::default(), add);
+        let ticks = self.shared.records_unrecorded.load(Ordering::Relaxed);
+        self.recorder.take().map(|recorder| recorder.finish(unrecorded, ticks))
+    }
+
+    /// Adds what was measured and received.
+    fn summarise(&self, summary: Summary, measured: &Measured, received: &[Option<Left>]) -> Summary {
+        let backlog_dropped =
+            backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
+        let all = received.iter().flatten().map(|received| received.table.accuracy());
+        Summary {
+            halted: measured.halts.why().map(str::to_owned),
+            halts: measured.halts.all(),
+            further_halts: measured.halts.further,
+            before_halt: measured.halts.history(&self.options.skin),
+            first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
+            control: self.loop_summary(measured, summary.control),
+            accuracy: all.fold(Accuracy::default(), Accuracy::with),
+            backlog_dropped,
+            buses: self.bus_summaries(received, backlog_dropped, measured),
+            ..summary
+        }
+    }
+
+    fn loop_summary(&self, measured: &Measured, summary: Loop) -> Loop {
+        let count = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        Loop {
+            ticks: measured.ticks,
+            ticks_skipped: measured.skipped,
+            broadcasts: count(&self.shared.broadcasts),
+            broadcasts_skipped: count(&self.shared.broadcasts_skipped),
+            bad_cycles: measured.bad.clone(),
+            late_us: Quantiles::of(&measured.late, 1e-3),
+            idle_late_us: Quantiles::of(&self.idle, 1e-3),
+            took_us: Quantiles::of(&measured.took, 1e-3),
+            central_us: Quantiles::of(&measured.central, 1e-3),
+            took_distributed_us: Quantiles::of(&measured.took_distributed, 1e-3),
+            records_lost: count(&self.shared.records_lost),
+            unsent: count(&self.shared.unsent),
+            ..summary
+        }
+    }
+
+    fn bus_summaries(
+        &self,
+        received: &[Option<Left>],
+        backlog_dropped: Option<u64>,
+        measured: &Measured,
+    ) -> Vec<BusSummary> {
+        let now = Micros(wall() / 1_000);
+        let summary = |(index, (lane, received)): (usize, (&Lane, &Option<Left>))| {
+            let Left { table, outages, dropped, .. } = received.as_ref()?;
+            let link = &lane.link;
+            let network = lane.network.as_ref().map(|network| NetworkSummary {
+                organised_s: network.organised.map(protocol::time::Span::seconds),
+                deepest: network.deepest(),
+                differences: network.differences.iter().map(ToString::to_string).collect(),
+                without_way: network.without_way().collect(),
+                longest_without_way_s: network.longest.seconds(),
+                parent_changes: table.parent_changes(),
+            });
+            let outages = OutagesSummary {
+                times: outages.times,
+                lost_s: outages.lost(Instant::now()).as_secs_f64(),
+                at_end: outages.lasts(),
+                ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
+            };
+            let kind = link.kind.to_string();
+            let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, *dropped, now);
+            Some(BusSummary { outages, network, ..summary })
+        };
+        let mut summaries: Vec<_> = self.lanes.iter().zip(received).enumerate().filter_map(summary).collect();
+        // Nobody knows of which bus they were, but of the kernel's own.
+        let mut backlog = backlog_dropped.unwrap_or(0);
+        for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
+            backlog -= summary.uplink.explain_by_backlog(backlog);
+        }
+        summaries
+    }
+}

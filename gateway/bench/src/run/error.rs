@@ -1,0 +1,180 @@
+//! Why a run did not come to its end.
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitStatus;
+
+use protocol::bus::{BusError, BusKind};
+use protocol::document::DocumentError;
+use thiserror::Error;
+
+use super::launch::LaunchError;
+use super::network::TooDeep;
+use crate::record::OutputError;
+use crate::signals::SignalError;
+use control::external::SocketError;
+
+/// How benches on embedded buses keep out of each other's way.
+const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
+
+/// Why a run did not come to its end.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// A file says something that cannot be.
+    #[error(transparent)]
+    Document(#[from] DocumentError),
+    /// A bus does not open.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A program does not start.
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    /// There is nowhere to record.
+    #[error(transparent)]
+    Output(#[from] OutputError),
+    /// There is no socket for an external controller.
+    #[error("{0}{cause}", cause = .0.source().map(|cause| format!(": {cause}")).unwrap_or_default())]
+    Controller(#[from] SocketError),
+    /// The tree of cells is too deep for their slots.
+    #[error(transparent)]
+    TooDeep(#[from] TooDeep),
+    /// Cells cannot keep their parameters there.
+    #[error("--flash {}: there is no such directory; make it first", .0.display())]
+    NoFlash(PathBuf),
+    /// A scenario asks for what only a simulated bus does.
+    #[error(
+        "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, restart, \
+         cut, mend, stuck and drift it can"
+    )]
+    BusFault,
+    /// Simulated wires have no place on a real bus.
+    #[error(
+        "{0} is real hardware, and the wires between cells that answer with sums are simulated by frames that may not \
+         go there: use a vcan or the embedded bus, or reply = \"torque\""
+    )]
+    RealWires(String),
+    /// Signals cannot be caught.
+    #[error(transparent)]
+    Signal(#[from] SignalError),
+    /// A signal ended it before it began.
+    #[error("interrupted while starting")]
+    Interrupted,
+    /// The system gives no thread.
+    #[error("cannot start a thread: {0}")]
+    Thread(#[source] std::io::Error),
+    /// The system gives no file in memory.
+    #[error("a file in memory: {0}")]
+    Memory(#[source] std::io::Error),
+    /// A bus is lost.
+    #[error(transparent)]
+    Lost(BusError),
+    /// Another gateway is on a bus.
+    #[error("{}", rival(.0.as_ref()))]
+    Rival(Option<(String, BusKind)>),
+    /// Cells are on a bus on which some were to be started.
+    #[error(
+        "cells are on the bus already: {cells}; use them with --no-spawn, {}",
+        if *.embedded { format!("stop them, or {ELSEWHERE}") } else { "or stop them".to_owned() }
+    )]
+    CellsThere {
+        /// Which.
+        cells: String,
+        /// Whether the bus is an embedded one.
+        embedded: bool,
+    },
+    /// Cells have nothing to compute with.
+    #[error(
+        "cells without parameters: {0}; write them with `gateway commission`, or delete their flash files if these are \
+         damaged"
+    )]
+    Unconfigured(String),
+    /// Cells do not answer.
+    #[error(
+        "cells that are not ready: {cells}; {}",
+        if *.spawned { "see their own messages above" } else { "start them with cell-node, or leave out --no-spawn" }
+    )]
+    NotReady {
+        /// Which.
+        cells: String,
+        /// Whether they were started here.
+        spawned: bool,
+    },
+    /// Cells have another configuration.
+    #[error(
+        "cells that are configured for another skin than {}: {cells}; write it into them with `gateway commission`, or \
+         delete their flash files",
+        .skin.display()
+    )]
+    OtherSkin {
+        /// The skin's file.
+        skin: PathBuf,
+        /// Which.
+        cells: String,
+    },
+    /// A cell's process ended too early.
+    #[error("{cells} ended while starting ({status}); see the message above")]
+    Ended {
+        /// Its cells.
+        cells: String,
+        /// How.
+        status: ExitStatus,
+    },
+    /// The network is not as it is described, and cannot carry sums.
+    #[error("{0}")]
+    BrokenTree(String),
+    /// Cells do not answer with sums.
+    #[error("cells that do not take up sums (parameter 6): {0}; give them firmware that does")]
+    NoSums(String),
+    /// A thread panicked.
+    #[error("the {0} panicked")]
+    Panicked(&'static str),
+    /// Nobody receives any more.
+    #[error("a receiver ended while the loop ran")]
+    ReceiverEnded,
+}
+
+impl RunError {
+    /// 2 for wrong use or configuration, 1 for a run that failed.
+    #[must_use]
+    pub const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Document(_)
+            | Self::Bus(_)
+            | Self::Launch(_)
+            | Self::Output(_)
+            | Self::Controller(_)
+            | Self::TooDeep(_)
+            | Self::NoFlash(_)
+            | Self::BusFault
+            | Self::RealWires(_) => 2,
+            Self::Signal(_)
+            | Self::Interrupted
+            | Self::Thread(_)
+            | Self::Memory(_)
+            | Self::Lost(_)
+            | Self::Rival(_)
+            | Self::CellsThere { .. }
+            | Self::Unconfigured(_)
+            | Self::NotReady { .. }
+            | Self::OtherSkin { .. }
+            | Self::Ended { .. }
+            | Self::BrokenTree(_)
+            | Self::NoSums(_)
+            | Self::Panicked(_)
+            | Self::ReceiverEnded => 1,
+        }
+    }
+}
+
+fn rival(link: Option<&(String, BusKind)>) -> String {
+    match link {
+        None => "another gateway is on the bus".to_owned(),
+        Some((name, BusKind::SocketCan)) => {
+            format!("another gateway is on {name}: stop one of the two, or give this one another bus")
+        }
+        Some((name, BusKind::Embedded)) => {
+            format!("another gateway is on {name}: stop one of the two, or {ELSEWHERE}")
+        }
+    }
+}

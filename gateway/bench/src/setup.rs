@@ -1,0 +1,50 @@
+//! What a run and a replay have in common until their cells are there.
+
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use protocol::id::CellId;
+
+use crate::run::RunError;
+
+/// How long it is waited for something that is getting on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Patience {
+    length: Duration,
+    most: usize,
+    since: Instant,
+}
+
+impl Patience {
+    /// So long without progress.
+    pub(crate) fn new(length: Duration) -> Self {
+        Self { length, most: 0, since: Instant::now() }
+    }
+
+    /// Takes in how far it is; whether it got no further than that for too long.
+    pub(crate) fn is_over(&mut self, far: usize) -> bool {
+        if far > self.most {
+            (self.most, self.since) = (far, Instant::now());
+        }
+        self.since.elapsed() > self.length
+    }
+}
+
+/// The numbers of some cells, for people, and where these are: `1, 2, 5 on vcan0`.
+pub(crate) fn names(cells: &[CellId], place: &str) -> String {
+    let numbers: Vec<_> = cells.iter().map(ToString::to_string).collect();
+    match numbers.len() {
+        count @ 13.. => {
+            format!("{count} cells{place} ({} ...)", numbers.get(..6).unwrap_or_default().join(", "))
+        }
+        _ => numbers.join(", ") + place,
+    }
+}
+
+/// Starts a thread of this name.
+pub(crate) fn spawn<T: Send + 'static>(
+    name: &str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<JoinHandle<T>, RunError> {
+    thread::Builder::new().name(name.to_owned()).spawn(work).map_err(RunError::Thread)
+}

@@ -1,0 +1,74 @@
+//! What the receiver of a bus shows of its cells to the main thread and to the recorder.
+
+use protocol::id::CellId;
+use protocol::message::State;
+use protocol::packet::{Epoch, WORDS};
+
+use model::network::check::Seen;
+use model::table::{Cell, SWITCHES, Said, Status, Switch};
+
+/// The state of a bus' cells, renewed every 20 ms.
+#[derive(Clone, Debug, Default)]
+pub struct View {
+    /// Each cell, in the bus' order.
+    pub cells: Vec<CellView>,
+    /// Commands of our own that were read back from the bus, or were lost with it.
+    pub commands: u64,
+    /// What is known of the network's cells, those that are not described among them; nobody where cells answer
+    /// with their own torques.
+    pub network: Vec<Seen>,
+}
+
+/// The state of one cell.
+#[derive(Clone, Copy, Debug)]
+pub struct CellView {
+    /// Its number.
+    pub node: CellId,
+    /// Whether it has been heard of.
+    pub heard: bool,
+    /// Whether it has fallen silent.
+    pub dead: bool,
+    /// Whether it can be expected to answer, once nobody halts it.
+    pub ready: bool,
+    /// Whether it waits for a resume.
+    pub halted: bool,
+    /// Whether it is there for good and has no parameters to compute with.
+    pub unconfigured: bool,
+    /// Whether its configuration is not the skin's.
+    pub other: bool,
+    /// The joints that it had taken last.
+    pub last_joints: Epoch,
+    /// What it has said since it was asked.
+    pub said: Said,
+    /// What it answers joints with, as it said last.
+    pub reply: Option<[i16; WORDS]>,
+    /// Ports that hear nothing because it was told so, as it said last.
+    pub deaf: u8,
+    /// What it is to be switched to and has not confirmed.
+    pub lacks: [Option<Switch>; SWITCHES],
+}
+
+impl CellView {
+    /// What a table knows of a cell.
+    #[must_use]
+    pub fn of(cell: &Cell, status: Status) -> Self {
+        let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
+        let alive = !matches!(status, Status::Dead | Status::Unknown);
+        let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
+        let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
+        Self {
+            node: cell.node,
+            heard: state.is_some(),
+            dead: status == Status::Dead,
+            ready,
+            halted: ready && !cell.is_ready(),
+            unconfigured: settled.is_some() && !ready,
+            other: cell.heartbeat().is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+            last_joints: cell.last_joints,
+            said: cell.said(),
+            reply: cell.reply,
+            deaf: cell.deaf,
+            lacks: cell.lacks(),
+        }
+    }
+}

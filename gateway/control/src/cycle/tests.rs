@@ -1,0 +1,181 @@
+use super::*;
+use crate::controller::Kinesthetic;
+use crate::robot::SimulatedArm;
+use model::table::Sums;
+use model::testing;
+
+struct Dead;
+
+impl Controller for Dead {
+    fn step(&mut self, _: &Input) -> Step {
+        Step::Bad(BadCycle::NoAnswer)
+    }
+}
+
+const fn works(sums: &Sums) -> Heard<'_> {
+    Heard { sums, works: true }
+}
+
+fn tick(number: u64) -> Tick {
+    Tick { number, time: Micros(number * 2_000) }
+}
+
+fn cycle(controller: Box<dyn Controller>) -> (Cycle, Sums) {
+    let skin = testing::skin();
+    let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+    (Cycle::new(&skin, controller, Box::new(robot)), Sums::default())
+}
+
+#[test]
+fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
+    let (mut cycle, bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+    let mut sent = vec![];
+    for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
+        let outcome = cycle.tick(tick(number), 0, [works(&bus)]);
+        if let Some((epoch, _)) = outcome.joints {
+            sent.push((number, epoch.0, outcome.broadcasts_skipped));
+        }
+    }
+    assert_eq!(sent, [(0, 0, 0), (8, 1, 0), (17, 2, 0), (40, 3, 2)]);
+}
+
+#[test]
+fn bad_cycles_in_a_row_halt_once_and_a_resume_lets_go() {
+    let (mut cycle, mut bus) = cycle(Box::new(Dead));
+    let limit = u64::from(testing::skin().safety.bad_cycles);
+    let halts: Vec<u64> = (0..limit + 10)
+        .filter(|&number| cycle.tick(tick(number), 0, [works(&bus)]).command.is_some())
+        .collect();
+    assert_eq!(halts, [limit - 1]);
+    bus.resumes = 1;
+    let after = cycle.tick(tick(99), 0, [works(&bus)]);
+    assert_eq!((after.record.halted, after.record.bad), (None, Some(BadCycle::NoAnswer)));
+    assert_eq!(after.command, Some(Command::Resume), "the other buses have not heard it");
+    bus.halts = 1;
+    let halted = cycle.tick(tick(100), 0, [works(&bus)]);
+    assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
+}
+
+#[test]
+fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
+    let skin = testing::skin();
+    let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
+    let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
+    let bad = |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
+    for number in 0..=limit * 8 {
+        assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
+    }
+    assert_eq!(bad(&mut cycle, &bus, limit * 8 + 8), Some(BadCycle::Torque));
+    bus.read_back = Some(Epoch(7));
+    assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
+}
+
+/// Two buses in a loop of eight ticks an epoch; each feels 1 Nm.
+struct Two {
+    cycle: Cycle,
+    buses: [Sums; 2],
+    works: [bool; 2],
+    number: u64,
+}
+
+impl Two {
+    fn new(lost_bus: LostBus) -> Self {
+        let mut skin = testing::two_buses();
+        skin.safety.lost_bus = lost_bus;
+        let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+        let controller = Box::new(Kinesthetic::new(&skin).unwrap());
+        let felt = Sums { torque: [1.0; WORDS], contributing: 1, ..Sums::default() };
+        let cycle = Cycle::new(&skin, controller, Box::new(robot));
+        Self { cycle, buses: [felt; 2], works: [true; 2], number: 0 }
+    }
+
+    /// The ticks of an epoch, of which the last is returned; those buses that carry it read it back.
+    fn epoch(&mut self, carries: [bool; 2]) -> Record {
+        let mut last = None;
+        for _ in 0..8 {
+            let heard = self.buses.iter().zip(self.works).map(|(sums, works)| Heard { sums, works });
+            let outcome = self.cycle.tick(tick(self.number), 0, heard);
+            self.number += 1;
+            if let Some((epoch, _)) = outcome.joints {
+                for (bus, _) in self.buses.iter_mut().zip(carries).filter(|(_, carries)| *carries) {
+                    bus.read_back = Some(epoch);
+                }
+            }
+            last = Some(outcome.record);
+        }
+        last.unwrap()
+    }
+}
+
+#[test]
+fn a_lost_bus_is_let_go_by_the_rule_for_cells_and_the_others_go_on() {
+    let mut two = Two::new(LostBus::GoOn);
+    for _ in 0..5 {
+        let record = two.epoch([true, true]);
+        assert_eq!((record.torque[0], record.contributing, record.missing), (2.0, 2, 0));
+    }
+    two.works[1] = false;
+    let mut torques = Vec::new();
+    for missed in 0..300 {
+        let record = two.epoch([true, false]);
+        torques.push(record.torque[0]);
+        assert_eq!((record.bad, record.halted, record.missing), (None, None, 0b10), "epoch {missed}");
+        let held = missed < 6;
+        assert_eq!((record.contributing, record.age), if held { (2, missed) } else { (1, 0) });
+    }
+    assert_eq!(torques[..8], [2.0, 2.0, 2.0, 1.75, 1.5, 1.25, 1.0, 1.0]);
+    assert!(torques[8..].iter().all(|&torque| torque == 1.0), "epochs come round, a lost torque does not");
+    two.works[1] = true;
+    two.epoch([true, true]);
+    let back = two.epoch([true, true]);
+    assert_eq!((back.torque[0], back.contributing, back.missing, back.bad), (2.0, 2, 0, None));
+}
+
+#[test]
+fn a_bus_that_carries_nothing_is_lost_also_when_nobody_says_so() {
+    let mut two = Two::new(LostBus::GoOn);
+    two.epoch([true, true]);
+    let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
+    assert_eq!(missing[..7], [0; 7]);
+    assert_eq!(missing[7..], [0b10; 293], "also when the same epoch comes round again");
+}
+
+#[test]
+fn without_any_bus_the_torque_is_not_valid() {
+    let mut two = Two::new(LostBus::GoOn);
+    two.epoch([true, true]);
+    two.works = [false, false];
+    assert_eq!(two.epoch([false, false]).bad, Some(BadCycle::Torque));
+    two.works = [false, true];
+    assert_eq!(two.epoch([false, true]).bad, None);
+}
+
+#[test]
+fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
+    let mut two = Two::new(LostBus::Halt);
+    assert_eq!(two.epoch([true, true]).bad, None);
+    two.works[0] = false;
+    assert_eq!(two.epoch([true, true]).bad, Some(BadCycle::Torque));
+    for _ in 0..3 {
+        two.epoch([true, true]);
+    }
+    assert_eq!(two.epoch([true, true]).halted, Some(Halt::BadCycles(BadCycle::Torque)));
+    two.works[0] = true;
+    assert_eq!(two.epoch([true, true]).bad, None);
+}
+
+#[test]
+fn a_halted_robot_stands_whatever_is_asked() {
+    let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+    bus.torque = [5.0; WORDS];
+    for number in 0..50 {
+        cycle.tick(tick(number), 0, [works(&bus)]);
+    }
+    let moved = cycle.positions();
+    assert!(moved[0] > 0.0);
+    bus.halts = 1;
+    for number in 50..99 {
+        cycle.tick(tick(number), 0, [works(&bus)]);
+    }
+    assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
+}
