@@ -2,7 +2,7 @@
 
 use std::io::{self, Read};
 
-use super::log::read_some;
+use crate::container::read_some;
 
 /// What a file that is not text is, and what to do with it; `None` for an MCAP recording.
 type Other = Option<(&'static str, &'static str)>;

@@ -10,7 +10,7 @@ use protocol::candump::{Direction, Record, Timestamp};
 
 use super::cdr::{CdrError, Encode, Reader, Writer};
 use super::{Header, Message, definition};
-use crate::capture::{Note, NoteKind};
+use crate::note::{Note, NoteKind};
 
 /// A frame of a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -2,8 +2,10 @@
 
 mod foreign;
 mod read;
+mod state;
 mod write;
 
 pub(super) use read::{Fault, McapReader};
+pub(super) use state::State;
 pub use write::ORIGIN;
 pub(super) use write::{McapWriter, SOURCE};
