@@ -21,7 +21,7 @@ use trace::capture::{Note, NoteKind};
 use trace::files::sync;
 use trace::recording::account::{Recording, Written};
 use trace::recording::layout::Layout;
-use trace::recording::series::{Head, Said, Series, What};
+use trace::recording::series::{Count, Head, Said, Series};
 use trace::ros2::skin::Felt;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
@@ -175,7 +175,7 @@ impl Work {
                     }
                     if let Some(series) = &mut self.series {
                         seen.missing += u64::from(!series.is_open());
-                        series.put(What::Frame, |writer, topics| topics.frame(writer, bus, name, &frame));
+                        series.put(Count::FRAME, |writer, topics| topics.frame(writer, bus, name, &frame));
                     }
                 }
                 Captured::Dropped { at_nanos, frames } => {
@@ -206,7 +206,7 @@ impl Work {
             let nanos = timed.due_ns.saturating_add_signed(offset);
             if let Some(series) = &mut self.series {
                 series
-                    .put(What::Others(4), |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
+                    .put(Count::others(4), |writer, topics| topics.tick(writer, &self.layout, nanos, &timed));
             }
         }
     }
@@ -223,7 +223,7 @@ impl Work {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                series.put(What::Others(messages), |writer, topics| {
+                series.put(Count::others(messages), |writer, topics| {
                     topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -271,7 +271,7 @@ impl Work {
             ],
         });
         let now = wall();
-        series.put(What::Others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
+        series.put(Count::others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
     }
 
     fn flush(&mut self) {
@@ -290,8 +290,9 @@ impl Work {
         // So that this file can be understood without the one before.
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.in_force.frames() {
-                series
-                    .put(What::Others(1), |writer, topics| topics.in_force(writer, now, (bus, name), &frame));
+                series.put(Count::others(1), |writer, topics| {
+                    topics.in_force(writer, now, (bus, name), &frame)
+                });
             }
         }
         for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
@@ -390,7 +391,7 @@ impl Dropped<'_> {
         if let Some(series) = series {
             let kind = NoteKind::Dropped(frames);
             let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-            series.put(What::Others(1), |writer, topics| topics.note(writer, &note));
+            series.put(Count::others(1), |writer, topics| topics.note(writer, &note));
         }
     }
 }

@@ -14,8 +14,7 @@ use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic}
 use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
 use crate::recording::TOPIC_OF_STATE;
 use crate::ros2::cdr::CdrError;
-use crate::ros2::messages::{CanFrame, CaptureNote};
-use crate::ros2::{Message, MessageError};
+use crate::ros2::{Message, MessageError, messages};
 
 /// Bytes of attachments, metadata and frames in force that are kept.
 pub(super) const KEPT: usize = 16 << 20;
@@ -235,11 +234,11 @@ impl State {
         let nine_digits = facts.get("time_digits").is_none_or(|digits| digits != "6");
         let what = if encoding != "cdr" {
             None
-        } else if schema == CanFrame::TYPE && topic.starts_with(TOPIC_OF_STATE) {
+        } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
             Some(What::InForce)
-        } else if schema == CanFrame::TYPE {
+        } else if schema == Record::TYPE {
             Some(What::Frames { nine_digits })
-        } else if schema == CaptureNote::TYPE {
+        } else if schema == Note::TYPE {
             Some(What::Notes)
         } else {
             Foreign::of(&schema).map(What::Foreign)
@@ -271,22 +270,22 @@ impl State {
             What::InForce => in_force(message).map(Entry::Frame),
             What::Frames { nine_digits } => {
                 let time = Timestamp { nanos: log_time, nine_digits };
-                decode(message, LONGEST_FRAME, |message| CanFrame::decode(message, time))
-                    .map(|CanFrame(frame)| Entry::Frame(frame))
+                decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
             }
             What::Foreign(foreign) => {
                 let bus = beginning(topic);
                 decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time, bus))
                     .map(Entry::Frame)
             }
-            What::Notes => decode(message, LONGEST_NOTE, |message| CaptureNote::decode(message, log_time))
-                .map(|note| {
-                    let mut note = note.0.into_owned();
+            What::Notes => {
+                let note = decode(message, LONGEST_NOTE, |message| messages::note(message, log_time));
+                note.map(|mut note| {
                     if note.line > 0 && !self.any_frame {
                         note.nanos = 0;
                     }
                     Entry::Note(note)
-                }),
+                })
+            }
         };
         let entry = decoded.unwrap_or_else(|why| unreadable(topic, log_time, message, &why));
         self.any_frame |= matches!(entry, Entry::Frame(_));
@@ -307,8 +306,7 @@ fn decode<'a, T>(
 /// A frame of before, with its own time.
 fn in_force(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
-        let time = Timestamp { nanos: CanFrame::stamp(message)?, nine_digits: true };
-        Ok(CanFrame::decode(message, time)?.0)
+        messages::frame(message, Timestamp { nanos: messages::stamp(message)?, nine_digits: true })
     })
 }
 
