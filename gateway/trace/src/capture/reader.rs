@@ -85,7 +85,7 @@ enum Source {
 
 impl Source {
     /// Of a recording that is a regular file, attachments and metadata are known from the beginning.
-    fn open(path: &Path, through: &Through, state: State) -> Result<(String, Self), CaptureError> {
+    fn open(path: &Path, through: &Through, mut state: State) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         let mut file = File::open(path).map_err(failed)?;
@@ -93,12 +93,10 @@ impl Source {
         if about.is_dir() {
             return Err(failed(io::ErrorKind::IsADirectory.into()));
         }
-        let source = if about.is_file() && is_mcap(&mut file).map_err(failed)? {
-            let mcap = McapReader::with_files(file, through, state).map_err(failed)?;
-            Self::Mcap(Box::new(mcap))
-        } else {
-            Self::begin(&name, through(file), state)?
-        };
+        if about.is_file() && is_mcap(&mut file).map_err(failed)? {
+            state.find_files(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
+        }
+        let source = Self::begin(&name, through(file), state)?;
         Ok((name, source))
     }
 
@@ -266,15 +264,10 @@ impl Reader {
         }
         let Self { file: name, source, entries, .. } = self;
         let next = match source {
-            Source::Log(log) => match log.next() {
-                Ok(next) => next.map(Item::Entry),
-                Err(source) => return Err(CaptureError::Io { name: name.clone(), source }),
-            },
-            Source::Mcap(mcap) => match mcap.next() {
-                Ok(next) => next,
-                Err(fault) => return Err(fault.of(name, *entries)),
-            },
+            Source::Log(log) => log.next().map(|next| next.map(Item::Entry)).map_err(Fault::from),
+            Source::Mcap(mcap) => mcap.next(),
         };
+        let next = next.map_err(|fault| fault.of(name, *entries))?;
         *entries += u64::from(matches!(next, Some(Item::Entry(_))));
         Ok(next)
     }

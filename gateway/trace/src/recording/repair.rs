@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{Gid, fchown};
 
-use super::names::{self, Found};
+use super::names;
 use super::recover::{RecoverError, Recovered, recover};
 use crate::files::WholeFile;
 
@@ -114,16 +114,14 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
     for (part, found) in names::parts(path).unwrap_or_default() {
         let name = part.display();
         let held = match found {
-            Found::Orphan(held) => held,
-            Found::Left(why, maybe) => {
-                let remedy = if maybe {
+            Ok(held) => held,
+            Err(why) => {
+                let remedy = why.may_be_recording().then(|| {
                     format!(
                         "; if it is a recording that broke off, `gateway recover {name} -o NAME` copies it"
                     )
-                } else {
-                    String::new()
-                };
-                say(&format!("{name} is left alone: {why}{remedy}"));
+                });
+                say(&format!("{name} is left alone: {why}{}", remedy.unwrap_or_default()));
                 continue;
             }
         };

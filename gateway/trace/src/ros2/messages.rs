@@ -105,8 +105,8 @@ impl Encode for Note<'_> {
         out.put((frames, self.line));
         match (&self.kind, same) {
             (_, Some(text)) => out.put(text),
-            (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?")),
-            (_, None) => out.put(String::from_utf8_lossy(self.text).replace('\0', "?")),
+            (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?").as_str()),
+            (_, None) => out.put(String::from_utf8_lossy(self.text).replace('\0', "?").as_str()),
         }
         out.bytes(if same.is_some() { &[] } else { self.text });
     }

@@ -1,35 +1,16 @@
 //! The entries of an MCAP recording, and what else it has.
 
-use std::fs::File;
-use std::io::{self, BufReader, Chain, Cursor, Read, Seek};
+use std::io::{BufReader, Chain, Cursor, Read};
 
 use ::mcap::records::op;
 
+use super::Fault;
 use super::state::{KEPT, State, Wanted};
-use crate::capture::{Extras, Item, Through};
+use crate::capture::{Extras, Item};
 use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, parse};
 
 /// Bytes that are read at once.
 const PIECE: usize = 1 << 18;
-
-/// Why nothing more comes.
-#[derive(Debug)]
-pub(crate) enum Fault {
-    Io(io::Error),
-    Damaged(Damage),
-}
-
-impl From<io::Error> for Fault {
-    fn from(error: io::Error) -> Self {
-        Self::Io(error)
-    }
-}
-
-impl From<Damage> for Fault {
-    fn from(damage: Damage) -> Self {
-        Self::Damaged(damage)
-    }
-}
 
 type Input = BufReader<Chain<Cursor<Vec<u8>>, Box<dyn Read + Send>>>;
 
@@ -61,13 +42,6 @@ impl McapReader {
         // What stands before the first message is known from the beginning.
         reader.first = reader.advance().transpose();
         reader
-    }
-
-    /// Reads a file from its beginning. Its attachments and metadata are known from then on, wherever they stand.
-    pub(crate) fn with_files(mut file: File, through: &Through, mut state: State) -> io::Result<Self> {
-        state.find_files(&mut file)?;
-        file.rewind()?;
-        Ok(Self::new(&[], through(file), state))
     }
 
     pub(crate) const fn extras(&self) -> &Extras {

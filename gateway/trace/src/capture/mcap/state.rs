@@ -7,8 +7,8 @@ use std::io::{self, BufReader, Read, Seek};
 use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
 
+use super::Fault;
 use super::foreign::Foreign;
-use super::read::Fault;
 use crate::capture::log::LONGEST as LONGEST_LINE;
 use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
 use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
@@ -104,8 +104,9 @@ impl State {
         self.extras.unfinished.get_or_insert_with(why);
     }
 
-    /// Takes the attachments and metadata of a file that can be gone through without reading all of it.
-    pub(super) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
+    /// Takes the attachments and metadata of a file that can be gone through without reading all of it: they are known
+    /// from the beginning then, wherever they stand.
+    pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
         if self.knows_files {
             return Ok(());
         }
