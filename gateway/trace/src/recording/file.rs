@@ -71,19 +71,13 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
     if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
         return Ok(false);
     }
-    let ours = match parse(op::HEADER, from.body()) {
-        Ok(Record::Header { library, .. }) => library.starts_with(PROGRAM),
-        _ => false,
-    };
-    if !ours || from.next()? != Framed::Record(op::METADATA) {
+    let header = parse(op::HEADER, from.body());
+    let is_ours = matches!(header, Ok(Record::Header { library, .. }) if library.starts_with(PROGRAM));
+    if !is_ours || from.next()? != Framed::Record(op::METADATA) {
         return Ok(false);
     }
-    Ok(match parse(op::METADATA, from.body()) {
-        Ok(Record::Metadata { name, facts }) => {
-            name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value))
-        }
-        _ => false,
-    })
+    let Ok(Record::Metadata { name, facts }) = parse(op::METADATA, from.body()) else { return Ok(false) };
+    Ok(name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value)))
 }
 
 /// What was written cannot go on.

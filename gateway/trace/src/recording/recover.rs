@@ -118,7 +118,7 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
         }
     }
     let mut copy = Copy::new(source.body(), out).map_err(RecoverError::Write)?;
-    let mut chunk = Chunk::new();
+    let mut chunk = Chunk::default();
     loop {
         let framed = source.next().map_err(RecoverError::Read)?;
         let (kept, bytes) = match framed {

@@ -1,7 +1,7 @@
 //! Files whose writers are gone: found, made whole, said.
 
 use std::fs::{File, Permissions};
-use std::io::{self, BufReader, BufWriter, Seek, Write};
+use std::io::{self, BufReader, BufWriter, Seek};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -76,22 +76,20 @@ fn copy(
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     as_private(from, &file).map_err(RecoverError::Write)?;
-    let about = file.try_clone().map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
     // A pipe is where it is.
     let _ = from.rewind();
     let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
-    let wanted = wanted(&recovered);
-    let finish = || -> io::Result<Option<u64>> {
-        if !wanted {
-            return Ok(None);
-        }
-        out.flush()?;
+    if !wanted(&recovered) {
+        return Ok((recovered, None));
+    }
+    let finish = || -> io::Result<u64> {
+        let file = out.into_inner()?;
         whole.finish()?;
-        Ok(Some(about.metadata()?.len()))
+        Ok(file.metadata()?.len())
     };
-    Ok((recovered, finish().map_err(RecoverError::Write)?))
+    Ok((recovered, Some(finish().map_err(RecoverError::Write)?)))
 }
 
 /// Lets nobody read a copy who could not read the original.

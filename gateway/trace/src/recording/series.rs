@@ -117,6 +117,7 @@ impl core::fmt::Display for Said {
 }
 
 /// A file that is being written.
+#[derive(Debug)]
 struct Open<T> {
     writer: Writer,
     topics: T,
@@ -134,6 +135,7 @@ struct Open<T> {
 }
 
 /// A file that broke off, held until it is mended.
+#[derive(Debug)]
 struct Broken {
     part: Part,
     file: File,
@@ -172,6 +174,7 @@ impl Count {
 }
 
 /// The files of a recording; `T` is what a file's channels are kept in.
+#[derive(Debug)]
 pub struct Series<T> {
     path: PathBuf,
     force: bool,
@@ -191,15 +194,6 @@ pub struct Series<T> {
     lost: Count,
     /// What people should know.
     said: Vec<Said>,
-}
-
-impl<T> core::fmt::Debug for Series<T> {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.debug_struct("Series")
-            .field("path", &self.path)
-            .field("number", &self.number)
-            .finish_non_exhaustive()
-    }
 }
 
 impl<T> Series<T> {

@@ -37,7 +37,7 @@ impl McapReader {
     /// Goes on behind `head`, which has been read already.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
-        let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::new());
+        let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::default());
         let mut reader = Self { source, chunk, place: Place::Magic, state, first: None };
         // What stands before the first message is known from the beginning.
         reader.first = reader.advance().transpose();

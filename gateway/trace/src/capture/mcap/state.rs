@@ -157,17 +157,13 @@ impl State {
                 let wanted = self.is_wanted(channel, data)?;
                 return Ok(wanted.then_some(Wanted { channel, log_time, in_chunk }));
             }
-            Raw::Attachment { name, data, .. } => {
-                if !self.knows_files {
-                    self.attachment(name, data);
-                }
-            }
-            Raw::Metadata { name, facts } => {
-                if !self.knows_files {
-                    self.metadata(name, &facts);
-                }
-            }
-            Raw::Header { .. } | Raw::DataEnd { .. } | Raw::Other => {}
+            Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
+            Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
+            Raw::Header { .. }
+            | Raw::Attachment { .. }
+            | Raw::Metadata { .. }
+            | Raw::DataEnd { .. }
+            | Raw::Other => {}
         }
         Ok(None)
     }
