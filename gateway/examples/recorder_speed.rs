@@ -30,7 +30,6 @@ use protocol::skin::Skin;
 use trace::recording::file::FileWriter;
 use trace::recording::layout::Layout;
 use trace::recording::series::{Head, Split};
-use trace::ros2::messages::CanFrame;
 
 const SKIN: &str = include_str!("ur5-253.toml");
 /// How long frames are pushed.
@@ -161,7 +160,7 @@ impl Write for Counter {
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
     let mut writer = FileWriter::new(Counter::default())?;
-    let mut channel = writer.channel::<CanFrame<'_>>("/can/vcan0", &[("time_digits", "9")])?;
+    let mut channel = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")])?;
     let (mut flushes, mut next) = (0_u64, 0);
     let began = Instant::now();
     for &Seen { at_nanos, own, frame } in frames {
@@ -172,7 +171,7 @@ fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
         }
         let direction = Some(if own { Direction::Sent } else { Direction::Received });
         let time = Timestamp { nanos: at_nanos, nine_digits: true };
-        let message = CanFrame(Record { time, interface: "vcan0", frame, direction });
+        let message = Record { time, interface: "vcan0", frame, direction };
         writer.write(&mut channel, at_nanos, &message)?;
     }
     writer.finish()?;

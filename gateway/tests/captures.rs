@@ -1,7 +1,6 @@
 //! Captures of either format come back from the other one as they were, and damaged ones as far as they are sound.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Cursor;
@@ -13,7 +12,6 @@ use trace::capture::convert::{Converted, Output, convert};
 use trace::capture::log::{LONGEST, Style};
 use trace::capture::{CaptureError, Entry, Format, Note, NoteKind, Reader};
 use trace::recording::file::FileWriter;
-use trace::ros2::messages::{CanFrame, CaptureNote};
 
 const CORPUS: &[u8] = include_bytes!("../../protocol/tests/golden/candump_corpus.log");
 const NANOS: u64 = 1_700_000_000_000_000_000;
@@ -276,13 +274,13 @@ fn what_else_a_recording_has_is_named_and_counted() {
     let time = Timestamp { nanos: NANOS, nine_digits: true };
     let frame = Frame::classic(0x123, &[1]).unwrap();
     let record = Record { time, interface: "can0", frame, direction: Some(Direction::Received) };
-    let mut state = file.channel::<CanFrame<'_>>("/state/can0", &[]).unwrap();
-    let mut can = file.channel::<CanFrame<'_>>("/can/can0", &[("time_digits", "9")]).unwrap();
-    let mut notes = file.channel::<CaptureNote<'_>>("/can/notes", &[]).unwrap();
+    let mut state = file.channel::<Record<'_>>("/state/can0", &[]).unwrap();
+    let mut can = file.channel::<Record<'_>>("/can/can0", &[("time_digits", "9")]).unwrap();
+    let mut notes = file.channel::<Note<'_>>("/can/notes", &[]).unwrap();
     let note = Note { kind: NoteKind::Dropped(2), nanos: NANOS, interface: "can0", line: 0, text: b"" };
-    file.write(&mut state, NANOS, &CanFrame(record)).unwrap();
-    file.write(&mut can, NANOS, &CanFrame(record)).unwrap();
-    file.write(&mut notes, NANOS, &CaptureNote(Cow::Borrowed(&note))).unwrap();
+    file.write(&mut state, NANOS, &record).unwrap();
+    file.write(&mut can, NANOS, &record).unwrap();
+    file.write(&mut notes, NANOS, &note).unwrap();
     for time in 0..3 {
         let diagnostics = trace::ros2::standard::Diagnostics { nanos: time, parts: &[] };
         let mut channel =

@@ -15,7 +15,6 @@ use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;
 use tempfile::TempDir;
 use trace::recording::file::FileWriter;
-use trace::ros2::messages::CanFrame;
 
 /// The paper's arm.
 const ARM: &str = include_str!("../examples/ur5-253.toml");
@@ -35,14 +34,14 @@ impl Files {
         fs::write(files.path("skin.toml"), &skin).unwrap();
         let mut mcap = FileWriter::new(fs::File::create(files.path("run.mcap")).unwrap()).unwrap();
         mcap.attach("skin.toml", "application/toml", 7, skin.as_bytes()).unwrap();
-        let mut topic = mcap.channel::<CanFrame<'_>>("/can/vcan0", &[]).unwrap();
+        let mut topic = mcap.channel::<Record<'_>>("/can/vcan0", &[]).unwrap();
         let mut log = String::new();
         for (nanos, message) in run() {
             for frame in message.encode().frames(Format::Fd) {
                 let time = Timestamp { nanos, nine_digits: true };
                 let direction = Some(Direction::Received);
                 let record = Record { time, interface: "vcan0", frame, direction };
-                mcap.write(&mut topic, nanos, &CanFrame(record)).unwrap();
+                mcap.write(&mut topic, nanos, &record).unwrap();
                 write_record(&mut log, &record).unwrap();
                 writeln!(log).unwrap();
             }

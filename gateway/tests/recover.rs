@@ -12,7 +12,6 @@ use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
 use trace::recording::file::FileWriter;
 use trace::recording::recover::{RecoverError, Recovered, recover};
-use trace::ros2::messages::CanFrame;
 use trace::ros2::standard::JointState;
 
 /// Messages of two topics in five chunks, a file and facts.
@@ -20,7 +19,7 @@ fn recording() -> Vec<u8> {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
     writer.metadata("program", &BTreeMap::from([("a".to_owned(), "b".to_owned())])).unwrap();
     writer.attach("skin.toml", "application/toml", 7, b"version = 1\n").unwrap();
-    let mut can = writer.channel::<CanFrame<'_>>("/can/vcan0", &[("time_digits", "9")]).unwrap();
+    let mut can = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")]).unwrap();
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
     writer.flush().unwrap();
     for number in 0..50_u8 {
@@ -28,7 +27,7 @@ fn recording() -> Vec<u8> {
         let frame = Frame::classic(0x123, &[number; 8]).unwrap();
         let time = Timestamp { nanos, nine_digits: true };
         let record = Record { time, interface: "vcan0", frame, direction: None };
-        writer.write(&mut can, nanos, &CanFrame(record)).unwrap();
+        writer.write(&mut can, nanos, &record).unwrap();
         let q = [f64::from(number)];
         let state = JointState { nanos, names: &[], position: &q, velocity: &[], effort: &[] };
         writer.write(&mut joints, nanos, &state).unwrap();

@@ -5,7 +5,6 @@ mod process;
 
 use std::fs;
 
-use model::generate;
 use process::log::{Log, same_torques};
 use process::{PRESSED, Place, Summary, example, skin_of, until};
 use protocol::can::Format;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use protocol::packet::WORDS;
 
-use trace::capture::{CaptureError, Item, Items};
+use trace::capture::{CaptureError, Item, Reader};
 use trace::ros2::Message;
 use trace::ros2::cdr::CdrError;
 use trace::ros2::read;
@@ -36,9 +36,9 @@ pub struct Row {
 /// # Errors
 /// When it cannot be read, is damaged, or has no ticks.
 pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
-    let mut items = Items::open_all(&[path.to_path_buf()])?;
+    let mut items = Reader::open_with_others(&[path.to_path_buf()])?;
     let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
-    while let Some(item) = items.next()? {
+    while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {
             // What is not as it should be was written by somebody else: it is no tick of ours.
             let _ = take(&mut rows, other.topic, other.schema, other.nanos, other.message);

@@ -4,6 +4,7 @@ use std::fmt::Display;
 
 use analysis::paper;
 use bench::summary::{BusSummary, Halted, Outcome, Processor, Summary};
+use model::table::Errors;
 
 use crate::print::{Rows, count, list, quantiles, words};
 

@@ -16,7 +16,6 @@ use trace::capture::Reader;
 use trace::capture::convert::{Output, convert};
 use trace::capture::log::Style;
 use trace::ros2::cdr::Writer as Cdr;
-use trace::ros2::messages::{CanFrame, CaptureNote};
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
 use trace::ros2::{Header, Message};
@@ -92,7 +91,7 @@ impl File {
         for frame in packet.encode().frames(Format::Fd) {
             let time = Timestamp { nanos, nine_digits: true };
             let record = Record { time, interface: "vcan0", frame, direction: None };
-            self.message(topic, nanos, &CanFrame(record));
+            self.message(topic, nanos, &record);
         }
     }
 }
@@ -157,7 +156,7 @@ fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
         line: 0,
         text: b"DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket (total drops 12)",
     };
-    file.message("/can/notes", BEGAN + 5, &CaptureNote(std::borrow::Cow::Borrowed(&note)));
+    file.message("/can/notes", BEGAN + 5, &note);
     if files_last {
         files(&mut file);
     }
@@ -204,7 +203,7 @@ pub(crate) fn bombs(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
     let message =
         |channel: u16, data: &[u8]| record(5, &[&channel.to_le_bytes()[..], &[0; 20], data].concat());
     let zeros = |bytes: usize| vec![0; bytes];
-    let can = CanFrame::TYPE.as_bytes();
+    let can = Record::TYPE.as_bytes();
     let names = (1..=30).map(|id| chunk("zstd", &schema(id, &vec![b'n'; 100 * MIB]))).collect::<Vec<_>>();
     let short_names = (1..=30).map(|id| chunk("zstd", &schema(id, &vec![b'n'; 3 * MIB]))).collect::<Vec<_>>();
     let channels = (0..=u16::MAX).map(|id| channel(id, id.to_string().as_bytes(), b""));

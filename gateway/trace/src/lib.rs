@@ -12,6 +12,7 @@
 pub mod capture;
 pub mod container;
 pub mod files;
+mod note;
 pub mod order;
 pub mod recording;
 pub mod ros2;

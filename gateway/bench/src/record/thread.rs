@@ -23,7 +23,7 @@ use trace::capture::{Note, NoteKind};
 use trace::files::sync;
 use trace::recording::account::{Recording, Written};
 use trace::recording::layout::Layout;
-use trace::recording::series::{Head, Said, Series, What, Writer};
+use trace::recording::series::{Count, Head, Said, Series, Writer};
 use trace::ros2::skin::Felt;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
@@ -175,7 +175,7 @@ impl Work {
                     seen.in_force.take(frame);
                     seen.missing += u64::from(self.files.is_between());
                     self.files.text(|text| text.frame(name, &frame));
-                    self.files.put(What::Frame, |writer, topics| topics.frame(writer, bus, name, &frame));
+                    self.files.put(Count::FRAME, |writer, topics| topics.frame(writer, bus, name, &frame));
                 }
                 Captured::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
@@ -201,7 +201,7 @@ impl Work {
             self.greatest_late_ns = self.greatest_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
-            self.files.put(What::Others(4), |writer, topics| topics.tick(writer, layout, nanos, &timed));
+            self.files.put(Count::others(4), |writer, topics| topics.tick(writer, layout, nanos, &timed));
         }
     }
 
@@ -217,7 +217,7 @@ impl Work {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                self.files.put(What::Others(messages), |writer, topics| {
+                self.files.put(Count::others(messages), |writer, topics| {
                     topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -264,7 +264,7 @@ impl Work {
             ],
         });
         let now = wall();
-        series.put(What::Others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
+        series.put(Count::others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
     }
 
     fn flush(&mut self) {
@@ -279,8 +279,9 @@ impl Work {
         // So that this file can be understood without the one before.
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.in_force.frames() {
-                series
-                    .put(What::Others(1), |writer, topics| topics.in_force(writer, now, (bus, name), &frame));
+                series.put(Count::others(1), |writer, topics| {
+                    topics.in_force(writer, now, (bus, name), &frame)
+                });
             }
         }
         for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
@@ -369,9 +370,9 @@ impl Files {
     }
 
     /// Writes to the recording, if there is one.
-    fn put(&mut self, what: What, write: impl FnOnce(&mut Writer, &mut Topics) -> io::Result<()>) {
+    fn put(&mut self, count: Count, write: impl FnOnce(&mut Writer, &mut Topics) -> io::Result<()>) {
         if let Some(series) = &mut self.series {
-            series.put(what, write);
+            series.put(count, write);
         }
     }
 
@@ -386,7 +387,7 @@ impl Files {
     fn note(&mut self, nanos: u64, interface: &str, frames: u64, line: &str) {
         let kind = NoteKind::Dropped(frames);
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-        self.put(What::Others(1), |writer, topics| topics.note(writer, &note));
+        self.put(Count::others(1), |writer, topics| topics.note(writer, &note));
     }
 }
 

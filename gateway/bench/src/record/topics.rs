@@ -1,6 +1,5 @@
 //! What stands on each topic of a recording.
 
-use std::borrow::Cow;
 use std::io;
 
 use protocol::candump::{Direction, Record, Timestamp};
@@ -17,7 +16,6 @@ use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
 use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
-use trace::ros2::messages::{CanFrame, CaptureNote};
 use trace::ros2::skin::{Felt, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
@@ -48,7 +46,7 @@ impl Topics {
         let digits = [("time_digits", "9")];
         let mut of_buses = |before: &str| -> io::Result<Vec<Channel>> {
             let topics = layout.buses.iter().map(|bus| format!("{before}{bus}"));
-            topics.map(|topic| writer.channel::<CanFrame<'_>>(&topic, &digits)).collect()
+            topics.map(|topic| writer.channel::<Record<'_>>(&topic, &digits)).collect()
         };
         let (can, state) = (of_buses(TOPIC_OF_BUS)?, of_buses(TOPIC_OF_STATE)?);
         let patches = layout.patches.iter().map(|Patch { topic, .. }| {
@@ -60,7 +58,7 @@ impl Topics {
         Ok(Self {
             can,
             state,
-            notes: writer.channel::<CaptureNote<'_>>(NOTES, &[])?,
+            notes: writer.channel::<Note<'_>>(NOTES, &[])?,
             joint_states: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_states"), &[])?,
             joint_commands: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_commands"), &[])?,
             torques: writer.channel::<Torques<'_>>(&format!("/{arm}/torques"), &[])?,
@@ -100,7 +98,7 @@ impl Topics {
     /// # Errors
     /// See above.
     pub fn note(&mut self, writer: &mut Writer, note: &Note<'_>) -> io::Result<()> {
-        writer.write(&mut self.notes, note.nanos, &CaptureNote(Cow::Borrowed(note)))
+        writer.write(&mut self.notes, note.nanos, note)
     }
 
     /// A tick of the loop that should have begun at a time.
@@ -187,10 +185,10 @@ impl Topics {
     }
 }
 
-fn message<'a>(interface: &'a str, seen: &Seen) -> CanFrame<'a> {
+fn message<'a>(interface: &'a str, seen: &Seen) -> Record<'a> {
     let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
     let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
-    CanFrame(Record { time, interface, frame: seen.frame, direction })
+    Record { time, interface, frame: seen.frame, direction }
 }
 
 const fn number(status: Status) -> u8 {

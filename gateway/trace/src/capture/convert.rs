@@ -121,36 +121,18 @@ pub fn convert<W: Write>(
                 return Err(error.into());
             }
         };
-        let mut is_frame = false;
         match &entry {
-            Entry::Frame(record) => {
-                is_frame = true;
-                done.frames += 1;
-                let nanos = record.time.nanos;
-                if nanos < newest {
-                    let (times, _) = done.backwards.get_or_insert((0, done.frames));
-                    *times += 1;
-                }
-                newest = nanos;
-            }
+            Entry::Frame(record) => done.frame(record.time.nanos, &mut newest),
             Entry::Note(note) => {
-                done.notes += 1;
-                match &note.kind {
-                    NoteKind::Text => {}
-                    NoteKind::Dropped(frames) => done.dropped = done.dropped.saturating_add(*frames),
-                    NoteKind::CanXl => done.can_xl += 1,
-                    NoteKind::Unreadable(why) => {
-                        done.unreadable += 1;
-                        unreadable(note, why).map_err(ConvertError::Strict)?;
-                    }
+                done.note(&note.kind);
+                if let NoteKind::Unreadable(why) = &note.kind {
+                    unreadable(note, why).map_err(ConvertError::Strict)?;
                 }
             }
         }
-        let wrote = to.write(&entry).map_err(ConvertError::Write)?;
-        match wrote {
+        match to.write(&entry).map_err(ConvertError::Write)? {
             Wrote::All => {}
             Wrote::Less => done.shortened += 1,
-            Wrote::Nothing if is_frame => done.frames -= 1,
             Wrote::Nothing => {
                 done.notes -= 1;
                 done.left_out += 1;
@@ -159,6 +141,26 @@ pub fn convert<W: Write>(
         if from.is_drained() {
             // Somebody may be reading along.
             to.pass_on().map_err(ConvertError::Write)?;
+        }
+    }
+}
+
+impl Converted {
+    fn frame(&mut self, nanos: u64, newest: &mut u64) {
+        self.frames += 1;
+        if nanos < *newest {
+            self.backwards.get_or_insert((0, self.frames)).0 += 1;
+        }
+        *newest = nanos;
+    }
+
+    fn note(&mut self, kind: &NoteKind) {
+        self.notes += 1;
+        match kind {
+            NoteKind::Text => {}
+            NoteKind::Dropped(frames) => self.dropped = self.dropped.saturating_add(*frames),
+            NoteKind::CanXl => self.can_xl += 1,
+            NoteKind::Unreadable(_) => self.unreadable += 1,
         }
     }
 }

@@ -2,42 +2,39 @@
 
 use std::io::{self, Read};
 
-use super::log::read_some;
-
-/// What a file that is not text is, and what to do with it; `None` for an MCAP recording.
-type Other = Option<(&'static str, &'static str)>;
+use crate::container::read_some;
 
 const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with python-can's can_logconvert";
 
 /// Files that are told by their first bytes. Anything else is text.
-const MAGIC: &[(&[u8], Other)] = &[
-    (b"\x89MCAP", None),
-    (b"PK\x03\x04", Some(("a zip archive", UNPACK))),
-    (b"PK\x05\x06", Some(("an empty zip archive", UNPACK))),
-    (b"\x1F\x8B", Some(("a gzip file", UNPACK))),
-    (b"\x28\xB5\x2F\xFD", Some(("a zstd file", UNPACK))),
-    (b"\xFD7zXZ", Some(("an xz file", UNPACK))),
-    (b"BZh", Some(("a bzip2 file", UNPACK))),
-    (b"\x04\x22\x4D\x18", Some(("an lz4 file", UNPACK))),
-    (b"\xD4\xC3\xB2\xA1", Some(PCAP)),
-    (b"\xA1\xB2\xC3\xD4", Some(PCAP)),
-    (b"\x4D\x3C\xB2\xA1", Some(PCAP)),
-    (b"\xA1\xB2\x3C\x4D", Some(PCAP)),
-    (b"\x0A\x0D\x0D\x0A", Some(PCAP)),
-    (b"LOGG", Some(("a BLF file", EXPORT))),
-    (b"MDF  ", Some(("an MDF file", EXPORT))),
-    (b"#ROSBAG V", Some(("a ROS 1 bag", "make an MCAP of it"))),
+const MAGIC: &[(&[u8], Kind)] = &[
+    (b"\x89MCAP", Kind::Mcap),
+    (b"PK\x03\x04", Kind::Other("a zip archive", UNPACK)),
+    (b"PK\x05\x06", Kind::Other("an empty zip archive", UNPACK)),
+    (b"\x1F\x8B", Kind::Other("a gzip file", UNPACK)),
+    (b"\x28\xB5\x2F\xFD", Kind::Other("a zstd file", UNPACK)),
+    (b"\xFD7zXZ", Kind::Other("an xz file", UNPACK)),
+    (b"BZh", Kind::Other("a bzip2 file", UNPACK)),
+    (b"\x04\x22\x4D\x18", Kind::Other("an lz4 file", UNPACK)),
+    (b"\xD4\xC3\xB2\xA1", PCAP),
+    (b"\xA1\xB2\xC3\xD4", PCAP),
+    (b"\x4D\x3C\xB2\xA1", PCAP),
+    (b"\xA1\xB2\x3C\x4D", PCAP),
+    (b"\x0A\x0D\x0D\x0A", PCAP),
+    (b"LOGG", Kind::Other("a BLF file", EXPORT)),
+    (b"MDF  ", Kind::Other("an MDF file", EXPORT)),
+    (b"#ROSBAG V", Kind::Other("a ROS 1 bag", "make an MCAP of it")),
     (
         b"SQLite format 3",
-        Some(("an SQLite database", "if it is a ROS 2 bag, make an MCAP of it with `ros2 bag convert`")),
+        Kind::Other("an SQLite database", "if it is a ROS 2 bag, make an MCAP of it with `ros2 bag convert`"),
     ),
-    (b"\xFF\xFE", Some(UTF_16)),
-    (b"\xFE\xFF", Some(UTF_16)),
+    (b"\xFF\xFE", UTF_16),
+    (b"\xFE\xFF", UTF_16),
 ];
 
-const PCAP: (&str, &str) = ("a packet capture", "take the capture as a candump log (candump -l)");
-const UTF_16: (&str, &str) = ("text in UTF-16", "save it as UTF-8");
+const PCAP: Kind = Kind::Other("a packet capture", "take the capture as a candump log (candump -l)");
+const UTF_16: Kind = Kind::Other("text in UTF-16", "save it as UTF-8");
 
 /// What is read as a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -55,8 +52,8 @@ pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
     let longest = MAGIC.iter().map(|(magic, _)| magic.len()).max().unwrap_or(0);
     let mut room = vec![0; longest];
     loop {
-        if let Some((_, other)) = MAGIC.iter().find(|(magic, _)| head.starts_with(magic)) {
-            return Ok((other.map_or(Kind::Mcap, |(what, remedy)| Kind::Other(what, remedy)), head));
+        if let Some((_, kind)) = MAGIC.iter().find(|(magic, _)| head.starts_with(magic)) {
+            return Ok((*kind, head));
         }
         let open = MAGIC.iter().any(|(magic, _)| magic.starts_with(&head));
         let free = room.get_mut(head.len()..).unwrap_or_default();
@@ -85,8 +82,9 @@ mod tests {
         for text in [&b""[..], b"P", b"PK\x03", b"\n", b"#", b"#ROS", b"BZ"] {
             assert_eq!(kind(text), (Kind::Text, text.to_vec()));
         }
-        for (magic, other) in MAGIC {
-            assert_eq!(kind(magic).0 == Kind::Mcap, other.is_none());
+        for (magic, expected) in MAGIC {
+            assert_eq!(kind(magic).0, *expected);
+            assert_eq!(kind(magic).0 == Kind::Mcap, *magic == b"\x89MCAP");
             assert_ne!(kind(magic).0, Kind::Text, "{magic:?}");
         }
     }

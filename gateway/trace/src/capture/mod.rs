@@ -10,16 +10,27 @@
 //! one as it was. Entries stand in the order of the file, which is not always that of their times.
 
 pub mod convert;
+mod extras;
 pub mod log;
 mod magic;
 mod mcap;
 mod parts;
 mod reader;
 
+pub use extras::{Extras, InForce, SKIN, Topic};
 pub use mcap::ORIGIN;
-pub use reader::{CaptureError, Extras, Format, InForce, Items, Reader, SKIN, Through, Topic};
+pub use parts::{Part, PartsError};
+pub use reader::{CaptureError, Format, Reader};
+
+pub use crate::note::{Note, NoteKind};
+
+use std::fs::File;
+use std::io::Read;
 
 use protocol::candump::Record;
+
+/// What a file is read through.
+pub type Through = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
 
 /// One entry of a capture.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,32 +61,4 @@ pub struct Other<'a> {
     pub nanos: u64,
     /// The message as the recording has it.
     pub message: &'a [u8],
-}
-
-/// What stands between frames.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Note<'a> {
-    /// What it is.
-    pub kind: NoteKind,
-    /// When, in ns since 1970; in a log, the time of the frame before it, 0 before the first one.
-    pub nanos: u64,
-    /// The bus, when it is about one; else empty.
-    pub interface: &'a str,
-    /// Its line in a log, from 1; 0 when it comes from none.
-    pub line: u64,
-    /// The line as it stands in the log, without its end; or words of whoever recorded it.
-    pub text: &'a [u8],
-}
-
-/// What a note is.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub enum NoteKind {
-    /// A comment, an empty line, anything that can-utils skip too.
-    Text,
-    /// So many frames are missing here: whoever took the capture lost them.
-    Dropped(u64),
-    /// A CAN XL frame, which is not read.
-    CanXl,
-    /// A line that begins like a frame and is none, and why.
-    Unreadable(String),
 }

@@ -9,12 +9,65 @@
 
 use std::path::{Path, PathBuf};
 
+use thiserror::Error;
+
 use super::Extras;
-use super::reader::{CaptureError, Reader};
+
+/// Why several files are not the parts of one recording.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum PartsError {
+    /// Not even one.
+    #[error("no file is named: name a capture")]
+    None,
+    /// One is no part of anything.
+    #[error(
+        "{} is no part of a recording: several files are read as one only if they are parts of one, as `gateway run \
+         --record` splits it; name this one alone",
+        .0.display()
+    )]
+    NoPart(PathBuf),
+    /// One has no name.
+    #[error("- is standard input, which cannot be one of several files: name files alone")]
+    StandardInput,
+    /// Two belong to different recordings.
+    #[error(
+        "{} and {} are of different recordings, begun at {} and {} ns: name the parts of one",
+        .one.path.display(), .other.path.display(), .one.began, .other.began
+    )]
+    Different {
+        /// One of them.
+        one: Part,
+        /// The other one.
+        other: Part,
+    },
+    /// Two are the same part.
+    #[error(
+        "{} and {} are both part {} of the recording: name one of them",
+        .one.path.display(), .other.path.display(), .one.number
+    )]
+    Twice {
+        /// One of them.
+        one: Part,
+        /// The other one.
+        other: Part,
+    },
+    /// One is missing between two others.
+    #[error(
+        "part {} of the recording is missing between {} and {}: name all parts from the first to the last, or one alone",
+        .one.number + 1, .one.path.display(), .next.path.display()
+    )]
+    Missing {
+        /// The one before.
+        one: Part,
+        /// The next one that is there.
+        next: Part,
+    },
+}
 
 /// Which part of which recording a file is.
 #[derive(Clone, Debug)]
-struct Part {
+pub struct Part {
     path: PathBuf,
     /// When the recording began, in ns since 1970.
     began: String,
@@ -22,66 +75,32 @@ struct Part {
 }
 
 impl Part {
-    fn of(path: &Path) -> Result<Self, CaptureError> {
-        let no_part = || {
-            CaptureError::Parts(format!(
-                "{} is no part of a recording: several files are read as one only if they are parts of one, as `gateway \
-                 run --record` splits it; name this one alone",
-                path.display()
-            ))
-        };
-        if path.as_os_str() == "-" {
-            return Err(CaptureError::Parts(
-                "- is standard input, which cannot be one of several files: name files alone".to_owned(),
-            ));
-        }
-        let reader = Reader::open(path)?;
-        let facts = (fact(reader.extras(), "program", "began_ns"), fact(reader.extras(), "part", "number"));
-        let (Some(began), Some(number)) = facts else { return Err(no_part()) };
-        let number = number.parse().map_err(|_| no_part())?;
-        Ok(Self { path: path.to_owned(), began: began.to_owned(), number })
+    /// By what the file has beside its frames.
+    pub(super) fn of(path: &Path, extras: &Extras) -> Result<Self, PartsError> {
+        let facts = extras.fact("program", "began_ns").zip(extras.fact("part", "number"));
+        let part = facts.and_then(|(began, number)| {
+            Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
+        });
+        part.ok_or_else(|| PartsError::NoPart(path.to_owned()))
     }
 }
 
-fn fact<'a>(extras: &'a Extras, record: &str, key: &str) -> Option<&'a str> {
-    let (_, facts) = extras.metadata.iter().find(|(name, _)| name == record)?;
-    facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
-}
-
-/// The parts in their order. One file is taken as it is.
+/// The files of parts, in their order.
 ///
 /// # Errors
 /// When they are not all parts of one recording, one is missing between two others, or is there twice.
-pub(super) fn ordered(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
-    if paths.len() < 2 {
-        return Ok(paths.to_vec());
-    }
-    let mut parts = paths.iter().map(|path| Part::of(path)).collect::<Result<Vec<_>, _>>()?;
+pub(super) fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
     parts.sort_by_key(|part| part.number);
     for pair in parts.windows(2) {
         let [one, next] = pair else { continue };
-        let (a, b) = (one.path.display(), next.path.display());
+        let (one, next) = (one.clone(), next.clone());
         if one.began != next.began {
-            return Err(CaptureError::Parts(format!(
-                "{a} and {b} are of different recordings, begun at {} and {} ns: name the parts of one",
-                one.began, next.began
-            )));
+            return Err(PartsError::Different { one, other: next });
         }
         match next.number - one.number {
-            0 => {
-                return Err(CaptureError::Parts(format!(
-                    "{a} and {b} are both part {} of the recording: name one of them",
-                    one.number
-                )));
-            }
+            0 => return Err(PartsError::Twice { one, other: next }),
             1 => {}
-            _ => {
-                return Err(CaptureError::Parts(format!(
-                    "part {} of the recording is missing between {a} and {b}: name all parts from the first to the \
-                     last, or one alone",
-                    one.number + 1
-                )));
-            }
+            _ => return Err(PartsError::Missing { one, next }),
         }
     }
     Ok(parts.into_iter().map(|part| part.path).collect())

@@ -21,6 +21,7 @@ const HEAD: usize = 9;
 
 /// The chunk that was unpacked last. Nothing of it is handed out before all of it was checked: its length, its
 /// checksum, and that its records end where it does.
+#[derive(Default)]
 pub struct Chunk {
     bytes: Vec<u8>,
     /// Where its next record begins.
@@ -42,19 +43,7 @@ impl fmt::Debug for Chunk {
     }
 }
 
-impl Default for Chunk {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl Chunk {
-    /// None yet.
-    #[must_use]
-    pub const fn new() -> Self {
-        Self { bytes: Vec::new(), at: 0, body: 0, total_bytes: 0, total_records: 0, zstd: None }
-    }
-
     /// Unpacks a chunk record; `read` is how many bytes of its file were read so far.
     ///
     /// # Errors
@@ -210,7 +199,7 @@ mod tests {
     }
 
     fn unpacked(record: &[u8]) -> Result<Vec<(u8, Vec<u8>)>, Damage> {
-        let mut chunk = Chunk::new();
+        let mut chunk = Chunk::default();
         chunk.unpack(record, 1_000)?;
         Ok(std::iter::from_fn(|| chunk.next().map(|(code, body)| (code, body.to_vec()))).collect())
     }
@@ -258,7 +247,7 @@ mod tests {
         let zeros = vec![0; 100 << 20];
         let packed = zstd::bulk::compress(&record(zeros.len() as u64, &zeros), 1).unwrap();
         let record = chunk(zeros.len() as u64 + 9, 0, "zstd", &packed);
-        let mut chunk = Chunk::new();
+        let mut chunk = Chunk::default();
         assert_eq!((chunk.unpack(&record, 0), chunk.unpack(&record, 0)), (Ok(()), Ok(())));
         let bomb = Damage::Bomb { read: 0, limit: FREE_BYTES, what: "bytes" };
         assert_eq!(chunk.unpack(&record, 0), Err(bomb));

@@ -192,59 +192,58 @@ impl<'a> Fields<'a> {
 /// # Errors
 /// When it is shorter than it says, longer than a description may be, or a name in it is not UTF-8.
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
-    let record = match opcode {
-        op::HEADER => "header",
-        op::SCHEMA => "schema",
-        op::CHANNEL => "channel",
-        op::MESSAGE => "message",
-        op::ATTACHMENT => "attachment",
-        op::METADATA => "metadata",
-        op::DATA_END => "data end",
-        _ => return Ok(Record::Other),
+    let description = |record| match body.len() as u64 {
+        bytes if body.len() > LONGEST_DESCRIPTION => {
+            Err(Damage::Long { what: record, bytes, limit: LONGEST_DESCRIPTION as u64 })
+        }
+        _ => Ok(Fields::new(record, body)),
     };
-    let describes = matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::METADATA);
-    if describes && body.len() > LONGEST_DESCRIPTION {
-        let (bytes, limit) = (body.len() as u64, LONGEST_DESCRIPTION as u64);
-        return Err(Damage::Long { what: record, bytes, limit });
-    }
-    let mut from = Fields::new(record, body);
     Ok(match opcode {
-        op::HEADER => Record::Header { profile: from.text("profile")?, library: from.text("library")? },
+        op::HEADER => {
+            let mut from = description("header")?;
+            Record::Header { profile: from.text("profile")?, library: from.text("library")? }
+        }
         op::SCHEMA => {
+            let mut from = description("schema")?;
             let (id, name, encoding) = (from.u16("id")?, from.text("name")?, from.text("encoding")?);
             let bytes = from.u32("definition")?;
             Record::Schema { id, name, encoding, data: from.bytes(bytes.into(), "definition")? }
         }
-        op::CHANNEL => Record::Channel {
-            id: from.u16("id")?,
-            schema: from.u16("schema id")?,
-            topic: from.text("topic")?,
-            encoding: from.text("message encoding")?,
-            facts: from.facts("metadata")?,
-        },
-        op::MESSAGE => Record::Message {
-            channel: from.u16("channel id")?,
-            sequence: from.u32("sequence")?,
-            log_time: from.u64("log time")?,
-            publish_time: from.u64("publish time")?,
-            data: from.rest,
-        },
-        op::ATTACHMENT => {
-            let (log_time, create_time) = (from.u64("log time")?, from.u64("create time")?);
-            let (name, media_type) = (from.text("name")?, from.text("media type")?);
-            let bytes = from.u64("data")?;
-            let data = from.bytes(bytes, "data")?;
-            let checked = body.get(..body.len() - from.rest.len()).unwrap_or_default();
-            let saved = from.u32("checksum")?;
-            let found = if saved == 0 { 0 } else { crc32fast::hash(checked) };
-            if saved != found {
-                return Err(Damage::Checksum { what: "an attachment", saved, found });
-            }
-            Record::Attachment { log_time, create_time, name, media_type, data }
+        op::CHANNEL => {
+            let mut from = description("channel")?;
+            let (id, schema) = (from.u16("id")?, from.u16("schema id")?);
+            let (topic, encoding) = (from.text("topic")?, from.text("message encoding")?);
+            Record::Channel { id, schema, topic, encoding, facts: from.facts("metadata")? }
         }
-        op::METADATA => Record::Metadata { name: from.text("name")?, facts: from.facts("facts")? },
-        _ => Record::DataEnd { crc: from.u32("checksum")? },
+        op::MESSAGE => {
+            let mut from = Fields::new("message", body);
+            let (channel, sequence) = (from.u16("channel id")?, from.u32("sequence")?);
+            let (log_time, publish_time) = (from.u64("log time")?, from.u64("publish time")?);
+            Record::Message { channel, sequence, log_time, publish_time, data: from.rest }
+        }
+        op::ATTACHMENT => attachment(body)?,
+        op::METADATA => {
+            let mut from = description("metadata")?;
+            Record::Metadata { name: from.text("name")?, facts: from.facts("facts")? }
+        }
+        op::DATA_END => Record::DataEnd { crc: Fields::new("data end", body).u32("checksum")? },
+        _ => Record::Other,
     })
+}
+
+fn attachment(body: &[u8]) -> Result<Record<'_>, Damage> {
+    let mut from = Fields::new("attachment", body);
+    let (log_time, create_time) = (from.u64("log time")?, from.u64("create time")?);
+    let (name, media_type) = (from.text("name")?, from.text("media type")?);
+    let bytes = from.u64("data")?;
+    let data = from.bytes(bytes, "data")?;
+    let checked = body.get(..body.len() - from.rest.len()).unwrap_or_default();
+    let saved = from.u32("checksum")?;
+    let found = if saved == 0 { 0 } else { crc32fast::hash(checked) };
+    if saved != found {
+        return Err(Damage::Checksum { what: "an attachment", saved, found });
+    }
+    Ok(Record::Attachment { log_time, create_time, name, media_type, data })
 }
 
 /// The name of an attachment of which only the beginning is there; empty when not even that is.

@@ -14,9 +14,12 @@ mod source;
 
 pub use chunk::Chunk;
 pub use field::{Facts, Names, Record, parse};
+pub(crate) use source::read_some;
 pub use source::{Framed, Source, find};
 
 use thiserror::Error;
+
+use crate::ros2::MessageError;
 
 /// The first and the last bytes of a file.
 pub const MAGIC: &[u8] = mcap::MAGIC;
@@ -95,6 +98,20 @@ pub enum Damage {
     Names {
         /// The limit.
         limit: usize,
+    },
+    /// It is no file of this kind, or another one is behind it.
+    #[error("it does not begin and end with the magic bytes of an MCAP file")]
+    Magic,
+    /// A message of nothing.
+    #[error("a message belongs to channel {0}, which it has not")]
+    Channel(u16),
+    /// A message that says something else than its channel.
+    #[error("a message of {topic}: {source}")]
+    Message {
+        /// Its topic.
+        topic: String,
+        /// Why.
+        source: MessageError,
     },
     /// Far more comes out than went in.
     #[error("{read} bytes unpack to more than {limit} {what}")]

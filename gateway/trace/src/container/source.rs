@@ -6,7 +6,6 @@ use mcap::records::op;
 
 use super::field::attachment_name;
 use super::{LONGEST, MAGIC};
-use crate::capture::log::read_some;
 
 /// Bytes that are kept of a record that is longer than anything that is taken into memory.
 const BEGINNING: u64 = 64 << 10;
@@ -160,6 +159,16 @@ impl<R: Read> Source<R> {
             left -= came.len() as u64;
         }
         Ok(true)
+    }
+}
+
+/// Reads what there is, whatever signals come.
+pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
+    loop {
+        match input.read(room) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            done => return done,
+        }
     }
 }
 

@@ -71,19 +71,13 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
     if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
         return Ok(false);
     }
-    let ours = match parse(op::HEADER, from.body()) {
-        Ok(Record::Header { library, .. }) => library.starts_with(PROGRAM),
-        _ => false,
-    };
-    if !ours || from.next()? != Framed::Record(op::METADATA) {
+    let header = parse(op::HEADER, from.body());
+    let is_ours = matches!(header, Ok(Record::Header { library, .. }) if library.starts_with(PROGRAM));
+    if !is_ours || from.next()? != Framed::Record(op::METADATA) {
         return Ok(false);
     }
-    Ok(match parse(op::METADATA, from.body()) {
-        Ok(Record::Metadata { name, facts }) => {
-            name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value))
-        }
-        _ => false,
-    })
+    let Ok(Record::Metadata { name, facts }) = parse(op::METADATA, from.body()) else { return Ok(false) };
+    Ok(name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value)))
 }
 
 /// What was written cannot go on.
@@ -103,7 +97,6 @@ pub struct Channel {
 pub struct FileWriter<W: Write> {
     writer: Writer<NoSeek<W>>,
     buffer: Vec<u8>,
-    messages: u64,
     /// Bytes of messages, uncompressed.
     raw: u64,
     flushes: u64,
@@ -111,7 +104,7 @@ pub struct FileWriter<W: Write> {
 
 impl<W: Write> core::fmt::Debug for FileWriter<W> {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.debug_struct("FileWriter").field("messages", &self.messages).finish_non_exhaustive()
+        f.debug_struct("FileWriter").field("raw", &self.raw).finish_non_exhaustive()
     }
 }
 
@@ -122,7 +115,7 @@ impl<W: Write> FileWriter<W> {
     /// When it cannot be written, as of everything below.
     pub fn new(out: W) -> io::Result<Self> {
         let writer = options().create(NoSeek::new(out)).map_err(io_error)?;
-        Ok(Self { writer, buffer: Vec::new(), messages: 0, raw: 0, flushes: 0 })
+        Ok(Self { writer, buffer: Vec::new(), raw: 0, flushes: 0 })
     }
 
     /// Begins the file of a run's recording, with its mark.
@@ -187,15 +180,8 @@ impl<W: Write> FileWriter<W> {
         };
         self.writer.write_to_known_channel(&header, &self.buffer).map_err(io_error)?;
         channel.sequence = channel.sequence.wrapping_add(1);
-        self.messages += 1;
         self.raw += HEAD + self.buffer.len() as u64;
         Ok(())
-    }
-
-    /// Messages so far.
-    #[must_use]
-    pub const fn messages(&self) -> u64 {
-        self.messages
     }
 
     /// At least as many chunks as there are so far.

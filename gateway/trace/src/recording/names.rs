@@ -14,6 +14,8 @@ use std::io::{self, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use thiserror::Error;
+
 use super::file;
 use crate::files::{
     folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_remedy,
@@ -169,20 +171,57 @@ pub fn is_held(file: &File) -> bool {
     hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
-/// A `.part` in a recording's folder.
-#[derive(Debug)]
-pub enum Found {
-    /// Left by a run that was killed, and held against others from now on.
-    Orphan(File),
-    /// Not ours to touch, and why; whether it may be a recording.
-    Left(String, bool),
+/// Why a `.part` in a recording's folder is not ours to touch.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum Left {
+    /// A link to something.
+    #[error("it is a symlink")]
+    Symlink,
+    /// A folder, a pipe, a device.
+    #[error("it is no regular file")]
+    Irregular,
+    /// It cannot be looked at.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// It cannot be read.
+    #[error("it cannot be read: {0}")]
+    Unreadable(#[source] io::Error),
+    /// Somebody else's.
+    #[error("it belongs to user {owner}, and this is user {me}")]
+    Owner {
+        /// Whose it is.
+        owner: u32,
+        /// Who asks.
+        me: u32,
+    },
+    /// It has other names.
+    #[error("it has {0} names (hard links)")]
+    Linked(u64),
+    /// Its writer is there.
+    #[error("another program is writing it")]
+    Held,
+    /// It has no mark, or that of another file.
+    #[error("no run of this program has begun it here")]
+    Unmarked,
 }
+
+impl Left {
+    /// Whether it may be a recording.
+    #[must_use]
+    pub const fn may_be_recording(&self) -> bool {
+        matches!(self, Self::Owner { .. } | Self::Linked(_) | Self::Unmarked)
+    }
+}
+
+/// A file that a run left which was killed, held against others from now on; or why it is not.
+pub type Orphan = Result<File, Left>;
 
 /// What of unfinished recordings is in a recording's folder.
 ///
 /// # Errors
 /// When the folder cannot be read.
-pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Found)>> {
+pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder_of(path))? {
         let path = path.with_file_name(entry?.file_name());
@@ -198,41 +237,33 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Found)>> {
 }
 
 /// Whose a file is.
-fn look(path: &Path) -> Found {
-    let left = |why: &str| Found::Left(why.to_owned(), false);
+fn look(path: &Path) -> Orphan {
     // Of what is no file not even an opening is harmless.
-    match fs::symlink_metadata(path) {
-        Ok(about) if about.is_symlink() => return left("it is a symlink"),
-        Ok(about) if !about.is_file() => return left("it is no regular file"),
-        Ok(_) => {}
-        Err(error) => return left(&error.to_string()),
+    let kind = fs::symlink_metadata(path)?.file_type();
+    if kind.is_symlink() {
+        return Err(Left::Symlink);
     }
-    let mut file = match open_unfollowed(path) {
-        Ok(file) => file,
-        Err(error) => return Found::Left(format!("it cannot be read: {error}"), false),
-    };
-    let about = match file.metadata() {
-        Ok(about) if about.is_file() => about,
-        Ok(_) => return left("it is no regular file"),
-        Err(error) => return left(&error.to_string()),
-    };
-    let me = rustix::process::geteuid().as_raw();
-    if about.uid() != me {
-        return Found::Left(format!("it belongs to user {}, and this is user {me}", about.uid()), true);
+    if !kind.is_file() {
+        return Err(Left::Irregular);
+    }
+    let mut file = open_unfollowed(path).map_err(Left::Unreadable)?;
+    let about = file.metadata()?;
+    let (owner, me) = (about.uid(), rustix::process::geteuid().as_raw());
+    if !about.is_file() {
+        return Err(Left::Irregular);
+    }
+    if owner != me {
+        return Err(Left::Owner { owner, me });
     }
     if about.nlink() != 1 {
-        return Found::Left(format!("it has {} names (hard links)", about.nlink()), true);
+        return Err(Left::Linked(about.nlink()));
     }
-    if let Err(error) = hold(&file) {
-        let locked = error.kind() == io::ErrorKind::WouldBlock;
-        let why = if locked { "another program is writing it".to_owned() } else { error.to_string() };
-        return Found::Left(why, false);
-    }
-    match file::is_marked(&mut file) {
-        Ok(true) => Found::Orphan(file),
-        Ok(false) => Found::Left("no run of this program has begun it here".to_owned(), true),
-        Err(error) => Found::Left(format!("it cannot be read: {error}"), false),
-    }
+    hold(&file).map_err(
+        |error| {
+            if error.kind() == io::ErrorKind::WouldBlock { Left::Held } else { error.into() }
+        },
+    )?;
+    if file::is_marked(&mut file).map_err(Left::Unreadable)? { Ok(file) } else { Err(Left::Unmarked) }
 }
 
 /// Takes an orphan away, if its name is still its own.
@@ -250,9 +281,9 @@ pub fn remove(path: &Path, file: &File) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    fn orphans(path: &Path) -> Vec<(PathBuf, Found)> {
+    fn orphans(path: &Path) -> Vec<(PathBuf, Orphan)> {
         let found = parts(path).unwrap().into_iter();
-        found.filter(|(_, found)| matches!(found, Found::Orphan(_))).collect()
+        found.filter(|(_, found)| found.is_ok()).collect()
     }
 
     #[test]

@@ -16,13 +16,13 @@ use std::io::{self, Read, Write};
 use mcap::records::{MessageHeader, op};
 use mcap::write::{Metadata, NoSeek};
 use mcap::{Attachment, McapError, Writer};
+use protocol::candump::Record as Frame;
 use thiserror::Error;
 
 use super::TOPIC_OF_BUS;
 use super::file::{io_error, options};
-use crate::container::{Chunk, Damage, Framed, MAGIC, Names, Record, Source, parse};
+use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Names, Record, Source, parse};
 use crate::ros2::Message;
-use crate::ros2::messages::CanFrame;
 
 /// The longest attachment that is copied.
 const LONGEST_ATTACHMENT: u64 = 1 << 30;
@@ -62,17 +62,16 @@ impl fmt::Display for Recovered {
             write!(f, ", the last at {}.{:06}", seconds.0, seconds.1)?;
         }
         match self.unfinished {
-            0 => write!(f, "; nothing unfinished at the end"),
-            bytes => write!(f, "; {bytes} bytes of an unfinished chunk are lost"),
-        }?;
-        match self.damaged {
-            (0, _) => Ok(()),
-            (chunks, bytes) => write!(f, "; {chunks} damaged chunks of {bytes} bytes are lost"),
-        }?;
-        match self.homeless {
-            0 => Ok(()),
-            messages => write!(f, "; {messages} messages of topics that were described there are lost"),
+            0 => write!(f, "; nothing unfinished at the end")?,
+            bytes => write!(f, "; {bytes} bytes of an unfinished chunk are lost")?,
         }
+        if let (chunks @ 1.., bytes) = self.damaged {
+            write!(f, "; {chunks} damaged chunks of {bytes} bytes are lost")?;
+        }
+        if self.homeless > 0 {
+            write!(f, "; {} messages of topics that were described there are lost", self.homeless)?;
+        }
+        Ok(())
     }
 }
 
@@ -111,55 +110,51 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
     if !source.magic().map_err(RecoverError::Read)? && !MAGIC.starts_with(source.body()) {
         return Err(RecoverError::NoMcap { got: source.body().to_vec() });
     }
-    let mut chunk = Chunk::new();
-    let mut copy = None;
-    let mut out = Some(out);
-    let mut recovered = Recovered::default();
+    loop {
+        match source.next().map_err(RecoverError::Read)? {
+            Framed::Record(op::HEADER) => break,
+            Framed::End(_) => return Err(RecoverError::Empty(source.read())),
+            Framed::Record(_) | Framed::Long(..) => {}
+        }
+    }
+    let mut copy = Copy::new(source.body(), out).map_err(RecoverError::Write)?;
+    let mut chunk = Chunk::default();
     loop {
         let framed = source.next().map_err(RecoverError::Read)?;
-        if framed == Framed::Record(op::HEADER)
-            && let Some(out) = out.take()
-        {
-            copy = Some(Copy::new(source.body(), out).map_err(RecoverError::Write)?);
-            continue;
-        }
-        let kept = match (framed, &mut copy) {
-            (Framed::End(bytes), _) => {
-                recovered.unfinished = bytes;
+        let (kept, bytes) = match framed {
+            Framed::End(bytes) => {
+                copy.recovered.unfinished = bytes;
                 break;
             }
-            (Framed::Record(op::DATA_END), Some(_)) => {
+            Framed::Record(op::DATA_END) => {
                 // What follows is made anew.
-                recovered.whole = ends_well(&mut source).map_err(RecoverError::Read)?;
+                copy.recovered.whole = ends_well(&mut source).map_err(RecoverError::Read)?;
                 break;
             }
-            (_, None) => continue,
-            (Framed::Record(op::CHUNK), Some(copy)) => chunk
-                .unpack(source.body(), source.read())
-                .map_err(Failed::from)
-                .and_then(|()| copy.chunk(&mut chunk)),
-            (Framed::Record(code), Some(copy)) => copy.record(code, source.body()),
-            (Framed::Long(..), Some(_)) => Err(Failed::Damaged),
+            Framed::Record(code) => {
+                let (body, read) = (source.body(), source.read());
+                let kept = if code == op::CHUNK {
+                    copy.chunk(&mut chunk, body, read)
+                } else {
+                    copy.record(code, body)
+                };
+                (kept, body.len() as u64)
+            }
+            Framed::Long(_, bytes) => {
+                (Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into()), bytes)
+            }
         };
         match kept {
             Ok(()) => {}
-            Err(Failed::Damaged) => {
-                recovered.damaged.0 += 1;
-                recovered.damaged.1 += match framed {
-                    Framed::Long(_, bytes) => bytes,
-                    Framed::Record(_) | Framed::End(_) => source.body().len() as u64,
-                };
+            Err(Failed::Write(error)) => return Err(RecoverError::Write(io_error(error))),
+            Err(Failed::Damage(_)) => {
+                copy.recovered.damaged.0 += 1;
+                copy.recovered.damaged.1 += bytes;
             }
-            Err(Failed::Write(error)) => return Err(RecoverError::Write(error)),
         }
     }
-    let Some(mut copy) = copy else { return Err(RecoverError::Empty(source.read())) };
     copy.writer.finish().map_err(|error| RecoverError::Write(io_error(error)))?;
-    recovered.homeless = copy.homeless;
-    recovered.messages = copy.messages;
-    recovered.frames = copy.frames;
-    recovered.last_nanos = copy.last_nanos;
-    Ok(recovered)
+    Ok(copy.recovered)
 }
 
 /// Whether summary, footer and magic follow. An index that breaks off is no loss: the new file has its own.
@@ -174,15 +169,12 @@ fn ends_well(source: &mut Source<impl Read>) -> io::Result<bool> {
 }
 
 /// Why a record or a chunk is not in the new file.
+#[derive(Debug, Error)]
 enum Failed {
-    Damaged,
-    Write(io::Error),
-}
-
-impl From<Damage> for Failed {
-    fn from(_: Damage) -> Self {
-        Self::Damaged
-    }
+    #[error(transparent)]
+    Damage(#[from] Damage),
+    #[error(transparent)]
+    Write(#[from] McapError),
 }
 
 struct Copy<W: Write> {
@@ -192,10 +184,7 @@ struct Copy<W: Write> {
     /// Channels, and whether their messages are frames.
     channels: BTreeMap<u16, bool>,
     names: Names,
-    homeless: u64,
-    messages: u64,
-    frames: u64,
-    last_nanos: u64,
+    recovered: Recovered,
 }
 
 impl<W: Write> Copy<W> {
@@ -205,20 +194,13 @@ impl<W: Write> Copy<W> {
             _ => "",
         };
         let writer = options().profile(profile).create(NoSeek::new(out)).map_err(io_error)?;
-        Ok(Self {
-            writer,
-            schemas: BTreeMap::new(),
-            channels: BTreeMap::new(),
-            names: Names::default(),
-            homeless: 0,
-            messages: 0,
-            frames: 0,
-            last_nanos: 0,
-        })
+        let (schemas, channels, names) = (BTreeMap::new(), BTreeMap::new(), Names::default());
+        Ok(Self { writer, schemas, channels, names, recovered: Recovered::default() })
     }
 
-    /// A chunk's records, if all of them are right.
-    fn chunk(&mut self, chunk: &mut Chunk) -> Result<(), Failed> {
+    /// A chunk's records, if all of them are right; `read` is how many bytes of the file were read so far.
+    fn chunk(&mut self, chunk: &mut Chunk, packed: &[u8], read: u64) -> Result<(), Failed> {
+        chunk.unpack(packed, read)?;
         while let Some((code, body)) = chunk.next() {
             parse(code, body)?;
         }
@@ -233,27 +215,25 @@ impl<W: Write> Copy<W> {
     }
 
     fn record(&mut self, code: u8, body: &[u8]) -> Result<(), Failed> {
-        let record = parse(code, body)?;
-        match self.keep(&record)? {
-            Err(McapError::Io(error)) => Err(Failed::Write(error)),
-            // Its channel or its schema stood in what is lost.
-            Err(_) => {
-                self.homeless += 1;
+        match self.keep(&parse(code, body)?) {
+            Err(Failed::Write(error)) if !matches!(error, McapError::Io(_)) => {
+                // Its channel or its schema stood in what is lost.
+                self.recovered.homeless += 1;
                 Ok(())
             }
-            Ok(()) => Ok(()),
+            kept => kept,
         }
     }
 
-    fn keep(&mut self, record: &Record<'_>) -> Result<Result<(), McapError>, Damage> {
+    fn keep(&mut self, record: &Record<'_>) -> Result<(), Failed> {
         let writer = &mut self.writer;
-        Ok(match *record {
+        match *record {
             Record::Schema { id, name, encoding, data } => {
                 if !self.schemas.contains_key(&id) {
                     self.names.add(name.len() + encoding.len() + data.len())?;
-                    self.schemas.insert(id, name == CanFrame::TYPE);
+                    self.schemas.insert(id, name == Frame::TYPE);
                 }
-                writer.add_schema_with_id(id, name, encoding, data).map(|_| ())
+                writer.add_schema_with_id(id, name, encoding, data)?;
             }
             Record::Channel { id, schema, topic, encoding, facts } => {
                 if !self.channels.contains_key(&id) {
@@ -262,27 +242,26 @@ impl<W: Write> Copy<W> {
                     let frames = self.schemas.get(&schema).is_some_and(|frames| *frames);
                     self.channels.insert(id, frames && topic.starts_with(TOPIC_OF_BUS));
                 }
-                writer.add_channel_with_id(id, schema, topic, encoding, &facts.into()).map(|_| ())
+                writer.add_channel_with_id(id, schema, topic, encoding, &facts.into())?;
             }
             Record::Message { channel, sequence, log_time, publish_time, data } => {
                 let header = MessageHeader { channel_id: channel, sequence, log_time, publish_time };
-                let written = writer.write_to_known_channel(&header, data);
-                if written.is_ok() {
-                    self.messages += 1;
-                    self.frames += u64::from(self.channels.get(&channel).is_some_and(|frames| *frames));
-                    self.last_nanos = self.last_nanos.max(log_time);
-                }
-                written
+                writer.write_to_known_channel(&header, data)?;
+                let Recovered { messages, frames, last_nanos, .. } = &mut self.recovered;
+                *messages += 1;
+                *frames += u64::from(self.channels.get(&channel).is_some_and(|frames| *frames));
+                *last_nanos = log_time.max(*last_nanos);
             }
             Record::Attachment { log_time, create_time, name, media_type, data } => {
                 let (name, media_type) = (name.to_owned(), media_type.to_owned());
-                writer.attach(&Attachment { log_time, create_time, name, media_type, data: data.into() })
+                writer.attach(&Attachment { log_time, create_time, name, media_type, data: data.into() })?;
             }
             Record::Metadata { name, facts } => {
-                writer.write_metadata(&Metadata { name: name.to_owned(), metadata: facts.into() })
+                writer.write_metadata(&Metadata { name: name.to_owned(), metadata: facts.into() })?;
             }
             // Made anew, or of no file of ours.
-            Record::Header { .. } | Record::DataEnd { .. } | Record::Other => Ok(()),
-        })
+            Record::Header { .. } | Record::DataEnd { .. } | Record::Other => {}
+        }
+        Ok(())
     }
 }

@@ -1,13 +1,13 @@
 //! Files whose writers are gone: found, made whole, said.
 
 use std::fs::{File, Permissions};
-use std::io::{self, BufReader, BufWriter, Seek, Write};
+use std::io::{self, BufReader, BufWriter, Seek};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{Gid, fchown};
 
-use super::names::{self, Found};
+use super::names;
 use super::recover::{RecoverError, Recovered, recover};
 use crate::files::WholeFile;
 
@@ -76,22 +76,20 @@ fn copy(
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     as_private(from, &file).map_err(RecoverError::Write)?;
-    let about = file.try_clone().map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
     // A pipe is where it is.
     let _ = from.rewind();
     let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
-    let wanted = wanted(&recovered);
-    let finish = || -> io::Result<Option<u64>> {
-        if !wanted {
-            return Ok(None);
-        }
-        out.flush()?;
+    if !wanted(&recovered) {
+        return Ok((recovered, None));
+    }
+    let finish = || -> io::Result<u64> {
+        let file = out.into_inner()?;
         whole.finish()?;
-        Ok(Some(about.metadata()?.len()))
+        Ok(file.metadata()?.len())
     };
-    Ok((recovered, finish().map_err(RecoverError::Write)?))
+    Ok((recovered, Some(finish().map_err(RecoverError::Write)?)))
 }
 
 /// Lets nobody read a copy who could not read the original.
@@ -114,16 +112,14 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
     for (part, found) in names::parts(path).unwrap_or_default() {
         let name = part.display();
         let held = match found {
-            Found::Orphan(held) => held,
-            Found::Left(why, maybe) => {
-                let remedy = if maybe {
+            Ok(held) => held,
+            Err(why) => {
+                let remedy = why.may_be_recording().then(|| {
                     format!(
                         "; if it is a recording that broke off, `gateway recover {name} -o NAME` copies it"
                     )
-                } else {
-                    String::new()
-                };
-                say(&format!("{name} is left alone: {why}{remedy}"));
+                });
+                say(&format!("{name} is left alone: {why}{}", remedy.unwrap_or_default()));
                 continue;
             }
         };

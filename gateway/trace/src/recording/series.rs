@@ -117,6 +117,7 @@ impl core::fmt::Display for Said {
 }
 
 /// A file that is being written.
+#[derive(Debug)]
 struct Open<T> {
     writer: Writer,
     topics: T,
@@ -134,6 +135,7 @@ struct Open<T> {
 }
 
 /// A file that broke off, held until it is mended.
+#[derive(Debug)]
 struct Broken {
     part: Part,
     file: File,
@@ -150,22 +152,29 @@ pub struct Count {
 }
 
 impl Count {
+    /// A frame of a bus.
+    pub const FRAME: Self = Self { frames: 1, others: 0 };
+
+    /// So many other messages.
+    #[must_use]
+    pub const fn others(others: u64) -> Self {
+        Self { frames: 0, others }
+    }
+
     fn add(&mut self, other: Self) {
         self.frames += other.frames;
         self.others += other.others;
     }
-}
 
-/// What is written.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum What {
-    /// A frame of a bus.
-    Frame,
-    /// So many other messages.
-    Others(u64),
+    /// What a file came to in which it is.
+    fn in_file(self, path: &Path, bytes: u64) -> Written {
+        let Self { frames, others } = self;
+        Written { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
+    }
 }
 
 /// The files of a recording; `T` is what a file's channels are kept in.
+#[derive(Debug)]
 pub struct Series<T> {
     path: PathBuf,
     force: bool,
@@ -185,15 +194,6 @@ pub struct Series<T> {
     lost: Count,
     /// What people should know.
     said: Vec<Said>,
-}
-
-impl<T> core::fmt::Debug for Series<T> {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.debug_struct("Series")
-            .field("path", &self.path)
-            .field("number", &self.number)
-            .finish_non_exhaustive()
-    }
 }
 
 impl<T> Series<T> {
@@ -259,11 +259,7 @@ impl<T> Series<T> {
     }
 
     /// Writes something into the file that is open; without one it is counted.
-    pub fn put(&mut self, what: What, write: impl FnOnce(&mut Writer, &mut T) -> io::Result<()>) {
-        let count = match what {
-            What::Frame => Count { frames: 1, others: 0 },
-            What::Others(others) => Count { frames: 0, others },
-        };
+    pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Writer, &mut T) -> io::Result<()>) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         open.pending.add(count);
         if let Err(error) = write(&mut open.writer, &mut open.topics) {
@@ -362,15 +358,7 @@ impl<T> Series<T> {
                 part.path
             }
         };
-        let path = path.display().to_string();
-        let messages = kept.frames + kept.others;
-        self.written.push(Written {
-            path,
-            format: "mcap",
-            frames: kept.frames,
-            messages,
-            bytes: gauge.bytes(),
-        });
+        self.written.push(kept.in_file(&path, gauge.bytes()));
     }
 
     /// The file takes nothing more.
@@ -410,18 +398,15 @@ impl<T> Series<T> {
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
-                    let path = goal.display().to_string();
-                    let (frames, messages) = (recovered.frames, recovered.messages);
-                    self.written.push(Written { path, format: "mcap", frames, messages, bytes });
+                    self.written.push(Count { frames: recovered.frames, others }.in_file(&goal, bytes));
                 }
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
-                    let path = part.path.display().to_string();
+                    let path = part.path.display();
                     self.said
                         .push(Said::Else(format!("{path}: {error}; mend it with `gateway recover {path}`")));
-                    let messages = kept.frames + kept.others;
                     let bytes = file.metadata().map_or(0, |about| about.len());
-                    self.written.push(Written { path, format: "mcap", frames: kept.frames, messages, bytes });
+                    self.written.push(kept.in_file(&part.path, bytes));
                 }
             }
         }

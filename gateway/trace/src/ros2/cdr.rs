@@ -87,19 +87,6 @@ impl<'a> Decode<'a> for &'a str {
     }
 }
 
-impl Encode for String {
-    fn encode(&self, out: &mut Writer<'_>) {
-        out.put(self.as_str());
-    }
-}
-
-/// Elements of a kind, with their count before them.
-impl<T: Encode> Encode for [T] {
-    fn encode(&self, out: &mut Writer<'_>) {
-        out.sequence(self.iter());
-    }
-}
-
 /// At most [`LONGEST`] elements.
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
@@ -320,13 +307,13 @@ mod tests {
         out.put(value.wide);
         out.put(value.truth);
         out.put(value.short);
-        out.put(&value.text);
+        out.put(value.text.as_str());
         out.put(value.signed);
         out.bytes(&value.bytes);
         out.put(value.long);
-        out.put(&value.singles[..]);
-        out.put(&value.doubles[..]);
-        out.put(&value.texts[..]);
+        out.sequence(value.singles.iter());
+        out.sequence(value.doubles.iter());
+        out.sequence(value.texts.iter().map(String::as_str));
         out.put(value.last);
         buffer
     }

@@ -3,28 +3,23 @@
 //! There is no convention for CAN in recordings that would bring a candump line back as it was: `can_msgs/Frame`
 //! holds 8 bytes, `ros2_socketcan_msgs/FdFrame` has no flags. These do, and any viewer reads them.
 
-use std::borrow::Cow;
-
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::cdr::{CdrError, Encode, Reader, Writer};
 use super::{Header, Message, definition};
-use crate::capture::{Note, NoteKind};
+use crate::note::{Note, NoteKind};
 
 /// A frame of a bus.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CanFrame<'a>(pub Record<'a>);
-
-impl Message for CanFrame<'_> {
+impl Message for Record<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CanFrame";
     const DEFINITION: &'static str =
         definition!("skinbus_msgs/CanFrame", "std_msgs/Header", "builtin_interfaces/Time");
 }
 
-impl Encode for CanFrame<'_> {
+impl Encode for Record<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
-        let Record { time, interface, frame, direction } = &self.0;
+        let Self { time, interface, frame, direction } = self;
         out.put(Header { nanos: time.nanos, frame_id: interface });
         out.put(frame.raw_id() & EXTENDED_MASK);
         for flag in [frame.is_extended(), frame.is_remote(), frame.is_error(), frame.format() == Format::Fd] {
@@ -42,107 +37,99 @@ impl Encode for CanFrame<'_> {
     }
 }
 
-impl<'a> CanFrame<'a> {
-    /// When the frame was on its bus, by its header, in ns since 1970: of a frame of before, that is long before the
-    /// recording has it.
-    ///
-    /// # Errors
-    /// When it is no such message.
-    pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
-        Ok(Reader::new(message)?.get::<Header<'_>>()?.nanos)
-    }
+/// When the frame was on its bus, by its header, in ns since 1970: of a frame of before, that is long before the
+/// recording has it.
+///
+/// # Errors
+/// When it is no such message.
+pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
+    Ok(Reader::new(message)?.get::<Header<'_>>()?.nanos)
+}
 
-    /// Reads a message that the recording holds at a time. Never panics.
-    ///
-    /// # Errors
-    /// When it is no such message.
-    pub fn decode(message: &'a [u8], time: Timestamp) -> Result<Self, CdrError> {
-        let mut from = Reader::new(message)?;
-        let (Header { frame_id: interface, .. }, mut id) = (from.get()?, from.get::<u32>()?);
-        if id > EXTENDED_MASK {
-            return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
-        }
-        for flag in [EXTENDED, REMOTE, ERROR] {
-            id |= if from.get()? { flag } else { 0 };
-        }
-        let format = if from.get()? { Format::Fd } else { Format::Classic };
-        let [flags, length, raw_dlc, direction]: [u8; 4] = from.get()?;
-        let direction = match direction {
-            0 => None,
-            1 => Some(Direction::Received),
-            2 => Some(Direction::Sent),
-            got => return Err(CdrError::Value { what: "direction", got: got.into(), allowed: "0, 1 or 2" }),
-        };
-        let data = from.bytes()?;
-        let wrong = CdrError::Value {
-            what: "length",
-            got: length.into(),
-            allowed: "that of the data; 8 in a classic frame, 64 in an FD one",
-        };
-        let asked = [0; 64];
-        let data = match id & REMOTE {
-            0 if data.len() == usize::from(length) => data,
-            0 => return Err(wrong),
-            _ => asked.get(..usize::from(length)).ok_or(wrong)?,
-        };
-        let frame = Frame::with_data(id, format, flags, data).map_err(|_| wrong)?.with_raw_dlc(raw_dlc);
-        Ok(Self(Record { time, interface, frame, direction }))
+/// Reads a frame that the recording holds at a time. Never panics.
+///
+/// # Errors
+/// When it is no such message.
+pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
+    let mut from = Reader::new(message)?;
+    let (Header { frame_id: interface, .. }, mut id) = (from.get()?, from.get::<u32>()?);
+    if id > EXTENDED_MASK {
+        return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
     }
+    for flag in [EXTENDED, REMOTE, ERROR] {
+        id |= if from.get()? { flag } else { 0 };
+    }
+    let format = if from.get()? { Format::Fd } else { Format::Classic };
+    let [flags, length, raw_dlc, direction]: [u8; 4] = from.get()?;
+    let direction = match direction {
+        0 => None,
+        1 => Some(Direction::Received),
+        2 => Some(Direction::Sent),
+        got => return Err(CdrError::Value { what: "direction", got: got.into(), allowed: "0, 1 or 2" }),
+    };
+    let data = from.bytes()?;
+    let wrong = CdrError::Value {
+        what: "length",
+        got: length.into(),
+        allowed: "that of the data; 8 in a classic frame, 64 in an FD one",
+    };
+    let asked = [0; 64];
+    let data = match id & REMOTE {
+        0 if data.len() == usize::from(length) => data,
+        0 => return Err(wrong),
+        _ => asked.get(..usize::from(length)).ok_or(wrong)?,
+    };
+    let frame = Frame::with_data(id, format, flags, data).map_err(|_| wrong)?.with_raw_dlc(raw_dlc);
+    Ok(Record { time, interface, frame, direction })
 }
 
 /// Something between frames: a comment, frames that were lost, a line that is no frame.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CaptureNote<'a>(pub Cow<'a, Note<'a>>);
-
-impl Message for CaptureNote<'_> {
+impl Message for Note<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CaptureNote";
     const DEFINITION: &'static str =
         definition!("skinbus_msgs/CaptureNote", "std_msgs/Header", "builtin_interfaces/Time");
 }
 
-impl Encode for CaptureNote<'_> {
+impl Encode for Note<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
-        let note = self.0.as_ref();
         // A text of CDR ends at its NUL for some readers.
-        let same = || str::from_utf8(note.text).ok().filter(|text| !text.contains('\0'));
-        let (kind, frames, same) = match note.kind {
+        let same = || str::from_utf8(self.text).ok().filter(|text| !text.contains('\0'));
+        let (kind, frames, same) = match self.kind {
             NoteKind::Text => (0_u8, 0, same()),
             NoteKind::Dropped(frames) => (1, frames, same()),
             NoteKind::CanXl => (2, 0, same()),
             NoteKind::Unreadable(_) => (3, 0, None),
         };
-        out.put(Header { nanos: note.nanos, frame_id: note.interface });
+        out.put(Header { nanos: self.nanos, frame_id: self.interface });
         out.put(kind);
-        out.put((frames, note.line));
-        match (&note.kind, same) {
+        out.put((frames, self.line));
+        match (&self.kind, same) {
             (_, Some(text)) => out.put(text),
-            (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?")),
-            (_, None) => out.put(String::from_utf8_lossy(note.text).replace('\0', "?")),
+            (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?").as_str()),
+            (_, None) => out.put(String::from_utf8_lossy(self.text).replace('\0', "?").as_str()),
         }
-        out.bytes(if same.is_some() { &[] } else { note.text });
+        out.bytes(if same.is_some() { &[] } else { self.text });
     }
 }
 
-impl<'a> CaptureNote<'a> {
-    /// Reads a message that the recording holds at a time. Never panics.
-    ///
-    /// # Errors
-    /// When it is no such message.
-    pub fn decode(message: &'a [u8], nanos: u64) -> Result<Self, CdrError> {
-        let mut from = Reader::new(message)?;
-        let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
-        let [frames, line]: [u64; 2] = from.get()?;
-        let (words, bytes) = (from.get::<&str>()?, from.bytes()?);
-        let text = if bytes.is_empty() { words.as_bytes() } else { bytes };
-        let (kind, text) = match kind {
-            0 => (NoteKind::Text, text),
-            1 => (NoteKind::Dropped(frames), text),
-            2 => (NoteKind::CanXl, text),
-            3 => (NoteKind::Unreadable(words.to_owned()), bytes),
-            got => return Err(CdrError::Value { what: "kind", got: got.into(), allowed: "0 to 3" }),
-        };
-        Ok(Self(Cow::Owned(Note { kind, nanos, interface, line, text })))
-    }
+/// Reads a note that the recording holds at a time. Never panics.
+///
+/// # Errors
+/// When it is no such message.
+pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
+    let mut from = Reader::new(message)?;
+    let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
+    let [frames, line]: [u64; 2] = from.get()?;
+    let (words, bytes) = (from.get::<&str>()?, from.bytes()?);
+    let text = if bytes.is_empty() { words.as_bytes() } else { bytes };
+    let (kind, text) = match kind {
+        0 => (NoteKind::Text, text),
+        1 => (NoteKind::Dropped(frames), text),
+        2 => (NoteKind::CanXl, text),
+        3 => (NoteKind::Unreadable(words.to_owned()), bytes),
+        got => return Err(CdrError::Value { what: "kind", got: got.into(), allowed: "0 to 3" }),
+    };
+    Ok(Note { kind, nanos, interface, line, text })
 }
 
 #[cfg(test)]
@@ -154,10 +141,10 @@ mod tests {
 
     fn back_and_forth(record: Record<'_>) -> Result<Record<'_>, CdrError> {
         let mut buffer = Vec::new();
-        CanFrame(record).encode_into(&mut buffer);
-        let back = CanFrame::decode(&buffer, record.time)?;
-        assert_eq!(back.0.interface, record.interface);
-        Ok(Record { interface: record.interface, ..back.0 })
+        record.encode_into(&mut buffer);
+        let back = frame(&buffer, record.time)?;
+        assert_eq!(back.interface, record.interface);
+        Ok(Record { interface: record.interface, ..back })
     }
 
     #[test]
@@ -166,7 +153,7 @@ mod tests {
         let time = Timestamp { nanos: 5 * NANOS + 7, nine_digits: true };
         let record = Record { time, interface: "vcan0", frame, direction: Some(Direction::Sent) };
         let mut buffer = Vec::new();
-        CanFrame(record).encode_into(&mut buffer);
+        record.encode_into(&mut buffer);
         let expected = [
             &[0, 1, 0, 0][..],
             &[5, 0, 0, 0, 7, 0, 0, 0],
@@ -184,11 +171,11 @@ mod tests {
         let time = Timestamp { nanos: 0, nine_digits: true };
         let record = Record { time, interface: "", frame: Frame::EMPTY, direction: None };
         let mut buffer = Vec::new();
-        CanFrame(record).encode_into(&mut buffer);
+        record.encode_into(&mut buffer);
         let with = |at: usize, value: u8| {
             let mut bytes = buffer.clone();
             bytes[at] = value;
-            CanFrame::decode(&bytes, time).map(|_| ()).unwrap_err().to_string()
+            frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
         };
         // The empty name takes 5 bytes, and 3 fill.
         assert!(with(23, 0xFF).starts_with("id of a message is 4278190080: allowed is 29 bits"));
@@ -212,8 +199,8 @@ mod tests {
             for text in [&b""[..], b"# a comment", b"\xFF\0broken", b"a\0b", "µ".as_bytes()] {
                 let note = note(kind.clone(), text);
                 let mut buffer = Vec::new();
-                CaptureNote(Cow::Borrowed(&note)).encode_into(&mut buffer);
-                assert_eq!(CaptureNote::decode(&buffer, 42).unwrap().0.as_ref(), &note);
+                note.encode_into(&mut buffer);
+                assert_eq!(super::note(&buffer, 42).unwrap(), note);
             }
         }
     }
@@ -241,8 +228,8 @@ mod tests {
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(0_u8..4, 0..80)) {
-            let _ = CanFrame::decode(&bytes, Timestamp { nanos: 0, nine_digits: true });
-            let _ = CaptureNote::decode(&bytes, 0);
+            let _ = frame(&bytes, Timestamp { nanos: 0, nine_digits: true });
+            let _ = super::note(&bytes, 0);
         }
     }
 }

@@ -10,6 +10,7 @@ pub mod skin;
 pub mod standard;
 
 use cdr::{CdrError, Decode, Encode, Reader, Writer};
+use thiserror::Error;
 
 /// A type of message: what a recording says of it, and how its bytes come about.
 pub trait Message: Encode {
@@ -22,6 +23,23 @@ pub trait Message: Encode {
     fn encode_into(&self, buffer: &mut Vec<u8>) {
         self.encode(&mut Writer::new(buffer));
     }
+}
+
+/// What is wrong with a message.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum MessageError {
+    /// Longer than anything of its type.
+    #[error("it has {bytes} bytes, and may have {limit}")]
+    Long {
+        /// Its length.
+        bytes: usize,
+        /// The limit.
+        limit: usize,
+    },
+    /// Its bytes are no such message.
+    #[error(transparent)]
+    Cdr(#[from] CdrError),
 }
 
 /// The definition of a type, and those of the types in it, by their files.

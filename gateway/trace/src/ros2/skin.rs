@@ -87,7 +87,8 @@ impl Message for Torques<'_> {
 impl Encode for Torques<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.put((self.distributed, self.central));
+        out.sequence(self.distributed.iter());
+        out.sequence(self.central.iter());
         let both = self.distributed.iter().zip(self.central);
         out.sequence(both.map(|(distributed, central)| distributed - central));
         out.put(self.active);

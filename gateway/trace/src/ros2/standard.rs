@@ -27,9 +27,9 @@ impl Message for JointState<'_> {
 impl Encode for JointState<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.put(self.names);
+        out.sequence(self.names.iter().map(String::as_str));
         for values in [self.position, self.velocity, self.effort] {
-            out.put(values);
+            out.sequence(values.iter());
         }
     }
 }
@@ -138,14 +138,14 @@ impl Message for Diagnostics<'_> {
 impl Encode for Diagnostics<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.put(self.parts);
+        out.sequence(self.parts.iter());
     }
 }
 
 impl Encode for Diagnosis {
     fn encode(&self, out: &mut Writer<'_>) {
-        out.put((self.level as u8, &self.name));
-        out.put((&self.message, ""));
-        out.put(&self.values[..]);
+        out.put((self.level as u8, self.name.as_str()));
+        out.put((self.message.as_str(), ""));
+        out.sequence(self.values.iter().map(|(name, value)| (*name, value.as_str())));
     }
 }

@@ -26,7 +26,7 @@ use crate::fit::rates::{Asked, Chosen};
 use crate::shadow::{self, Shadow};
 use lane::Lane;
 use motion::Motion;
-use trace::capture::{CaptureError, Entry, Extras, Format, Item, Items, Note, NoteKind, Other, SKIN};
+use trace::capture::{CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN};
 use trace::recording::layout::Layout;
 use trace::ros2::read;
 
@@ -115,7 +115,7 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
 
 /// Reads it all; also why it has no proper end, if it has none.
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
-    let mut items = Items::open_all(paths).map_err(ReportError::Open)?;
+    let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
@@ -131,7 +131,7 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), R
     // What stands before the first message is known when it is open.
     let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
     let damaged = loop {
-        match items.next() {
+        match items.next_item() {
             Ok(Some(item)) => run.take(&item),
             Ok(None) => break None,
             Err(error) => break Some(error),

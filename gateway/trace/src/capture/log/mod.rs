@@ -5,5 +5,4 @@ mod write;
 
 pub use read::LONGEST;
 pub(super) use read::LogReader;
-pub(crate) use read::read_some;
 pub use write::{Digits, LogWriter, Style, Wrote};

@@ -6,6 +6,7 @@ use std::ops::Range;
 use protocol::candump::{self, Line};
 
 use crate::capture::{Entry, Note, NoteKind};
+use crate::container::read_some;
 
 /// The longest line that is read, with its end: twice that of the longest CAN XL frame.
 pub const LONGEST: usize = 8_192;
@@ -137,16 +138,6 @@ impl LogReader {
         self.rest.end += got;
         self.at_end = got == 0;
         Ok(got)
-    }
-}
-
-/// Reads what there is, whatever signals come.
-pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
-    loop {
-        match input.read(room) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            done => return done,
-        }
     }
 }
 

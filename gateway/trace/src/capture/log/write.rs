@@ -40,7 +40,7 @@ pub enum Wrote {
     All,
     /// Its line is shorter than what is known: digits, direction or raw DLC are left out, as was asked for.
     Less,
-    /// It is not in the log: it was not asked for, or a log has no place for it.
+    /// It is not in the log: a note that was not asked for, or that a log has no place for.
     Nothing,
 }
 

@@ -1,6 +1,5 @@
 //! The entries of a capture as an MCAP recording.
 
-use std::borrow::Cow;
 use std::io::{self, Write};
 
 use protocol::candump::Record;
@@ -8,7 +7,6 @@ use protocol::candump::Record;
 use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{NOTES, TOPIC_OF_BUS};
-use crate::ros2::messages::{CanFrame, CaptureNote};
 
 /// Channels of frames: each costs a reader memory, and what a log calls its buses may be anything.
 const LANES: usize = 64;
@@ -70,7 +68,7 @@ impl<W: Write> McapWriter<W> {
                 }
                 let lane = self.lane(record)?;
                 let Some(lane) = self.lanes.get_mut(lane) else { return Ok(()) };
-                self.file.write(&mut lane.channel, record.time.nanos, &CanFrame(*record))
+                self.file.write(&mut lane.channel, record.time.nanos, record)
             }
             Entry::Note(note) => match &mut self.waiting {
                 Some(waiting) if note.line > 0 && self.bytes < WAITING => {
@@ -98,9 +96,9 @@ impl<W: Write> McapWriter<W> {
     fn note(&mut self, note: &Note<'_>) -> io::Result<()> {
         let channel = match &mut self.notes {
             Some(channel) => channel,
-            none => none.insert(self.file.channel::<CaptureNote<'_>>(NOTES, &[])?),
+            none => none.insert(self.file.channel::<Note<'_>>(NOTES, &[])?),
         };
-        self.file.write(channel, note.nanos, &CaptureNote(Cow::Borrowed(note)))
+        self.file.write(channel, note.nanos, note)
     }
 
     /// The place of a frame's lane, which is made when it is the first one there.
@@ -122,7 +120,7 @@ impl<W: Write> McapWriter<W> {
         } else {
             let topic = format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
             let digits = if nine_digits { "9" } else { "6" };
-            let channel = self.file.channel::<CanFrame<'_>>(&topic, &[("time_digits", digits)])?;
+            let channel = self.file.channel::<Record<'_>>(&topic, &[("time_digits", digits)])?;
             self.lanes.push(Lane { interface: name.to_owned(), nine_digits, channel });
             self.lanes.len() - 1
         };

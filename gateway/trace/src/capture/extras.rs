@@ -1,0 +1,75 @@
+//! What a recording has beside frames and notes.
+
+use protocol::can::Frame;
+use protocol::document::DocumentError;
+use protocol::skin::Skin;
+
+/// What an MCAP recording has beside frames and notes, as far as it has been read.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Extras {
+    /// Topics that are no frames and no notes, in the order in which they came.
+    pub topics: Vec<Topic>,
+    /// Frames of before, that are in force when the recording begins.
+    pub in_force: Vec<InForce>,
+    /// Attachments by name; the largest without their bytes.
+    pub attachments: Vec<(String, Vec<u8>)>,
+    /// Metadata by name.
+    pub metadata: Vec<(String, Vec<(String, String)>)>,
+    /// What is missing at its end, when it was never finished.
+    pub unfinished: Option<String>,
+}
+
+/// What the skin in a recording of a run is called.
+pub const SKIN: &str = "skin.toml";
+
+impl Extras {
+    /// Nothing.
+    pub(super) const NONE: &Self = &Self {
+        topics: Vec::new(),
+        in_force: Vec::new(),
+        attachments: Vec::new(),
+        metadata: Vec::new(),
+        unfinished: None,
+    };
+
+    /// A value of the metadata.
+    #[must_use]
+    pub fn fact(&self, record: &str, key: &str) -> Option<&str> {
+        let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
+        facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
+    }
+
+    /// The skin that is attached; `None` when none is.
+    ///
+    /// # Errors
+    /// Of the skin, when it is none that this version knows.
+    #[must_use]
+    pub fn skin(&self) -> Option<Result<Skin, DocumentError>> {
+        let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN)?;
+        Some(Skin::parse(SKIN, &String::from_utf8_lossy(text)))
+    }
+}
+
+/// A frame that was on a bus before a recording began, and still says what holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InForce {
+    /// Its bus.
+    pub bus: String,
+    /// Whether whoever recorded it had sent it.
+    pub own: bool,
+    /// What it is.
+    pub frame: Frame,
+    /// When it was on the bus, in ns since 1970.
+    pub nanos: u64,
+}
+
+/// A topic that is neither frames nor notes.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Topic {
+    /// Its name.
+    pub name: String,
+    /// The type of its messages.
+    pub schema: String,
+    /// How many.
+    pub messages: u64,
+}

@@ -1,0 +1,322 @@
+//! What is known of an MCAP recording, and what its messages are.
+
+use std::collections::HashMap;
+use std::fmt::Display;
+use std::io::{self, BufReader, Read, Seek};
+
+use ::mcap::records::op;
+use protocol::candump::{Direction, Record, Timestamp};
+
+use super::Fault;
+use super::foreign::Foreign;
+use crate::capture::log::LONGEST as LONGEST_LINE;
+use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
+use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
+use crate::recording::TOPIC_OF_STATE;
+use crate::ros2::cdr::CdrError;
+use crate::ros2::{Message, MessageError, messages};
+
+/// Bytes of attachments, metadata and frames in force that are kept.
+pub(super) const KEPT: usize = 16 << 20;
+/// Bytes that a file, a fact or a frame costs beside its own.
+const ENTRY: usize = Names::ENTRY;
+/// The longest message that is a frame.
+const LONGEST_FRAME: usize = 4 << 10;
+/// The longest message that is a note: a line and its place.
+const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
+/// Letters of a topic's name that stand for a bus without a name.
+const LONGEST_BUS: usize = 255;
+
+/// What is known of a recording.
+pub(crate) struct State {
+    schemas: HashMap<u16, String>,
+    channels: HashMap<u16, Lane>,
+    /// The places of topics that are only counted, by name and type.
+    counted: HashMap<(String, String), usize>,
+    names: Names,
+    extras: Extras,
+    /// Bytes of attachments and metadata so far.
+    kept: usize,
+    /// Whether attachments and metadata are known already.
+    knows_files: bool,
+    any_frame: bool,
+    /// Whether messages that are only counted are wanted too.
+    others: bool,
+    /// Whether no other part of the recording came before.
+    is_first: bool,
+}
+
+/// A message that is wanted. What it says is the record that was read last.
+#[derive(Clone, Copy)]
+pub(super) struct Wanted {
+    pub(super) channel: u16,
+    pub(super) log_time: u64,
+    pub(super) in_chunk: bool,
+}
+
+/// A channel: its topic, and what is done with its messages.
+struct Lane {
+    topic: String,
+    what: What,
+}
+
+#[derive(Clone, Copy)]
+enum What {
+    Frames {
+        nine_digits: bool,
+    },
+    /// Frames of before, that are in force when the recording begins.
+    InForce,
+    Notes,
+    Foreign(Foreign),
+    /// They are counted, here in the list of topics.
+    Counted(usize),
+}
+
+impl State {
+    /// Nothing yet, or what the parts `before` this one have: what is in force when a part begins is no news then, and
+    /// its topics are theirs. `others` if messages are wanted that are only counted.
+    pub(crate) fn new(others: bool, before: Option<Extras>) -> Self {
+        let is_first = before.is_none();
+        let extras = before.unwrap_or_default();
+        let topics = extras.topics.iter().enumerate();
+        Self {
+            schemas: HashMap::new(),
+            channels: HashMap::new(),
+            counted: topics.map(|(at, it)| ((it.name.clone(), it.schema.clone()), at)).collect(),
+            names: Names::default(),
+            extras,
+            kept: 0,
+            knows_files: !is_first,
+            any_frame: false,
+            others,
+            is_first,
+        }
+    }
+
+    pub(super) const fn extras(&self) -> &Extras {
+        &self.extras
+    }
+
+    /// Nothing more comes, and it has no end.
+    pub(super) fn cut_off(&mut self, read: u64) {
+        let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
+        self.extras.unfinished.get_or_insert_with(why);
+    }
+
+    /// Takes the attachments and metadata of a file that can be gone through without reading all of it: they are known
+    /// from the beginning then, wherever they stand.
+    pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
+        if self.knows_files {
+            return Ok(());
+        }
+        // Most of what is passed over is longer than this.
+        let mut from = BufReader::with_capacity(4 << 10, file);
+        if from.read_exact(&mut [0; MAGIC.len()]).is_err() {
+            return Ok(());
+        }
+        let mut body = Vec::new();
+        while let Some((opcode, length)) = find(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])? {
+            if opcode == op::FOOTER {
+                break;
+            }
+            body.clear();
+            let came = (&mut from).take(length.min(KEPT as u64)).read_to_end(&mut body)? as u64;
+            if came < length {
+                let rest = i64::try_from(length - came);
+                if rest.is_err() || rest.is_ok_and(|rest| from.seek_relative(rest).is_err()) {
+                    break;
+                }
+            }
+            match parse(opcode, &body) {
+                Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
+                Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
+                // What is wrong with it is said when it is come to.
+                _ => {}
+            }
+        }
+        self.knows_files = true;
+        Ok(())
+    }
+
+    /// Takes a record.
+    pub(super) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Wanted>, Fault> {
+        match parse(opcode, body)? {
+            Raw::Schema { id, name, .. } => {
+                if self.schemas.get(&id).is_none_or(|known| known != name) {
+                    self.names.add(name.len())?;
+                    self.schemas.insert(id, name.to_owned());
+                }
+            }
+            // Said again in the summary, or in every chunk.
+            Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
+            Raw::Channel { id, schema, topic, encoding, facts } => {
+                self.channel(id, schema, topic, encoding, &facts)?;
+            }
+            Raw::Message { channel, log_time, data, .. } => {
+                let wanted = self.is_wanted(channel, data)?;
+                return Ok(wanted.then_some(Wanted { channel, log_time, in_chunk }));
+            }
+            Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
+            Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
+            Raw::Header { .. }
+            | Raw::Attachment { .. }
+            | Raw::Metadata { .. }
+            | Raw::DataEnd { .. }
+            | Raw::Other => {}
+        }
+        Ok(None)
+    }
+
+    /// Takes a message, if nobody else wants it.
+    fn is_wanted(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
+        let lane = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
+        match lane.what {
+            What::Counted(topic) => {
+                if let Some(topic) = self.extras.topics.get_mut(topic) {
+                    topic.messages += 1;
+                }
+                Ok(self.others)
+            }
+            What::InForce if !self.is_first => Ok(false),
+            What::InForce => {
+                let record =
+                    in_force(data).map_err(|source| Damage::Message { topic: lane.topic.clone(), source })?;
+                let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
+                let (frame, nanos) = (record.frame, record.time.nanos);
+                self.keep(bus.len() + ENTRY, |extras| {
+                    extras.in_force.push(InForce { bus: bus.to_owned(), own, frame, nanos });
+                });
+                Ok(false)
+            }
+            What::Frames { .. } | What::Notes | What::Foreign(_) => Ok(true),
+        }
+    }
+
+    /// Keeps something of so many bytes, while there is room.
+    fn keep(&mut self, size: usize, keep: impl FnOnce(&mut Extras)) {
+        self.kept = self.kept.saturating_add(size);
+        if self.is_first && self.kept <= KEPT {
+            keep(&mut self.extras);
+        }
+    }
+
+    pub(super) fn attachment(&mut self, name: &str, data: &[u8]) {
+        let fits = self.kept.saturating_add(name.len() + ENTRY + data.len()) <= KEPT;
+        let data = if fits { data } else { &[] };
+        self.keep(name.len() + ENTRY + data.len(), |extras| {
+            extras.attachments.push((name.to_owned(), data.to_vec()));
+        });
+    }
+
+    fn metadata(&mut self, name: &str, facts: &Facts<'_>) {
+        let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY).sum::<usize>();
+        self.keep(name.len() + ENTRY + size, |extras| {
+            let facts = facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned()));
+            extras.metadata.push((name.to_owned(), facts.collect()));
+        });
+    }
+
+    fn channel(
+        &mut self,
+        id: u16,
+        schema: u16,
+        topic: &str,
+        encoding: &str,
+        facts: &Facts<'_>,
+    ) -> Result<(), Fault> {
+        let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
+        // Each of them may be kept twice.
+        self.names.add(2 * (topic.len() + schema.len()))?;
+        let nine_digits = facts.get("time_digits").is_none_or(|digits| digits != "6");
+        let what = if encoding != "cdr" {
+            None
+        } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
+            Some(What::InForce)
+        } else if schema == Record::TYPE {
+            Some(What::Frames { nine_digits })
+        } else if schema == Note::TYPE {
+            Some(What::Notes)
+        } else {
+            Foreign::of(&schema).map(What::Foreign)
+        };
+        let what = what.unwrap_or_else(|| {
+            let topics = &mut self.extras.topics;
+            let place =
+                self.counted.entry((topic.to_owned(), schema)).or_insert_with_key(|(name, schema)| {
+                    topics.push(Topic { name: name.clone(), schema: schema.clone(), messages: 0 });
+                    topics.len() - 1
+                });
+            What::Counted(*place)
+        });
+        self.channels.insert(id, Lane { topic: topic.to_owned(), what });
+        Ok(())
+    }
+
+    pub(super) fn item<'a>(&'a mut self, channel: u16, log_time: u64, message: &'a [u8]) -> Item<'a> {
+        let Some(Lane { topic, what }) = self.channels.get(&channel) else {
+            return Item::Entry(unreadable("", log_time, message, &"no channel"));
+        };
+        let decoded = match *what {
+            What::Counted(place) => {
+                let topic = self.extras.topics.get(place);
+                let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
+                return Item::Other(Other { topic, schema, nanos: log_time, message });
+            }
+            // They are never wanted.
+            What::InForce => in_force(message).map(Entry::Frame),
+            What::Frames { nine_digits } => {
+                let time = Timestamp { nanos: log_time, nine_digits };
+                decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
+            }
+            What::Foreign(foreign) => {
+                let bus = beginning(topic);
+                decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time, bus))
+                    .map(Entry::Frame)
+            }
+            What::Notes => {
+                let note = decode(message, LONGEST_NOTE, |message| messages::note(message, log_time));
+                note.map(|mut note| {
+                    if note.line > 0 && !self.any_frame {
+                        note.nanos = 0;
+                    }
+                    Entry::Note(note)
+                })
+            }
+        };
+        let entry = decoded.unwrap_or_else(|why| unreadable(topic, log_time, message, &why));
+        self.any_frame |= matches!(entry, Entry::Frame(_));
+        Item::Entry(entry)
+    }
+}
+
+/// What a message says, unless it is longer than it may be.
+fn decode<'a, T>(
+    message: &'a [u8],
+    limit: usize,
+    decode: impl FnOnce(&'a [u8]) -> Result<T, CdrError>,
+) -> Result<T, MessageError> {
+    let bytes = message.len();
+    if bytes > limit { Err(MessageError::Long { bytes, limit }) } else { Ok(decode(message)?) }
+}
+
+/// A frame of before, with its own time.
+fn in_force(message: &[u8]) -> Result<Record<'_>, MessageError> {
+    decode(message, LONGEST_FRAME, |message| {
+        messages::frame(message, Timestamp { nanos: messages::stamp(message)?, nine_digits: true })
+    })
+}
+
+/// The beginning of a topic's name, which may be as long as anything.
+fn beginning(topic: &str) -> &str {
+    let ends = (0..=LONGEST_BUS.min(topic.len())).rev();
+    ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
+}
+
+/// A message that is not what its channel says.
+fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> Entry<'a> {
+    let topic = beginning(topic);
+    let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));
+    let message = message.get(..LONGEST_LINE).unwrap_or(message);
+    Entry::Note(Note { kind, nanos, interface: "", line: 0, text: message })
+}
