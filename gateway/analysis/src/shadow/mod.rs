@@ -123,23 +123,21 @@ impl Shadow {
         let place = self.frames;
         self.frames += 1;
         let lane = self.lane(bus);
+        let bits = lane.and_then(|_| Bits::of(frame));
         if let Some(told) = &mut self.told {
-            let flag = frame.raw_id() & ERROR;
-            told.enter(lane, nanos, frame.id() | flag, frame.is_extended() || frame.is_error());
+            let (id, extended) =
+                (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
+            told.enter(Shaded { nanos, bus: lane, id, extended, bits, sent: None });
         }
         let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
             self.further += 1;
             return;
         };
         lane.count(nanos);
-        let Some(bits) = Bits::of(frame) else {
-            lane.counts.error_frames += 1;
-            return;
-        };
-        if let Some(told) = &mut self.told {
-            told.bits(place, bits);
+        match bits {
+            Some(bits) => lane.take(nanos, frame, bits, place, self.told.as_mut()),
+            None => lane.counts.error_frames += 1,
         }
-        lane.take(nanos, frame, bits, place, self.told.as_mut());
     }
 
     /// A frame that was on a bus before the capture began, and still says what holds.

@@ -88,7 +88,7 @@ impl Draft<'_> {
         ] {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
-                Finding::less_is_better(what, (theirs, "Nm"), (mean, "Nm"))
+                Finding::less_is_better(what, theirs, (mean, "Nm"))
             };
             findings.extend(errors.mean().map(finding));
         }
@@ -104,19 +104,19 @@ impl Draft<'_> {
                 skin.cells.len(),
                 number((active * 10.0).round() / 10.0)
             );
-            findings.push(Finding::less_is_better(what, (law, "µs"), (median, "µs")));
+            findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
         findings.push(Finding::told("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             let loop_hz =
                 hertz(motion.counts.ticks.saturating_add(motion.counts.unrecorded), motion.seconds());
-            findings.push(Finding::told("control loop", loop_hz).beside((PAPER_CONTROL_HZ, "Hz")));
+            findings.push(Finding::told("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
             let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
                 let finding = Finding::told("joints", hertz(count, last - first));
-                findings.push(finding.beside((PAPER_BROADCAST_HZ, "Hz")));
+                findings.push(finding.beside(PAPER_BROADCAST_HZ));
             }
             findings.push(none("ticks skipped".to_owned(), motion.counts.skipped));
         }
