@@ -85,7 +85,11 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
 
 fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
-    let missing = if bus.counts.missing > 0 { format!("{} more are missing", bus.counts.missing) } else { String::new() };
+    let missing = if bus.counts.missing > 0 {
+        format!("{} more are missing", bus.counts.missing)
+    } else {
+        String::new()
+    };
     rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
     fit(rows, bus);
     if bus.this_run.is_some() {
