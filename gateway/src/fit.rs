@@ -4,7 +4,7 @@ mod text;
 
 use std::path::PathBuf;
 
-use analysis::fit::{self, BusFit, COMPUTATION_NS};
+use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
 use clap::Args;
 use protocol::can::Format;
 use protocol::skin::{Bus, Skin};
@@ -52,11 +52,11 @@ impl Fit {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
         let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
-        let rates = if self.table { None } else { self.rates(&skin)? };
-        let (buses, whole, rows) = match rates {
+        let chosen = if self.table { None } else { self.rates(&skin)? };
+        let (buses, whole, rows) = match chosen {
             None => (Vec::new(), None, fit::table(&skin, self.format, computation_ns)),
-            Some(rates) => {
-                let buses = rates.into_iter().enumerate();
+            Some(chosen) => {
+                let buses = chosen.into_iter().enumerate();
                 let fit = |(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns);
                 let buses: Vec<BusFit> = buses.filter_map(fit).collect();
                 let whole = fit::fullest(buses.iter().cloned()).map(|it| fit::whole(&skin, &it));
@@ -96,16 +96,11 @@ impl Fit {
     }
 }
 
-/// What a bus' description says; a data bit rate that it does not have is the nominal one.
+/// What a bus' description says.
 fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
-    let Some(nominal) = bus.bitrate else { return Ok(None) };
-    let data = match format {
-        Format::Fd => bus.data_bitrate.unwrap_or(nominal),
-        Format::Classic => nominal,
-    };
-    let rates = BitRates::new(nominal, data);
+    let rates = rates::described(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
-    Ok(Some((format, rates)))
+    Ok(rates.map(|rates| (format, rates)))
 }
 
 /// µs, with up to three decimals, as ns.

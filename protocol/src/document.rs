@@ -20,7 +20,7 @@ use crate::fixed::{OutOfRange, Q};
 
 /// One step from the file's root to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Step {
+enum Step {
     /// Into a table.
     Key(&'static str),
     /// Into an array, counted from 0.
@@ -33,14 +33,6 @@ pub struct Fault {
     path: Vec<Step>,
     value: String,
     why: String,
-}
-
-impl Fault {
-    /// The value at `path` cannot be, and why; an empty value is not printed.
-    #[must_use]
-    pub fn new(path: &[Step], value: impl fmt::Display, why: impl fmt::Display) -> Self {
-        Self { path: path.to_vec(), value: value.to_string(), why: why.to_string() }
-    }
 }
 
 /// Where a value stands in a file, or a table of them; what is wrong there, and what is not.
@@ -69,7 +61,7 @@ impl Place {
     /// What stands here cannot be, and why; an empty value is not printed.
     #[must_use]
     pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> Fault {
-        Fault::new(&self.0, value, why)
+        Fault { path: self.0.clone(), value: value.to_string(), why: why.to_string() }
     }
 
     /// What a word means, one of a few.

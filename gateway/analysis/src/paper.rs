@@ -4,8 +4,6 @@
 pub const SINGLE_NM: f64 = 0.0054;
 /// Mean error of summed torques, Q7.8, in Nm (Fig. 6).
 pub const SUMMED_NM: f64 = 0.0356;
-/// When the central computation is switched off, in s (Fig. 8).
-pub const SWITCHED_S: f64 = 5.7;
 /// Time of the rest of a cycle without the central computation, in s (Fig. 8).
 pub const REST_S: f64 = 0.2e-3;
 /// Time of a cycle at 500 Hz, in s.

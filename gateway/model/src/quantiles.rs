@@ -10,6 +10,40 @@ pub fn histogram() -> Histogram<u64> {
     Histogram::new(3).expect("three digits are a valid precision")
 }
 
+/// Times in ns, of which the longest is known exactly.
+#[derive(Clone, Debug)]
+pub struct Times {
+    histogram: Histogram<u64>,
+    longest: u64,
+}
+
+impl Default for Times {
+    fn default() -> Self {
+        Self { histogram: histogram(), longest: 0 }
+    }
+}
+
+impl Times {
+    /// Takes one more.
+    pub fn record(&mut self, nanos: u64) {
+        // The histogram grows by itself; it cannot refuse.
+        let _ = self.histogram.record(nanos);
+        self.longest = self.longest.max(nanos);
+    }
+
+    /// All of them.
+    #[must_use]
+    pub const fn histogram(&self) -> &Histogram<u64> {
+        &self.histogram
+    }
+
+    /// The longest; 0 of none.
+    #[must_use]
+    pub const fn longest(&self) -> u64 {
+        self.longest
+    }
+}
+
 /// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Quantiles {

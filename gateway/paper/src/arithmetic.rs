@@ -114,19 +114,19 @@ impl Costs {
             Parameters { joint, ..cell }
         };
         let words: [Q1_14; MAX_JOINTS] = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
-        let wrench = |joint| {
-            let kernel = <Wrench<Counted> as Kernel<Counted>>::new(&on(joint));
-            Operations::count(|| kernel.jacobian(&words)).1
-        };
-        let projection = |joint| {
-            let kernel = <Projection<Counted> as Kernel<Counted>>::new(&on(joint));
-            Operations::count(|| kernel.jacobian(&words)).1
-        };
         Self {
-            wrench: (1..=joints).map(wrench).collect(),
-            projection: (1..=joints).map(projection).collect(),
+            wrench: (1..=joints).map(|joint| jacobian::<Wrench<Counted>>(&on(joint), &words)).collect(),
+            projection: (1..=joints)
+                .map(|joint| jacobian::<Projection<Counted>>(&on(joint), &words))
+                .collect(),
         }
     }
+}
+
+/// What one Jacobian takes.
+fn jacobian<K: Kernel<Counted>>(cell: &Parameters, words: &[Q1_14; MAX_JOINTS]) -> Operations {
+    let kernel = K::new(cell);
+    Operations::count(|| kernel.jacobian(words)).1
 }
 
 /// Operations by name, in the paper's order.

@@ -121,7 +121,7 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ours = ours.into();
     let ratio = ours.value / (paper_s * 1e9);
     [
-        Finding::less_is_better(what, (paper_s * 1e9, "ns"), ours),
+        Finding::less_is_better(what, paper_s * 1e9, ours),
         Finding::told(format!("{what}: ours by the paper's"), ratio),
     ]
 }
@@ -129,7 +129,7 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
 /// How many cells fit into a cycle, so many of them active.
 fn limit(active: &str, paper: f64, ours: f64) -> Finding {
     let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
-    Finding::more_is_better(what, (paper, "cells"), (ours, "cells"))
+    Finding::more_is_better(what, paper, (ours, "cells"))
 }
 
 /// T_skin over something.
@@ -246,7 +246,7 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
             (line.intercept, "ns"),
             paper::NONE_ACTIVE_S,
         ))
-        .findings([quality(line, paper::ACTIVE_QUALITY), all.beside((all_papers, "µs"))])
+        .findings([quality(line, paper::ACTIVE_QUALITY), all.beside(all_papers)])
         .findings(limits)
         .tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
 }

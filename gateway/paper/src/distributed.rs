@@ -164,8 +164,7 @@ fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     let Over { distributed, central, .. } = over;
     [
         Finding::told(format!("central T_skin for each {what}"), central.slope_in("ns")),
-        Finding::told(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
-            .beside((0.0, "ns")),
+        Finding::told(format!("distributed tick for each {what}"), distributed.slope_in("ns")).beside(0.0),
         Finding::told(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
             (over.share() * 100.0, "%"),

@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn results_have_every_finding_with_its_verdict() {
-        let finding = Finding::less_is_better("error", Quantity::new(2.0, "Nm"), Quantity::new(1.0, "Nm"));
+        let finding = Finding::less_is_better("error", 2.0, Quantity::new(1.0, "Nm"));
         let section = Section { name: "fig6".to_owned(), findings: vec![finding], ..Section::default() };
         let page = Page {
             facts: vec![("machine".to_owned(), "one".to_owned())],

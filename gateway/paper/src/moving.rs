@@ -82,12 +82,12 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
     let title = "Fig. 6: torques of the moving arm, computed in the loop and on the cells";
     let cell = Finding::less_is_better(
         "mean error of a cell's torque, Q3.12",
-        (paper::SINGLE_NM, "Nm"),
+        paper::SINGLE_NM,
         (mean_single, "Nm"),
     );
     let sum = Finding::less_is_better(
         "mean error of the summed torque, Q7.8",
-        (paper::SUMMED_NM, "Nm"),
+        paper::SUMMED_NM,
         (mean_summed, "Nm"),
     );
     let rows = [
@@ -206,11 +206,11 @@ pub fn fig8(run: &Run) -> Section {
     };
     let none = Finding::less_is_better(
         format!("mean T_skin while none of {cells} cells is active"),
-        us((paper::CELL_S * cells + paper::FIXED_S) * 1e6),
+        (paper::CELL_S * cells + paper::FIXED_S) * 1e6,
         us(none_active),
     );
     let after_switch =
-        Finding::less_is_better("T_total after the switch, median", us(paper::REST_S * 1e6), us(total[1]));
+        Finding::less_is_better("T_total after the switch, median", paper::REST_S * 1e6, us(total[1]));
     let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
         Finding::told("T_total after the switch for each active cell", slope)
@@ -237,7 +237,7 @@ pub fn fig8(run: &Run) -> Section {
         ])
         .findings([
             none,
-            Finding::told("T_skin after the switch, greatest", us(off)).beside(us(0.0)).must("0", off <= 0.0),
+            Finding::told("T_skin after the switch, greatest", us(off)).beside(0.0).must("0", off <= 0.0),
             Finding::told("T_total before the switch, median", us(total[0])),
             after_switch.must("less than before", total[1] < total[0]),
         ])

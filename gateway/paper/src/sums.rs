@@ -165,7 +165,7 @@ pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
     let findings = at.flat_map(|at| {
         WAYS.map(|(label, what, error)| {
             let what = format!("sum of {FOUND_AT} active cells of {of}, {what}");
-            let found = Finding::less_is_better(what, (paper::SUMMED_NM, "Nm"), (error(at), "Nm"));
+            let found = Finding::less_is_better(what, paper::SUMMED_NM, (error(at), "Nm"));
             if label == "rounded" { found.at_most(0.005) } else { found }
         })
     });

@@ -3,7 +3,7 @@
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};
 use analysis::fit::verdict::{Answer, percent};
-use analysis::fit::{BusFit, Judged, Row, Whole, name};
+use analysis::fit::{BusFit, Judged, Row, Spread, Whole, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 
@@ -75,9 +75,9 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
         rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
         rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
-        for (buses, judged) in &whole.spread {
-            let on = format!("{} of {} cells", count(*buses, "bus"), judged.case.answers.cells());
-            rows.row(on, figures(judged), judged.verdict());
+        for Spread { buses, fullest } in &whole.spread {
+            let on = format!("{} of {} cells", count(*buses, "bus"), fullest.case.answers.cells());
+            rows.row(on, figures(fullest), fullest.verdict());
         }
     }
     rows.text()

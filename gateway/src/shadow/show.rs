@@ -85,7 +85,11 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
 
 fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
-    let missing = if bus.missing > 0 { format!("{} more are missing", bus.missing) } else { String::new() };
+    let missing = if bus.counts.missing > 0 {
+        format!("{} more are missing", bus.counts.missing)
+    } else {
+        String::new()
+    };
     rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
     fit(rows, bus);
     if bus.this_run.is_some() {
@@ -96,15 +100,15 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     }
     if bit_error_rate > 0.0 {
         let each = format!("of each bit {bit_error_rate:e}");
-        rows.row("damaged, and sent again", format!("{} attempts", bus.damaged), each);
+        rows.row("damaged, and sent again", format!("{} attempts", bus.counts.damaged), each);
     }
     bench(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    rows.any("left out: error frames", bus.error_frames, "words of a driver, never on a wire");
-    rows.any("out of order, and sorted", bus.out_of_order, of_all(bus.out_of_order));
-    rows.any("  too far for that", bus.too_late_to_sort, "they count at a later time");
-    rows.any("never sent", bus.no_room, "4 million frames waited already");
+    rows.any("left out: error frames", bus.counts.error_frames, "words of a driver, never on a wire");
+    rows.any("out of order, and sorted", bus.counts.out_of_order, of_all(bus.counts.out_of_order));
+    rows.any("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
+    rows.any("never sent", bus.counts.no_room, "4 million frames waited already");
 }
 
 /// Whether it fits, at most and in this run.
@@ -162,14 +166,14 @@ fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
 }
 
 fn bench(rows: &mut Rows, bus: &BusShadow) {
-    let BenchFrames { stimuli, syncs, reports, wires } = bus.bench;
-    if bus.bench.total() == 0 {
+    let BenchFrames { stimuli, syncs, reports, wires } = bus.counts.bench;
+    if bus.counts.bench.total() == 0 {
         return;
     }
-    let name = if bus.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
+    let name = if bus.counts.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
-    rows.row(name, format!("{} frames", bus.bench.total()), list(parts));
+    rows.row(name, format!("{} frames", bus.counts.bench.total()), list(parts));
 }
 
 fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {

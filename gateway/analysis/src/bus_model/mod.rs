@@ -32,7 +32,7 @@ pub use priority::Priority;
 
 /// A frame that somebody wants to send.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Request {
+pub struct Request<T = u64> {
     /// From when on, in ns.
     pub at: u64,
     /// What arbitration goes by.
@@ -43,14 +43,14 @@ pub struct Request {
     /// small numbers. Without one it takes part in every arbitration, as from a controller with room for each identifier.
     pub queue: Option<u16>,
     /// Whatever the caller knows it by.
-    pub tag: u64,
+    pub tag: T,
 }
 
 /// A frame that was on the wire.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Attempt {
+pub struct Attempt<T = u64> {
     /// The request's tag.
-    pub tag: u64,
+    pub tag: T,
     /// When it was asked for, in ns; at the earliest the time of the request before it.
     pub at: u64,
     /// Its first bit, in ns.
@@ -61,9 +61,9 @@ pub struct Attempt {
     pub is_damaged: bool,
 }
 
-/// A bus.
+/// A bus, whose frames the caller knows by a `T` each.
 #[derive(Debug)]
-pub struct BusModel {
+pub struct BusModel<T = u64> {
     rates: BitRates,
     errors: Option<BitErrors>,
     /// The time of the newest request.
@@ -72,10 +72,10 @@ pub struct BusModel {
     free_at: u64,
     /// When the oldest of what waits was asked for, if nothing waited before.
     ready_at: u64,
-    on_wire: Option<(Waiting, Attempt)>,
-    contenders: BinaryHeap<Waiting>,
-    queues: Vec<Queue>,
-    ended: VecDeque<Attempt>,
+    on_wire: Option<(Waiting<T>, Attempt<T>)>,
+    contenders: BinaryHeap<Waiting<T>>,
+    queues: Vec<Queue<T>>,
+    ended: VecDeque<Attempt<T>>,
     requests: u64,
     waiting: usize,
     most_waiting: usize,
@@ -83,42 +83,42 @@ pub struct BusModel {
 
 /// One that waits.
 #[derive(Clone, Copy, Debug)]
-struct Waiting {
-    request: Request,
+struct Waiting<T> {
+    request: Request<T>,
     /// Which request it was: of one identifier the older one goes first.
     number: u64,
 }
 
 /// A transmit queue.
-#[derive(Debug, Default)]
-struct Queue {
+#[derive(Debug)]
+struct Queue<T> {
     /// Whether a frame of its own takes part, or is on the wire.
     is_heard: bool,
-    behind: VecDeque<Waiting>,
+    behind: VecDeque<Waiting<T>>,
 }
 
-impl Ord for Waiting {
+impl<T> Ord for Waiting<T> {
     /// The greatest is the first one out of a heap: the one that wins.
     fn cmp(&self, other: &Self) -> Ordering {
         (other.request.priority, other.number).cmp(&(self.request.priority, self.number))
     }
 }
 
-impl PartialOrd for Waiting {
+impl<T> PartialOrd for Waiting<T> {
     fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl PartialEq for Waiting {
+impl<T> PartialEq for Waiting<T> {
     fn eq(&self, other: &Self) -> bool {
         self.cmp(other) == Ordering::Equal
     }
 }
 
-impl Eq for Waiting {}
+impl<T> Eq for Waiting<T> {}
 
-impl BusModel {
+impl<T: Copy> BusModel<T> {
     /// An idle bus without errors.
     #[must_use]
     pub const fn new(rates: BitRates) -> Self {
@@ -154,7 +154,7 @@ impl BusModel {
     /// Somebody wants to send from a time on. A time before that of the newest request counts as that one's.
     ///
     /// Time passes up to then: attempts that ended are there to be polled.
-    pub fn request(&mut self, mut request: Request) {
+    pub fn request(&mut self, mut request: Request<T>) {
         request.at = request.at.max(self.newest);
         self.run_until(request.at);
         let waiting = Waiting { request, number: self.requests };
@@ -208,7 +208,7 @@ impl BusModel {
     }
 
     /// The next attempt that ended, in order of time.
-    pub fn poll(&mut self) -> Option<Attempt> {
+    pub fn poll(&mut self) -> Option<Attempt<T>> {
         self.ended.pop_front()
     }
 
@@ -234,10 +234,11 @@ impl BusModel {
         self.most_waiting
     }
 
-    fn queue(&mut self, number: u16) -> &mut Queue {
+    fn queue(&mut self, number: u16) -> &mut Queue<T> {
         let index = usize::from(number);
         if self.queues.len() <= index {
-            self.queues.resize_with(index + 1, Queue::default);
+            let empty = || Queue { is_heard: false, behind: VecDeque::new() };
+            self.queues.resize_with(index + 1, empty);
         }
         self.queues.get_mut(index).expect("there are as many now")
     }
@@ -250,7 +251,7 @@ impl BusModel {
         self.contenders.extend(next);
     }
 
-    fn attempt(&mut self, request: &Request, start: u64) -> Attempt {
+    fn attempt(&mut self, request: &Request<T>, start: u64) -> Attempt<T> {
         let Request { tag, at, bits, .. } = *request;
         let spoilt = self.errors.as_mut().and_then(|errors| errors.spoils(bits));
         let took = spoilt.unwrap_or(bits).nanoseconds(self.rates);

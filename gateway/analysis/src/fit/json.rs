@@ -2,171 +2,74 @@
 
 use protocol::can::Format;
 use protocol::skin::Skin;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
+use serde_json::{Value, json};
 
-use super::case::{Answers, Load};
-use super::limits::{Limit, Most, Need};
-use super::remedy::Remedy;
-use super::verdict::Verdict;
+use super::case::Answers;
+use super::limits::Need;
 use super::{BusFit, Judged, Row, Whole, name};
-
-#[derive(Serialize)]
-struct Document<'a> {
-    skin: &'a str,
-    cells: usize,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    buses: Option<Vec<Bus<'a>>>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    whole: Option<Spread>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    table: Option<Vec<Bus<'a>>>,
-}
-
-#[derive(Serialize)]
-struct Bus<'a> {
-    bus: &'a str,
-    #[serde(flatten)]
-    judged: Figures,
-    most_cells: Most,
-    buses_needed: Needed,
-    other_answers: Vec<Change<'a>>,
-    changes: Vec<Change<'a>>,
-}
-
-#[derive(Serialize)]
-struct Figures {
-    name: String,
-    verdict: Verdict,
-    format: &'static str,
-    nominal: u32,
-    data: u32,
-    cells: u32,
-    answers: &'static str,
-    period_us: f64,
-    computation_us: f64,
-    packet_us: f64,
-    load: Shares,
-    joints_us: Option<f64>,
-    last_answer_us: Option<f64>,
-    by_chain_us: Option<f64>,
-    by_response_us: Option<f64>,
-    deadline_us: f64,
-    heartbeat_us: Option<f64>,
-    exceeded: Vec<Limit>,
-}
-
-#[derive(Serialize)]
-struct Shares {
-    joints: f64,
-    answers: f64,
-    sensors: f64,
-    heartbeats: f64,
-    total: f64,
-}
-
-#[derive(Serialize)]
-struct Change<'a> {
-    change: &'a str,
-    #[serde(flatten)]
-    after: Figures,
-}
-
-#[derive(Serialize)]
-struct Needed {
-    #[serde(flatten)]
-    by: Need,
-    buses: Option<u32>,
-    binding: Vec<Limit>,
-}
-
-#[derive(Serialize)]
-struct Spread {
-    cells: u32,
-    buses_needed: Needed,
-    spread: Vec<OnBuses>,
-}
-
-#[derive(Serialize)]
-struct OnBuses {
-    buses: u32,
-    fullest: Figures,
-}
 
 /// What was found of single buses with their whole, or of common rates; all times in µs, loads as shares of 1, and what
 /// has no bound as null.
 #[must_use]
-#[expect(clippy::missing_panics_doc, reason = "strings for keys and finite numbers are always JSON")]
-pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> serde_json::Value {
-    let some = |list: Vec<_>| (!list.is_empty()).then_some(list);
-    let document = Document {
-        skin: &skin.name,
-        cells: skin.cells.len(),
-        buses: some(buses.iter().map(|it| bus(it, it.need)).collect()),
-        whole: whole.map(spread),
-        table: some(table.iter().map(|it| bus(&it.fullest, it.need)).collect()),
+pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> Value {
+    let mut document = json!({ "skin": skin.name, "cells": skin.cells.len() });
+    let mut add = |key: &str, value: Option<Value>| {
+        value.into_iter().for_each(|value| document[key] = value);
     };
-    serde_json::to_value(document).expect("strings for keys and finite numbers")
+    add("buses", (!buses.is_empty()).then(|| json!(buses)));
+    add("whole", whole.map(|whole| json!(whole)));
+    // A row's buses are those for all cells of the skin.
+    let rows = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
+    add("table", (!table.is_empty()).then(|| rows.map(|row| json!(row)).collect()));
+    document
 }
 
-fn bus(fit: &BusFit, need: Need) -> Bus<'_> {
-    Bus {
-        bus: &fit.name,
-        judged: figures(&fit.judged),
-        most_cells: fit.most,
-        buses_needed: needed(need),
-        other_answers: fit.answers.iter().map(change).collect(),
-        changes: fit.remedies.iter().map(change).collect(),
-    }
+/// How many buses, and what asks for so many.
+pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok, S::Error> {
+    let Need { bandwidth, deadline, nodes } = need;
+    json!({
+        "bandwidth": bandwidth,
+        "deadline": deadline,
+        "nodes": nodes,
+        "buses": need.buses(),
+        "binding": need.binding(),
+    })
+    .serialize(serializer)
 }
 
-fn change(remedy: &Remedy) -> Change<'_> {
-    Change { change: &remedy.change, after: figures(&remedy.after) }
-}
-
-fn spread(whole: &Whole) -> Spread {
-    let spread =
-        whole.spread.iter().map(|(buses, fullest)| OnBuses { buses: *buses, fullest: figures(fullest) });
-    Spread { cells: whole.cells, buses_needed: needed(whole.need), spread: spread.collect() }
-}
-
-fn needed(by: Need) -> Needed {
-    Needed { by, buses: by.buses(), binding: by.binding() }
-}
-
-fn figures(judged: &Judged) -> Figures {
-    let Judged { case, load, times, exceeded } = judged;
-    Figures {
-        verdict: judged.verdict(),
-        name: name(case.format, case.rates),
-        format: match case.format {
-            Format::Fd => "fd",
-            Format::Classic => "classic",
-        },
-        nominal: case.rates.nominal(),
-        data: case.rates.data(),
-        cells: case.answers.cells(),
-        answers: match case.answers {
+impl Serialize for Judged {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self { case, load, times, exceeded } = self;
+        let answers = match case.answers {
             Answers::Torques { .. } => "torques",
             Answers::Sums { shared: true, .. } => "sums",
             Answers::Sums { shared: false, .. } => "sums of roots",
-        },
-        period_us: micros(case.period_ns),
-        computation_us: micros(case.computation_ns),
-        packet_us: micros(case.packet_ns()),
-        load: shares(load),
-        joints_us: times.joints_ns.map(micros),
-        last_answer_us: times.last_ns().map(micros),
-        by_chain_us: times.chain_ns.map(micros),
-        by_response_us: times.response_ns.map(|it| micros(it.worst_ns)),
-        deadline_us: micros(case.deadline_ns()),
-        heartbeat_us: times.heartbeat_ns.map(micros),
-        exceeded: exceeded.clone(),
+        };
+        let mut load_and_total = json!(load);
+        load_and_total["total"] = load.total().into();
+        json!({
+            "name": name(case.format, case.rates),
+            "verdict": self.verdict(),
+            "format": if case.format == Format::Fd { "fd" } else { "classic" },
+            "nominal": case.rates.nominal(),
+            "data": case.rates.data(),
+            "cells": case.answers.cells(),
+            "answers": answers,
+            "period_us": micros(case.period_ns),
+            "computation_us": micros(case.computation_ns),
+            "packet_us": micros(case.packet_ns()),
+            "load": load_and_total,
+            "joints_us": times.joints_ns.map(micros),
+            "last_answer_us": times.last_ns().map(micros),
+            "by_chain_us": times.chain_ns.map(micros),
+            "by_response_us": times.response_ns.map(|it| micros(it.worst_ns)),
+            "deadline_us": micros(case.deadline_ns()),
+            "heartbeat_us": times.heartbeat_ns.map(micros),
+            "exceeded": exceeded,
+        })
+        .serialize(serializer)
     }
-}
-
-fn shares(load: &Load) -> Shares {
-    let Load { joints, answers, sensors, heartbeats } = *load;
-    Shares { joints, answers, sensors, heartbeats, total: load.total() }
 }
 
 /// Nanoseconds in µs.

@@ -34,16 +34,36 @@ impl Limit {
     }
 }
 
-/// The most cells that each limit lets onto one bus.
+/// Something for each limit.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-pub struct Most {
-    /// With heartbeats and everything, at most 100 % load.
-    pub bandwidth: u32,
-    /// So that the last answer is there in time.
-    pub deadline: u32,
-    /// Electrically, [`NODES`] less the gateway.
-    pub nodes: u32,
+pub struct ByLimit<T> {
+    /// For bandwidth: with heartbeats and everything, at most 100 % load.
+    pub bandwidth: T,
+    /// For the deadline: so that the last answer is there in time.
+    pub deadline: T,
+    /// For the number of nodes, electrically.
+    pub nodes: T,
 }
+
+impl<T> ByLimit<T> {
+    /// The limits of which something holds, in this order.
+    fn which(self, holds: impl Fn(T) -> bool) -> Vec<Limit> {
+        let Self { bandwidth, deadline, nodes } = self;
+        let all = [(Limit::Bandwidth, bandwidth), (Limit::Deadline, deadline), (Limit::Nodes, nodes)];
+        all.into_iter().filter_map(|(limit, it)| holds(it).then_some(limit)).collect()
+    }
+}
+
+impl ByLimit<bool> {
+    /// The limits that do not hold.
+    #[must_use]
+    pub fn broken(self) -> Vec<Limit> {
+        self.which(|holds| !holds)
+    }
+}
+
+/// The most cells that each limit lets onto one bus; of nodes [`NODES`] less the gateway.
+pub type Most = ByLimit<u32>;
 
 impl Most {
     /// Of a bus like this one.
@@ -61,12 +81,6 @@ impl Most {
     pub fn in_time(&self) -> u32 {
         self.bandwidth.min(self.deadline)
     }
-
-    /// The limit that is reached first, of bandwidth and deadline.
-    #[must_use]
-    pub const fn tighter(&self) -> Limit {
-        if self.deadline < self.bandwidth { Limit::Deadline } else { Limit::Bandwidth }
-    }
 }
 
 /// Whether all frames find their time.
@@ -77,12 +91,12 @@ fn has_room(case: &Case) -> bool {
 /// What is too much on a bus.
 #[must_use]
 pub fn exceeded(case: &Case) -> Vec<Limit> {
-    let checks = [
-        (Limit::Bandwidth, has_room(case)),
-        (Limit::Deadline, case.is_in_time()),
-        (Limit::Nodes, case.answers.cells() < NODES),
-    ];
-    checks.into_iter().filter(|(_, holds)| !holds).map(|(limit, _)| limit).collect()
+    let holds = ByLimit {
+        bandwidth: has_room(case),
+        deadline: case.is_in_time(),
+        nodes: case.answers.cells() < NODES,
+    };
+    holds.broken()
 }
 
 /// The greatest number that something holds for which holds for all lesser ones; 0 when it does not even for 1.
@@ -104,15 +118,7 @@ fn greatest(holds: impl Fn(u32) -> bool) -> u32 {
 }
 
 /// Buses that so many cells take, by each limit; `None` where not even one cell fits.
-#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-pub struct Need {
-    /// By bandwidth.
-    pub bandwidth: Option<u32>,
-    /// By the last answer.
-    pub deadline: Option<u32>,
-    /// Electrically.
-    pub nodes: Option<u32>,
-}
+pub type Need = ByLimit<Option<u32>>;
 
 impl Need {
     /// Of so many cells, spread evenly.
@@ -137,15 +143,10 @@ impl Need {
     /// The limits that ask for that many.
     #[must_use]
     pub fn binding(&self) -> Vec<Limit> {
-        let needs = [
-            (Limit::Bandwidth, self.bandwidth),
-            (Limit::Deadline, self.deadline),
-            (Limit::Nodes, self.nodes),
-        ];
         // None is more than any number.
         let key = |buses: Option<u32>| buses.unwrap_or(u32::MAX);
-        let most = needs.iter().map(|&(_, buses)| key(buses)).max();
-        needs.into_iter().filter(|&(_, buses)| Some(key(buses)) == most).map(|(limit, _)| limit).collect()
+        let most = [self.bandwidth, self.deadline, self.nodes].map(key).into_iter().max();
+        self.which(|buses| Some(key(buses)) == most)
     }
 
     /// How many buses, and what asks for so many, in few words: `3 nodes`. Bandwidth and deadline are both a matter of time.

@@ -23,6 +23,7 @@ pub mod verdict;
 use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::wire_time::BitRates;
+use serde::Serialize;
 
 pub use json::json;
 
@@ -94,19 +95,25 @@ impl Judged {
 }
 
 /// One bus of the skin.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusFit {
     /// Its name.
+    #[serde(rename = "bus")]
     pub name: String,
     /// As it is described.
+    #[serde(flatten)]
     pub judged: Judged,
     /// The most cells that it takes.
+    #[serde(rename = "most_cells")]
     pub most: Most,
     /// Buses that its cells take.
+    #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
     /// What its cells could answer with instead.
+    #[serde(rename = "other_answers")]
     pub answers: Vec<Remedy>,
     /// What else can be done when it is too much.
+    #[serde(rename = "changes")]
     pub remedies: Vec<Remedy>,
 }
 
@@ -145,14 +152,24 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Judged> 
 }
 
 /// All cells of a skin, evenly on several buses.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Whole {
     /// So many cells.
     pub cells: u32,
     /// Buses that they take.
+    #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
-    /// The fullest bus of so many.
-    pub spread: Vec<(u32, Judged)>,
+    /// The same on more and more buses.
+    pub spread: Vec<Spread>,
+}
+
+/// Cells on so many buses.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// How many.
+    pub buses: u32,
+    /// The fullest one.
+    pub fullest: Judged,
 }
 
 /// Spreads all cells of a skin over more and more buses that are like the fullest one of it.
@@ -165,7 +182,8 @@ pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
     let told = |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
     let spread = numbers
         .filter(told)
-        .map(|buses| (buses, Judged::of(&fullest.judged.case.with_cells(cells.div_ceil(buses)))));
+        .map(|buses| (buses, fullest.judged.case.with_cells(cells.div_ceil(buses))))
+        .map(|(buses, case)| Spread { buses, fullest: Judged::of(&case) });
     Whole { cells, need, spread: spread.collect() }
 }
 
@@ -202,5 +220,3 @@ pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
 
 #[cfg(test)]
 mod tests;
-#[cfg(test)]
-mod tests_simulated;

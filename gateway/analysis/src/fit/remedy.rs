@@ -3,6 +3,7 @@
 use protocol::can::Format;
 use protocol::parameters::Sensing;
 use protocol::skin::{Reply, Skin};
+use serde::Serialize;
 
 use super::case::{self, Answers, Case};
 use super::limits::{Limit, Most, Need, exceeded};
@@ -12,11 +13,12 @@ use super::{COMMON, Judged};
 const LONGEST_NS: u64 = 65_535_000;
 
 /// A change and the bus after it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Remedy {
     /// What to change.
     pub change: String,
     /// What comes of it; of several buses, of the fullest.
+    #[serde(flatten)]
     pub after: Judged,
 }
 
@@ -58,25 +60,17 @@ fn more_buses(case: &Case) -> Vec<Remedy> {
 /// The slowest common rates at which it is in time: of the same format, and CAN FD in the place of classic CAN.
 fn faster(case: &Case) -> Vec<Remedy> {
     let at = |format: Format| {
-        let mut slowest: Option<Case> = None;
-        for rates in COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates()) {
-            let other = Case { format, rates, ..case.clone() };
-            let quicker = slowest.as_ref().is_none_or(|it| it.frame_ns() < other.frame_ns());
-            if is_in_time(&other) && quicker {
-                slowest = Some(other);
-            }
-        }
-        slowest
+        let rates = COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
+        let others = rates.map(|rates| Case { format, rates, ..case.clone() }).filter(is_in_time);
+        // Of equally slow ones the first.
+        others.reduce(|slowest, other| if slowest.frame_ns() < other.frame_ns() { other } else { slowest })
     };
-    let formats: &[Format] = match case.format {
-        Format::Fd => &[Format::Fd],
-        Format::Classic => &[Format::Classic, Format::Fd],
+    let formats = match case.format {
+        Format::Fd => [Some(Format::Fd), None],
+        Format::Classic => [Some(Format::Classic), Some(Format::Fd)],
     };
-    formats
-        .iter()
-        .filter_map(|&format| at(format))
-        .map(|it| remedy(super::name(it.format, it.rates), &it))
-        .collect()
+    let cases = formats.into_iter().flatten().filter_map(at);
+    cases.map(|it| remedy(super::name(it.format, it.rates), &it)).collect()
 }
 
 fn is_in_time(case: &Case) -> bool {

@@ -1,5 +1,7 @@
 //! What is said of skins, against what is known of them, and every remedy against the skin that it makes.
 
+mod simulated;
+
 use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::wire_time::BitRates;

@@ -105,13 +105,10 @@ pub struct Traffic {
     owed: Vec<Owed>,
 }
 
-/// What a cell still answers to sync and report.
-#[derive(Clone, Copy, Debug, Default)]
-struct Owed {
-    heartbeat: bool,
-    /// Pages of the report: sensors 0, sensors 1, tree.
-    pages: [bool; 3],
-}
+/// What a cell still answers to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
+type Owed = [bool; 4];
+/// The place of the tree.
+const TREE: usize = 3;
 
 impl Traffic {
     /// Whether most of what could be packets of this project's protocol were; chance makes one frame in 65 536 a packet.
@@ -170,36 +167,32 @@ impl Traffic {
             Message::Configure { .. } | Message::Configured { .. } => says(Says::Preparation),
             Message::Stimulus { .. } => bench(Bench::Stimulus),
             Message::Sync => {
-                self.all_owe(|owed| owed.heartbeat = true);
+                self.cells().iter_mut().for_each(|[heartbeat, ..]| *heartbeat = true);
                 bench(Bench::Sync)
             }
             Message::Report => Sorted { says: Says::Preparation, ..bench(Bench::Report) },
-            Message::Sensors { from, page, .. } => {
-                let page = match page {
-                    SensorPage::Skin(_) => 0,
-                    SensorPage::Acceleration(_) => 1,
-                };
-                self.page(*from, page)
-            }
+            Message::Sensors { from, page: SensorPage::Skin(_), .. } => self.page(*from, 1),
+            Message::Sensors { from, page: SensorPage::Acceleration(_), .. } => self.page(*from, 2),
             Message::Network { from, page, .. } => {
                 let Node::Cell(from) = from else { return Sorted::OTHER };
                 match page {
                     NetworkPage::Heartbeat(heartbeat) if heartbeat.state.has(State::CLAIMING) => {
                         // It leaves sync and report unanswered.
-                        self.owed(*from).map(std::mem::take);
+                        self.take(*from);
                         says(Says::Preparation)
                     }
                     NetworkPage::Heartbeat(_) => {
-                        let owed = self.owed(*from).map(std::mem::take).unwrap_or_default();
-                        if owed.heartbeat { bench(Bench::Sync) } else { Sorted::OTHER }
+                        let [heartbeat, ..] = self.take(*from);
+                        if heartbeat { bench(Bench::Sync) } else { Sorted::OTHER }
                     }
                     // Nothing but a report makes a cell send these; the others of it follow.
                     NetworkPage::Heard(_) | NetworkPage::Refused(_) => {
-                        self.owed(*from).into_iter().for_each(|owed| owed.pages = [true; 3]);
+                        let owed = self.cells().get_mut(from.index());
+                        owed.into_iter().for_each(|[_, pages @ ..]| *pages = [true; 3]);
                         bench(Bench::Report)
                     }
                     NetworkPage::Ports(_) => bench(Bench::Report),
-                    NetworkPage::Tree(_) => self.page(*from, 2),
+                    NetworkPage::Tree(_) => self.page(*from, TREE),
                 }
             }
         }
@@ -207,18 +200,19 @@ impl Traffic {
 
     /// A page that a cell says on a report, and at other times too.
     fn page(&mut self, from: CellId, page: usize) -> Sorted {
-        let owed = self.owed(from).and_then(|owed| owed.pages.get_mut(page)).map(std::mem::take);
-        Sorted { bench: owed.unwrap_or(false).then_some(Bench::Report), ..Sorted::OTHER }
+        let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
+        let owed = owed.map(std::mem::take).unwrap_or(false);
+        Sorted { bench: owed.then_some(Bench::Report), ..Sorted::OTHER }
     }
 
-    fn owed(&mut self, cell: CellId) -> Option<&mut Owed> {
-        self.owed.resize(CellId::COUNT, Owed::default());
-        self.owed.get_mut(cell.index())
+    /// What a cell owed; now it owes nothing.
+    fn take(&mut self, from: CellId) -> Owed {
+        self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
 
-    fn all_owe(&mut self, what: impl FnMut(&mut Owed)) {
+    fn cells(&mut self) -> &mut [Owed] {
         self.owed.resize(CellId::COUNT, Owed::default());
-        self.owed.iter_mut().for_each(what);
+        &mut self.owed
     }
 }
 

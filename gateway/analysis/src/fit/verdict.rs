@@ -5,7 +5,7 @@ use std::fmt::{self, Display, Formatter};
 use serde::{Serialize, Serializer};
 
 use super::Judged;
-use super::limits::{Limit, NODES};
+use super::limits::{ByLimit, Limit, NODES};
 
 /// Whether something fits on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -21,17 +21,14 @@ pub enum Verdict {
 }
 
 impl Verdict {
-    /// Of what is too much on a bus of so many cells.
+    /// Of what is too much on a bus of so many cells, as [`ByLimit::broken`] says it.
     #[must_use]
     pub fn of(exceeded: &[Limit], cells: u32) -> Self {
-        if exceeded.contains(&Limit::Bandwidth) {
-            Self::Bandwidth
-        } else if exceeded.contains(&Limit::Deadline) {
-            Self::Deadline
-        } else if exceeded.contains(&Limit::Nodes) {
-            Self::Nodes(cells.saturating_add(1))
-        } else {
-            Self::Fits
+        match exceeded.first() {
+            Some(Limit::Bandwidth) => Self::Bandwidth,
+            Some(Limit::Deadline) => Self::Deadline,
+            Some(Limit::Nodes) => Self::Nodes(cells.saturating_add(1)),
+            None => Self::Fits,
         }
     }
 
@@ -148,14 +145,8 @@ impl Answer {
     #[must_use]
     pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
         let on_the_bus = cells.on_the_bus();
-        let limits = [
-            (Limit::Bandwidth, load <= 1.0),
-            (Limit::Deadline, late == 0),
-            (Limit::Nodes, on_the_bus < NODES),
-        ];
-        let exceeded: Vec<_> =
-            limits.into_iter().filter(|(_, holds)| !holds).map(|(limit, _)| limit).collect();
-        Self { load, rates, cells, verdict: Verdict::of(&exceeded, on_the_bus) }
+        let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < NODES };
+        Self { load, rates, cells, verdict: Verdict::of(&holds.broken(), on_the_bus) }
     }
 
     /// Which case it is.

@@ -9,6 +9,7 @@
 //! [`figure`] is what is said, [`svg`] draws it, [`page`] sets it; all three are pure.
 
 pub mod figure;
+mod finding;
 pub mod page;
 pub mod run;
 mod scale;

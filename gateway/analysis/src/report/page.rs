@@ -190,7 +190,7 @@ mod tests {
                 figure(&format!("{name}-half"), Size::Half),
             ],
             findings: vec![
-                Finding::less_is_better("error", nm(0.0054), nm(6.3e-5)),
+                Finding::less_is_better("error", 0.0054, nm(6.3e-5)),
                 Finding::told("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false),
             ],
             tables: vec![Table {

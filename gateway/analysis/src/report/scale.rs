@@ -25,12 +25,9 @@ impl Span {
             });
             wider(ends, scale, room)
         });
-        if usable(&from) && usable(&to) && from < to {
-            Self { from, to, scale }
-        } else {
-            let (from, to) = wider((from, to), scale, room);
-            Self { from, to, scale }
-        }
+        let is_fit = usable(&from) && usable(&to) && from < to;
+        let (from, to) = if is_fit { (from, to) } else { wider((from, to), scale, room) };
+        Self { from, to, scale }
     }
 
     /// Where a value stands: 0 at the axis' beginning, 1 at its end; not a number where it cannot stand.
@@ -125,11 +122,8 @@ fn step(from: f64, to: f64, most: usize) -> f64 {
     let most = u32::try_from(most.max(1)).unwrap_or(u32::MAX);
     let least = (to - from) / f64::from(most);
     let power = 10_f64.powf(least.log10().floor());
-    [1.0, 2.0, 5.0]
-        .map(|times| times * power)
-        .into_iter()
-        .find(|step| *step >= 0.999_999 * least)
-        .unwrap_or(10.0 * power)
+    let mut steps = [1.0, 2.0, 5.0].into_iter().map(|times| times * power);
+    steps.find(|step| *step >= 0.999_999 * least).unwrap_or(10.0 * power)
 }
 
 fn linear_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
@@ -179,21 +173,13 @@ fn power(tick: f64) -> String {
     if digits == "1" { format!("10{exponent}") } else { format!("{digits}·10{exponent}") }
 }
 
-const fn raised(digit: char) -> char {
-    match digit {
-        '0' => '⁰',
-        '1' => '¹',
-        '2' => '²',
-        '3' => '³',
-        '4' => '⁴',
-        '5' => '⁵',
-        '6' => '⁶',
-        '7' => '⁷',
-        '8' => '⁸',
-        '9' => '⁹',
-        '-' => '⁻',
-        other => other,
-    }
+fn raised(digit: char) -> char {
+    let place = digit.to_digit(10).and_then(|digit| usize::try_from(digit).ok());
+    place.and_then(|place| "⁰¹²³⁴⁵⁶⁷⁸⁹".chars().nth(place)).unwrap_or(if digit == '-' {
+        '⁻'
+    } else {
+        digit
+    })
 }
 
 #[cfg(test)]

@@ -29,33 +29,28 @@ const DASHED: u32 = 14;
 const DOTTED: u32 = 9;
 const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
 
-const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
-const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
-const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
-/// On paper: Okabe and Ito's, that can be told apart by everybody, without the yellow that nobody sees on white.
-const SERIES: [RGBColor; Figure::COLOURS] = [
-    RGBColor(0x00, 0x72, 0xB2),
-    RGBColor(0xD5, 0x5E, 0x00),
-    RGBColor(0x00, 0x9E, 0x73),
-    RGBColor(0xCC, 0x79, 0xA7),
-    RGBColor(0xE6, 0x9F, 0x00),
-    RGBColor(0x56, 0xB4, 0xE9),
-    RGBColor(0x33, 0x33, 0x33),
-];
-
-/// Colour, class, and the colour on a dark screen.
-const CLASSES: [(RGBColor, &str, &str); 10] = [
+/// Colour, class, and the colour on a dark screen: of words, of what is faint, of the grid, and of series. On paper those
+/// are Okabe and Ito's, that can be told apart by everybody, without the yellow that nobody sees on white.
+const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOURS] = [
     (INK, "ink", "#E4E4E4"),
     (FAINT, "faint", "#A6A6A6"),
     (GRID, "grid", "#3A3D42"),
-    (SERIES[0], "c0", "#5AB4F0"),
-    (SERIES[1], "c1", "#FF8A3D"),
-    (SERIES[2], "c2", "#35C79A"),
-    (SERIES[3], "c3", "#E59AC8"),
-    (SERIES[4], "c4", "#F5C04A"),
-    (SERIES[5], "c5", "#A8DCFF"),
-    (SERIES[6], "c6", "#DDDDDD"),
+    (RGBColor(0x00, 0x72, 0xB2), "c0", "#5AB4F0"),
+    (RGBColor(0xD5, 0x5E, 0x00), "c1", "#FF8A3D"),
+    (RGBColor(0x00, 0x9E, 0x73), "c2", "#35C79A"),
+    (RGBColor(0xCC, 0x79, 0xA7), "c3", "#E59AC8"),
+    (RGBColor(0xE6, 0x9F, 0x00), "c4", "#F5C04A"),
+    (RGBColor(0x56, 0xB4, 0xE9), "c5", "#A8DCFF"),
+    (RGBColor(0x33, 0x33, 0x33), "c6", "#DDDDDD"),
 ];
+const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
+const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
+const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
+
+/// The colours of series, which begin again behind the last.
+fn colours() -> impl Iterator<Item = RGBColor> {
+    CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
+}
 
 /// The rules that give a drawing its colours on a dark screen.
 #[must_use]
@@ -192,15 +187,15 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
         .draw()?;
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
     let grain = (columns / UNIT.unsigned_abs(), lines / UNIT.unsigned_abs());
-    for (series, colour) in figure.series.iter().zip(SERIES.iter().cycle()) {
-        series_of(&mut chart, series, *colour, (&x, &y), grain)?;
+    for (series, colour) in figure.series.iter().zip(colours()) {
+        series_of(&mut chart, series, colour, (&x, &y), grain)?;
     }
     for mark in &figure.marks {
         mark_of(&mut chart, mark, (&x, &y))?;
     }
     for (row, entries) in (0..).zip(&rows) {
-        for (at, entry) in entries {
-            entry_of(&above, &figure.series, *entry, (*at, row))?;
+        for (at, series, colour) in entries {
+            entry_of(&above, series, *colour, (*at, row))?;
         }
     }
     Ok(())
@@ -220,8 +215,8 @@ fn series_of(
     };
     match series.shape {
         Shape::Line | Shape::Dashed | Shape::Steps => {
-            for run in runs(placed) {
-                let run = thinned(&run, columns);
+            for run in runs(&placed.collect::<Vec<_>>()) {
+                let run = thinned(run, columns);
                 let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
                 for piece in clipped(&run) {
                     let points = back(piece);
@@ -230,9 +225,7 @@ fn series_of(
             }
         }
         Shape::Points => {
-            let inside =
-                |point: &(f64, f64)| (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1);
-            let mut points: Vec<_> = placed.filter(inside).collect();
+            let mut points: Vec<_> = placed.filter(is_inside).collect();
             // Dots that cover each other are one.
             let cell = |point: &(f64, f64)| {
                 ((point.0 * f64::from(columns)).floor(), (point.1 * f64::from(lines)).floor())
@@ -247,26 +240,28 @@ fn series_of(
             )?;
         }
         Shape::Band => {
-            let held = placed.filter(|point| point.0.is_finite() && point.1.is_finite());
-            let points = held.map(|point| (point.0.clamp(0.0, 1.0), point.1.clamp(0.0, 1.0))).collect();
+            let points = placed
+                .filter(is_finite)
+                .map(|point| (point.0.clamp(0.0, 1.0), point.1.clamp(0.0, 1.0)))
+                .collect();
             chart.draw_series([Polygon::new(back(points), colour.mix(0.25).filled())])?;
         }
     }
     Ok(())
 }
 
+/// Whether a point is in the picture, which is from 0 to 1 both ways.
+fn is_inside(point: &(f64, f64)) -> bool {
+    (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1)
+}
+
+fn is_finite(point: &(f64, f64)) -> bool {
+    point.0.is_finite() && point.1.is_finite()
+}
+
 /// The pieces of a line between its gaps.
-fn runs(points: impl Iterator<Item = (f64, f64)>) -> Vec<Vec<(f64, f64)>> {
-    let mut runs = vec![Vec::new()];
-    for point in points {
-        if !(point.0.is_finite() && point.1.is_finite()) {
-            runs.push(Vec::new());
-        } else if let Some(run) = runs.last_mut() {
-            run.push(point);
-        }
-    }
-    runs.retain(|run| !run.is_empty());
-    runs
+fn runs(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
+    points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
 }
 
 /// A line that holds each value until the next one.
@@ -281,13 +276,12 @@ pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     stairs
 }
 
-/// The pieces of a line inside of the picture, which is from 0 to 1 both ways.
+/// The pieces of a line inside of the picture.
 fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     if let [point] = points {
         // A point alone is a line of no length, and would not be seen.
-        let inside = (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1);
         let dash = vec![(point.0 - 0.001, point.1), (point.0 + 0.001, point.1)];
-        return if inside { vec![dash] } else { Vec::new() };
+        return if is_inside(point) { vec![dash] } else { Vec::new() };
     }
     let mut pieces: Vec<Vec<(f64, f64)>> = Vec::new();
     for pair in points.windows(2) {
@@ -339,29 +333,26 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     Ok(())
 }
 
-/// Rows of the legend: where each entry begins, and which series it is.
-fn legend(figure: &Figure, width: u32) -> Vec<Vec<(i32, usize)>> {
-    let named = figure.series.iter().enumerate().filter(|(_, series)| !series.label.is_empty());
-    let mut rows: Vec<Vec<(i32, usize)>> = Vec::new();
+/// Rows of the legend: where each entry begins, its series and its colour.
+fn legend(figure: &Figure, width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
+    let named = figure.series.iter().zip(colours()).filter(|(series, _)| !series.label.is_empty());
+    let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
-    for (which, series) in named {
+    for (series, colour) in named {
         let room = in_pixels(48.0 + 0.56 * LETTERS * series.label.chars().count() as f64);
         if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
             rows.push(Vec::new());
             at = in_pixels(12.0);
         }
         if let Some(row) = rows.last_mut() {
-            row.push((at, which));
+            row.push((at, series, colour));
         }
         at = at.saturating_add(room);
     }
     rows
 }
 
-fn entry_of(area: &Area<'_>, series: &[Series], which: usize, (at, row): (i32, i32)) -> Drawn {
-    let (Some(series), Some(colour)) = (series.get(which), SERIES.iter().cycle().nth(which)) else {
-        return Ok(());
-    };
+fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32, i32)) -> Drawn {
     let middle = in_pixels(15.0) + row * in_pixels(20.0);
     let end = at + in_pixels(22.0);
     let style: ShapeStyle = colour.stroke_width(pixels(2));

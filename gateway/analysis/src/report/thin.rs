@@ -47,27 +47,26 @@ pub struct Thinned {
     width: f64,
     /// Where the first column begins.
     from: Option<f64>,
-    columns: Vec<(u64, Column)>,
+    /// By place; whether the line has a gap before the column.
+    columns: Vec<(u64, bool, Column)>,
     /// Points that were pushed, gaps not among them.
     count: u64,
-    /// Where the line has a gap: before the column at this place in `columns`.
+    /// Whether a gap came after the last of them.
     gap: bool,
-    gaps: Vec<u64>,
+}
+
+impl Default for Thinned {
+    /// As many columns as a page has, of 2 ms at first.
+    fn default() -> Self {
+        Self::new(1_000, 0.002)
+    }
 }
 
 impl Thinned {
     /// Nothing yet: at most `most` columns (at least 2), each of which is at least `width` wide.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
-        Self {
-            most: most.max(2),
-            width,
-            from: None,
-            columns: Vec::new(),
-            count: 0,
-            gap: false,
-            gaps: Vec::new(),
-        }
+        Self { most: most.max(2), width, from: None, columns: Vec::new(), count: 0, gap: false }
     }
 
     /// How many points have come.
@@ -88,21 +87,14 @@ impl Thinned {
         }
         self.count += 1;
         let mut at = self.column(x - from);
-        while self.columns.len() >= self.most && self.columns.last().is_some_and(|(last, _)| *last != at)
-            || self.columns.first().is_some_and(|(first, _)| at - first >= 2 * self.most as u64)
+        while self.columns.len() >= self.most && self.columns.last().is_some_and(|(last, ..)| *last != at)
+            || self.columns.first().is_some_and(|(first, ..)| at - first >= 2 * self.most as u64)
         {
             self.merge();
             at = self.column(x - from);
         }
-        if std::mem::take(&mut self.gap) && self.gaps.last() != Some(&at) {
-            self.gaps.push(at);
-        }
-        let new = Column::new((x, y));
-        match self.columns.last_mut() {
-            // Points that come a little late belong to the newest column all the same.
-            Some((last, column)) if *last >= at => column.join(&new),
-            _ => self.columns.push((at, new)),
-        }
+        let (gap, new) = (std::mem::take(&mut self.gap), Column::new((x, y)));
+        join(&mut self.columns, (at, gap, new));
     }
 
     #[expect(
@@ -117,30 +109,31 @@ impl Thinned {
     /// Each two columns become one.
     fn merge(&mut self) {
         self.width *= 2.0;
-        let mut merged: Vec<(u64, Column)> = Vec::with_capacity(self.columns.len());
-        for (at, column) in &self.columns {
-            match merged.last_mut() {
-                Some((last, joined)) if *last == at / 2 => joined.join(column),
-                _ => merged.push((at / 2, *column)),
-            }
-        }
+        let mut merged = Vec::with_capacity(self.columns.len());
+        self.columns.iter().for_each(|&(at, gap, column)| join(&mut merged, (at / 2, gap, column)));
         self.columns = merged;
-        self.gaps = self.gaps.iter().map(|at| at / 2).collect();
-        self.gaps.dedup();
     }
 
     /// What is left: at most four points a column, by increasing x, and points that are not numbers where it has gaps.
     #[must_use]
     pub fn points(&self) -> Vec<(f64, f64)> {
-        let mut gaps = self.gaps.iter().peekable();
         let mut points = Vec::with_capacity(self.columns.len() * 4);
-        for (at, column) in &self.columns {
-            if gaps.next_if(|gap| *gap <= at).is_some() {
-                points.push((column.first.0, f64::NAN));
-            }
+        for (_, gap, column) in &self.columns {
+            points.extend(gap.then_some((column.first.0, f64::NAN)));
             points.extend(column.points());
         }
         points
+    }
+}
+
+/// Adds a column behind others, or to the last one: what comes a little late belongs to the newest all the same.
+fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
+    match columns.last_mut() {
+        Some((last, before, joined)) if *last >= at => {
+            *before |= gap;
+            joined.join(&column);
+        }
+        _ => columns.push((at, gap, column)),
     }
 }
 
@@ -153,16 +146,13 @@ pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
     let place = |x: f64| (x * f64::from(columns)).floor();
     points
         .chunk_by(|a, b| (place(a.0) - place(b.0)).abs() < 0.5)
-        .flat_map(|points| {
-            let mut all = points.iter().map(|point| Column::new(*point));
-            let column = all.next().map(|first| {
-                all.fold(first, |mut sum, next| {
-                    sum.join(&next);
-                    sum
-                })
-            });
-            column.into_iter().flat_map(|column| column.points())
+        .filter_map(|points| {
+            points.iter().map(|point| Column::new(*point)).reduce(|mut sum, next| {
+                sum.join(&next);
+                sum
+            })
         })
+        .flat_map(|column| column.points())
         .collect()
 }
 
@@ -173,6 +163,13 @@ pub struct Binned {
     width: f64,
     from: Option<f64>,
     bins: Vec<f64>,
+}
+
+impl Default for Binned {
+    /// 600 bins, of 0.1 s at first.
+    fn default() -> Self {
+        Self::new(600, 0.1)
+    }
 }
 
 impl Binned {

@@ -3,18 +3,17 @@
 use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
-use protocol::id::CellId;
 use protocol::packet::Epoch;
 use protocol::wire_time::{BitRates, Bits};
 
-use super::answering::Counter;
-use super::phase::{Delay, Each, Figures, Phase, Phases};
-use super::report::{BusShadow, Replies};
+use super::epochs::Epochs;
+use super::phase::{Each, Figures, Phase, Phases};
+use super::report::{BusShadow, Counts, Delays};
 use super::told::Told;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 use crate::fit;
-use crate::fit::traffic::{Bench, BenchFrames, Says, Sorted, Traffic};
+use crate::fit::traffic::{Says, Sorted, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 
 /// Frames that may wait on a bus: some minutes of a full one. Beyond them frames are refused, as by a full transmit queue.
@@ -22,7 +21,7 @@ pub const GREATEST_QUEUE: usize = 1 << 22;
 /// Identifiers of 11 bits.
 const IDS: usize = 0x800;
 
-/// What is known of a frame while it is in the model, in one word.
+/// What is known of a frame while it is in the model.
 #[derive(Clone, Copy, Debug)]
 struct Tag {
     /// Its place in the file.
@@ -34,29 +33,6 @@ struct Tag {
     answer: Option<(Epoch, bool)>,
 }
 
-impl Tag {
-    fn pack(self) -> u64 {
-        let (kind, epoch) = match self.answer {
-            None => (0, 0),
-            Some((epoch, is_late)) => (2 + u64::from(is_late), epoch.0),
-        };
-        let id = self.id.map_or(0, |id| u64::from(id) | 0x800);
-        let phase = self.phase as u64;
-        self.place << 23 | phase << 22 | id << 10 | u64::from(epoch) << 2 | kind
-    }
-
-    fn unpack(word: u64) -> Self {
-        let id = u16::try_from(word >> 10 & 0xFFF).unwrap_or(0);
-        let epoch = Epoch((word >> 2).to_le_bytes()[0]);
-        Self {
-            place: word >> 23,
-            id: (id & 0x800 != 0).then_some(id & 0x7FF),
-            phase: if word >> 22 & 1 == 0 { Phase::StartUp } else { Phase::Operation },
-            answer: (word & 2 != 0).then_some((epoch, word & 1 != 0)),
-        }
-    }
-}
-
 /// A frame that waits for those that may come before it.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
@@ -66,9 +42,7 @@ struct Pending {
     place: u64,
     /// None of one with 29 bits.
     id: Option<u16>,
-    says: Says,
-    bench: Option<Bench>,
-    from: Option<CellId>,
+    sorted: Sorted,
 }
 
 /// What a bus is known to be.
@@ -87,10 +61,9 @@ pub(super) struct Known {
 #[derive(Debug)]
 pub(super) struct Lane {
     pub(super) name: String,
-    pub(super) error_frames: u64,
-    pub(super) missing: u64,
+    pub(super) counts: Counts,
     known: Known,
-    model: BusModel,
+    model: BusModel<Tag>,
     pending: VecDeque<Pending>,
     frames: u64,
     /// The first and the last time in the capture.
@@ -99,22 +72,11 @@ pub(super) struct Lane {
     released: u64,
     /// When the wire was taken last.
     wire_end: u64,
-    out_of_order: u64,
-    too_late_to_sort: u64,
-    no_room: u64,
-    sent: u64,
-    damaged: u64,
     traffic: Traffic,
     has_fd: bool,
-    bench: BenchFrames,
     phases: Phases,
     figures: Each<Figures>,
-    answering: Counter,
-    /// The newest joints, and when the joints of each epoch were to go out.
-    newest: Option<Epoch>,
-    joints: Vec<u64>,
-    replies: Replies,
-    after_joints: Delay,
+    epochs: Epochs,
     queued: Vec<u32>,
 }
 
@@ -123,8 +85,7 @@ impl Lane {
         let model = BusModel::new(known.rates);
         Self {
             name: name.to_owned(),
-            error_frames: 0,
-            missing: 0,
+            counts: Counts { bench_left_out: !known.bench_traffic, ..Counts::default() },
             known,
             model: errors.into_iter().fold(model, BusModel::with_errors),
             pending: VecDeque::new(),
@@ -132,21 +93,11 @@ impl Lane {
             span: None,
             released: 0,
             wire_end: 0,
-            out_of_order: 0,
-            too_late_to_sort: 0,
-            no_room: 0,
-            sent: 0,
-            damaged: 0,
             traffic: Traffic::default(),
             has_fd: false,
-            bench: BenchFrames::default(),
             phases: Phases::default(),
-            figures: Each { start_up: Figures::new(), operation: Figures::new() },
-            answering: Counter::new(),
-            newest: None,
-            joints: vec![0; 256],
-            replies: Replies::default(),
-            after_joints: Delay::new(),
+            figures: Each::default(),
+            epochs: Epochs::default(),
             queued: vec![0; IDS],
         }
     }
@@ -155,8 +106,7 @@ impl Lane {
     pub(super) fn in_force(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
             Says::Joints(_) => self.phases.beginning.in_the_middle = true,
-            Says::Halt => self.answering.halt(true),
-            Says::Resume => self.answering.halt(false),
+            says @ (Says::Halt | Says::Resume) => _ = self.epochs.hear(nanos, says, None),
             Says::Answer(_) | Says::Preparation | Says::Other => {}
         }
     }
@@ -178,24 +128,23 @@ impl Lane {
         told: Option<&mut Told>,
     ) {
         let id = (!frame.is_extended()).then(|| u16::try_from(frame.id()).unwrap_or(0));
-        let Sorted { says, bench, from, ends_pair } = self.traffic.sort(nanos, frame);
+        let sorted = self.traffic.sort(nanos, frame);
         self.has_fd |= frame.format() == Format::Fd;
-        if let Some(bench) = bench.filter(|_| ends_pair) {
+        if sorted.bench.is_some() && sorted.ends_pair {
             // The last one before it under its identifier, which is near.
             let first = self.pending.iter_mut().rev().find(|it| it.id == id);
-            first.into_iter().for_each(|first| first.bench = Some(bench));
+            first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
-        self.phases.beginning.see(nanos, says);
-        let pending =
-            Pending { at: nanos, priority: Priority::of(frame), bits, place, id, says, bench, from };
+        self.phases.beginning.see(nanos, sorted.says);
+        let pending = Pending { at: nanos, priority: Priority::of(frame), bits, place, id, sorted };
         match self.pending.back() {
             Some(last) if last.at > nanos => {
-                self.out_of_order += 1;
+                self.counts.out_of_order += 1;
                 let index = self.pending.partition_point(|it| it.at <= nanos);
                 self.pending.insert(index, pending);
             }
             _ => {
-                self.out_of_order += u64::from(nanos < self.released);
+                self.counts.out_of_order += u64::from(nanos < self.released);
                 self.pending.push_back(pending);
             }
         }
@@ -221,26 +170,27 @@ impl Lane {
 
     /// The next frame in order of time wants to go out.
     fn enter(&mut self, pending: Pending, mut told: Option<&mut Told>) {
-        let Pending { at, priority, bits, place, id, says, bench, from } = pending;
+        let Pending { at, priority, bits, place, id, sorted } = pending;
+        let Sorted { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
-            self.bench.count(bench, 1);
+            self.counts.bench.count(bench, 1);
             if !self.known.bench_traffic {
                 told.into_iter().for_each(|told| told.left_out(place));
                 return;
             }
         }
-        self.too_late_to_sort += u64::from(at < self.released);
+        self.counts.too_late_to_sort += u64::from(at < self.released);
         let at = at.max(self.released);
         self.released = at;
         self.model.run_until(at);
         self.drain(told.as_deref_mut());
         let phase = self.phases.at(at, says, self.traffic.is_ours());
-        let answer = self.hear(at, says, from);
+        let answer = self.epochs.hear(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
         let figures = self.figures.of(phase);
         figures.ask(at, took);
         if self.model.waiting() >= GREATEST_QUEUE {
-            self.no_room += 1;
+            self.counts.no_room += 1;
             told.into_iter().for_each(|told| told.sent(place, None));
             return;
         }
@@ -249,73 +199,32 @@ impl Lane {
             *queued += 1;
             (*queued, id)
         });
-        let tag = Tag { place, id, phase, answer }.pack();
+        let tag = Tag { place, id, phase, answer };
         self.model.request(Request { at, priority, bits, queue: None, tag });
         figures.queue(at, self.model.waiting(), of_one);
-    }
-
-    /// What a frame says of joints and answers; the joints that it answers, and whether it is late.
-    fn hear(&mut self, at: u64, says: Says, from: Option<CellId>) -> Option<(Epoch, bool)> {
-        from.into_iter().for_each(|cell| self.answering.heard(cell));
-        match says {
-            Says::Joints(epoch) => {
-                self.answering.joints(epoch);
-                self.newest = Some(epoch);
-                self.joints.get_mut(usize::from(epoch.0)).into_iter().for_each(|of| *of = at);
-            }
-            Says::Answer(epoch) => {
-                from.into_iter().for_each(|cell| self.answering.answer(cell, epoch));
-                return Some((epoch, self.newest.is_some_and(|newest| newest != epoch)));
-            }
-            Says::Halt => self.answering.halt(true),
-            Says::Resume => self.answering.halt(false),
-            Says::Preparation | Says::Other => {}
-        }
-        None
     }
 
     /// Takes in what has ended on the wire.
     fn drain(&mut self, mut told: Option<&mut Told>) {
         while let Some(attempt) = self.model.poll() {
-            let Attempt { tag, at, start, end, is_damaged } = attempt;
+            let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
             self.figures.of(self.phases.now()).busy.take(start, end, SATURATED_NS);
             if is_damaged {
-                self.damaged += 1;
+                self.counts.damaged += 1;
                 continue;
             }
-            self.sent += 1;
-            let Tag { place, id, phase, answer } = Tag::unpack(tag);
+            self.counts.sent += 1;
             self.figures.of(phase).sent(id, end - at);
             let queued = id.and_then(|id| self.queued.get_mut(usize::from(id)));
             queued.into_iter().for_each(|queued| *queued -= 1);
             if let Some((epoch, was_late)) = answer {
-                self.answered(epoch, was_late, (at, end));
+                self.epochs.answered(epoch, was_late, (at, end));
             }
             if let Some(told) = &mut told {
                 told.sent(place, Some((start, end)));
             }
         }
-    }
-
-    /// An answer that was to be sent at a time has come to its end.
-    fn answered(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
-        let Some(newest) = self.newest else { return };
-        self.replies.count += 1;
-        if was_late {
-            self.replies.late_before += 1;
-            return;
-        }
-        let sent = |epoch: Epoch| self.joints.get(usize::from(epoch.0)).copied();
-        let joints = sent(epoch).unwrap_or(end);
-        if newest != epoch {
-            self.replies.late += 1;
-            let next = sent(epoch.next()).filter(|&next| next > joints).unwrap_or(end);
-            let period = next.saturating_sub(joints);
-            let is_slow = at.saturating_sub(joints) > period / 8 * 7;
-            self.replies.late_when_ready += u64::from(is_slow);
-        }
-        self.after_joints.record(end.saturating_sub(joints));
     }
 
     /// Format and rates, as the skin has them, else as the frames are.
@@ -337,10 +246,9 @@ impl Lane {
         let overrun = self.wire_end.saturating_sub(self.released);
         let load = operation.loads(span, overrun);
         let is_ours = self.traffic.is_ours();
-        let answering = self.answering.report(self.known.cells);
-        let replies = Replies { after_joints_us: self.after_joints.report(), ..self.replies };
-        let (queue, queue_of_one, queue_of_one_id) = operation.queues();
-        let this_run = (operation.frames() > 0).then(|| {
+        let answering = self.epochs.answering(self.known.cells);
+        let replies = self.epochs.replies();
+        let this_run = (operation.frames > 0).then(|| {
             let who = if is_ours { answering.cells() } else { Cells::Foreign };
             let late = replies.late - replies.late_when_ready;
             Answer::this_run(load.worst_1_s.value, late, self.named_rates(), who)
@@ -357,23 +265,15 @@ impl Lane {
             this_run,
             answering: is_ours.then_some(answering),
             start_up: start_up.start_up(self.phases.spans.start_up),
-            sent: self.sent,
-            bench: self.bench,
-            bench_left_out: !self.known.bench_traffic,
-            error_frames: self.error_frames,
-            missing: self.missing,
-            out_of_order: self.out_of_order,
-            too_late_to_sort: self.too_late_to_sort,
-            no_room: self.no_room,
-            damaged: self.damaged,
+            counts: self.counts,
             load,
             stretches: operation.busy.stretches(SATURATED_NS),
-            delay_us: operation.delays(),
+            delay_us: Delays::of(&operation.all),
             kinds: if is_ours { operation.kinds() } else { Vec::new() },
             replies: Some(replies).filter(|replies| is_ours && replies.count > 0),
-            queue,
-            queue_of_one,
-            queue_of_one_id,
+            queue: operation.queue,
+            queue_of_one: operation.queue_of_one,
+            queue_of_one_id: operation.queue_of_one_id.into(),
         }
     }
 }

@@ -7,25 +7,20 @@ use super::report::{Most, Stretches};
 /// Moments that are told apart within a span; more count at the last one's.
 const MOMENTS: usize = 1 << 16;
 
-/// The most that was asked for within a span of a length, wherever it begins.
-#[derive(Debug)]
-pub(super) struct Window {
-    span: u64,
+/// The most that was asked for within any `SPAN` ns, wherever they begin.
+#[derive(Debug, Default)]
+pub(super) struct Window<const SPAN: u64> {
     /// When, and how much.
     asked: VecDeque<(u64, u64)>,
     sum: u64,
-    most: u64,
-    most_at: u64,
+    /// As a share of the span, and when the span began.
+    pub(super) most: Most,
 }
 
-impl Window {
-    pub(super) const fn new(span: u64) -> Self {
-        Self { span, asked: VecDeque::new(), sum: 0, most: 0, most_at: 0 }
-    }
-
+impl<const SPAN: u64> Window<SPAN> {
     /// So many ns of the bus were asked for at a time, which never runs backwards.
     pub(super) fn ask(&mut self, at: u64, nanos: u64) {
-        while let Some(&(then, gone)) = self.asked.front().filter(|(then, _)| then + self.span <= at) {
+        while let Some(&(then, gone)) = self.asked.front().filter(|(then, _)| then + SPAN <= at) {
             self.asked.pop_front();
             self.sum -= gone;
             debug_assert!(then <= at, "time runs forwards");
@@ -36,15 +31,7 @@ impl Window {
             _ => self.asked.push_back((at, nanos)),
         }
         self.sum += nanos;
-        if self.sum > self.most {
-            self.most = self.sum;
-            self.most_at = self.asked.front().map_or(at, |(first, _)| *first);
-        }
-    }
-
-    /// The most as a share of the span, and when the span began.
-    pub(super) fn most(&self) -> (f64, u64) {
-        (self.most as f64 / self.span as f64, self.most_at)
+        self.most.raise(self.sum as f64 / SPAN as f64, self.asked.front().map_or(at, |(first, _)| *first));
     }
 }
 
@@ -75,10 +62,7 @@ impl Busy {
             self.stretches.count += 1;
             self.stretches.total_s += length as f64 / 1e9;
         }
-        let longest = length as f64 / 1e9;
-        if longest > self.stretches.longest_s.value {
-            self.stretches.longest_s = Most { value: longest, at_ns: self.begin };
-        }
+        self.stretches.longest_s.raise(length as f64 / 1e9, self.begin);
     }
 
     /// All stretches; those that count as saturated have at least this length in ns.
@@ -98,13 +82,13 @@ mod tests {
     proptest! {
         #[test]
         fn the_most_is_that_of_every_span_that_ends_with_a_request(steps in proptest::collection::vec((0..30_u64, 1..9_u64), 1..80)) {
-            let mut window = Window::new(50);
+            let mut window = Window::<50>::default();
             let mut now = 0;
             let asked: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
             asked.iter().for_each(|&(at, nanos)| window.ask(at, nanos));
             let within = |end: u64| -> u64 { asked.iter().filter(|(at, _)| *at <= end && at + 50 > end).map(|(_, n)| n).sum() };
             let most = asked.iter().map(|(at, _)| within(*at)).max().unwrap();
-            prop_assert!((window.most().0 - most as f64 / 50.0).abs() < 1e-12);
+            prop_assert!((window.most.value - most as f64 / 50.0).abs() < 1e-12);
         }
     }
 

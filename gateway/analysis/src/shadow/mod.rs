@@ -9,15 +9,13 @@
 //! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
 //! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`GREATEST_QUEUE`] frames wait on a bus.
 
-mod answering;
+mod epochs;
 mod lane;
 mod load;
 mod phase;
 mod report;
 #[cfg(test)]
 mod tests;
-#[cfg(test)]
-mod tests_run;
 mod told;
 
 use std::fmt::{self, Display, Formatter};
@@ -32,10 +30,10 @@ use crate::fit::verdict::Answer;
 use lane::{Known, Lane};
 use told::Told;
 
-pub use answering::Answering;
+pub use epochs::Answering;
 pub use lane::GREATEST_QUEUE;
 pub use phase::PAUSE_NS;
-pub use report::{BusShadow, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
+pub use report::{BusShadow, Counts, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
 pub use told::Shaded;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 
@@ -125,23 +123,21 @@ impl Shadow {
         let place = self.frames;
         self.frames += 1;
         let lane = self.lane(bus);
+        let bits = lane.and_then(|_| Bits::of(frame));
         if let Some(told) = &mut self.told {
-            let flag = frame.raw_id() & ERROR;
-            told.enter(lane, nanos, frame.id() | flag, frame.is_extended() || frame.is_error());
+            let (id, extended) =
+                (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
+            told.enter(Shaded { nanos, bus: lane, id, extended, bits, sent: None });
         }
         let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
             self.further += 1;
             return;
         };
         lane.count(nanos);
-        let Some(bits) = Bits::of(frame) else {
-            lane.error_frames += 1;
-            return;
-        };
-        if let Some(told) = &mut self.told {
-            told.bits(place, bits);
+        match bits {
+            Some(bits) => lane.take(nanos, frame, bits, place, self.told.as_mut()),
+            None => lane.counts.error_frames += 1,
         }
-        lane.take(nanos, frame, bits, place, self.told.as_mut());
     }
 
     /// A frame that was on a bus before the capture began, and still says what holds.
@@ -153,7 +149,7 @@ impl Shadow {
     /// Frames that whoever took the capture lost.
     pub fn missing(&mut self, bus: &str, frames: u64) {
         if let Some(lane) = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane)) {
-            lane.missing = lane.missing.saturating_add(frames);
+            lane.counts.missing = lane.counts.missing.saturating_add(frames);
         }
     }
 

@@ -1,6 +1,6 @@
 //! Start-up and operation, and the figures of each.
 
-use hdrhistogram::Histogram;
+use model::quantiles::Times;
 use protocol::id::{Id, Kind};
 
 use super::load::{Busy, Window};
@@ -114,75 +114,38 @@ impl Phases {
     }
 }
 
-/// How long something took.
-#[derive(Debug)]
-pub(super) struct Delay {
-    histogram: Histogram<u64>,
-    most: u64,
-}
-
-impl Delay {
-    pub(super) fn new() -> Self {
-        Self { histogram: Histogram::new(3).expect("three digits are possible"), most: 0 }
-    }
-
-    pub(super) fn record(&mut self, nanos: u64) {
-        self.histogram.record(nanos).expect("it grows as it has to");
-        self.most = self.most.max(nanos);
-    }
-
-    pub(super) fn report(&self) -> Delays {
-        Delays::of(&self.histogram, self.most)
-    }
-}
-
 /// The figures of one phase.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Figures {
-    frames: u64,
+    pub(super) frames: u64,
     asked: u64,
-    windows: [Window; 2],
+    in_16_ms: Window<SATURATED_NS>,
+    in_1_s: Window<SECOND_NS>,
     pub(super) busy: Busy,
-    all: Delay,
-    kinds: [Delay; 8],
-    /// How many, and when.
-    queue: (usize, u64),
-    /// How many, of which identifier, and when.
-    queue_of_one: (u32, u16, u64),
+    pub(super) all: Times,
+    kinds: [Times; 8],
+    /// The most frames that waited, of all identifiers and of one.
+    pub(super) queue: Most,
+    pub(super) queue_of_one: Most,
+    pub(super) queue_of_one_id: u16,
 }
 
 impl Figures {
-    pub(super) fn new() -> Self {
-        Self {
-            frames: 0,
-            asked: 0,
-            windows: [SATURATED_NS, SECOND_NS].map(Window::new),
-            busy: Busy::default(),
-            all: Delay::new(),
-            kinds: std::array::from_fn(|_| Delay::new()),
-            queue: (0, 0),
-            queue_of_one: (0, 0, 0),
-        }
-    }
-
     /// A frame wants so many ns of the bus.
     pub(super) fn ask(&mut self, at: u64, took: u64) {
         self.frames += 1;
         self.asked += took;
-        self.windows.iter_mut().for_each(|window| window.ask(at, took));
-    }
-
-    pub(super) const fn frames(&self) -> u64 {
-        self.frames
+        self.in_16_ms.ask(at, took);
+        self.in_1_s.ask(at, took);
     }
 
     /// So many frames wait, and of one identifier.
     pub(super) fn queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
-        if waiting > self.queue.0 {
-            self.queue = (waiting, at);
-        }
-        if let Some((queued, id)) = of_one.filter(|(queued, _)| *queued > self.queue_of_one.0) {
-            self.queue_of_one = (queued, id, at);
+        self.queue.raise(waiting as f64, at);
+        if let Some((queued, id)) = of_one.filter(|(queued, _)| f64::from(*queued) > self.queue_of_one.value)
+        {
+            self.queue_of_one.raise(f64::from(queued), at);
+            self.queue_of_one_id = id;
         }
     }
 
@@ -193,20 +156,15 @@ impl Figures {
         kind.into_iter().for_each(|kind| kind.record(nanos));
     }
 
-    pub(super) fn delays(&self) -> Delays {
-        self.all.report()
-    }
-
     pub(super) fn kinds(&self) -> Vec<KindDelays> {
-        let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram.is_empty());
-        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: delay.report() }).collect()
+        let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram().is_empty());
+        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::of(delay) }).collect()
     }
 
     /// The load of a phase that lasted so long, and went on for a while on the wire.
     pub(super) fn loads(&self, span: u64, overrun: u64) -> Loads {
         let share = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
-        let [worst_16_ms, worst_1_s] =
-            self.windows.each_ref().map(Window::most).map(|(value, at_ns)| Most { value, at_ns });
+        let worst_1_s = self.in_1_s.most;
         let worst_1_s = match span {
             // Of less than a second, all of it; but a few frames are no load of theirs alone.
             0..SECOND_NS => {
@@ -216,13 +174,7 @@ impl Figures {
             _ => worst_1_s,
         };
         let (mean, busy) = (share(self.asked, span), share(self.busy.total, span.saturating_add(overrun)));
-        Loads { mean, worst_16_ms, worst_1_s, busy }
-    }
-
-    pub(super) fn queues(&self) -> (Most, Most, u32) {
-        let most = |value: f64, at_ns| Most { value, at_ns };
-        let (of_one, id, at) = self.queue_of_one;
-        (most(self.queue.0 as f64, self.queue.1), most(f64::from(of_one), at), u32::from(id))
+        Loads { mean, worst_16_ms: self.in_16_ms.most, worst_1_s, busy }
     }
 
     /// All of a start-up that lasted so long; none when nothing was sent in it.
@@ -232,7 +184,7 @@ impl Figures {
             duration_s: span as f64 / 1e9,
             load: self.loads(span, 0),
             stretches: self.busy.stretches(SATURATED_NS),
-            delay_us: self.delays(),
+            delay_us: Delays::of(&self.all),
         })
     }
 }

@@ -1,10 +1,10 @@
 //! What a shadow adds up to.
 
-use hdrhistogram::Histogram;
+use model::quantiles::Times;
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
-use super::answering::Answering;
+use super::epochs::Answering;
 use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::Answer;
 
@@ -47,6 +47,30 @@ pub struct BusShadow {
     pub answering: Option<Answering>,
     /// What was sent before the first joints, and when there were none for a second.
     pub start_up: Option<StartUp>,
+    /// What became of the frames.
+    #[serde(flatten)]
+    pub counts: Counts,
+    /// What was asked of the bus.
+    pub load: Loads,
+    /// Times without a pause.
+    pub stretches: Stretches,
+    /// From wanting to send to the end of the intermission, in µs: all frames.
+    pub delay_us: Delays,
+    /// The same by kind; empty where the bus does not speak this project's protocol.
+    pub kinds: Vec<KindDelays>,
+    /// Answers to joints, where the bus speaks this project's protocol.
+    pub replies: Option<Replies>,
+    /// The most frames that waited at the same time.
+    pub queue: Most,
+    /// The most frames of one identifier of 11 bits that waited at the same time.
+    pub queue_of_one: Most,
+    /// That identifier.
+    pub queue_of_one_id: u32,
+}
+
+/// What became of a bus' frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Counts {
     /// Frames that went through the model.
     pub sent: u64,
     /// Frames that only a bench sends.
@@ -65,22 +89,6 @@ pub struct BusShadow {
     pub no_room: u64,
     /// Attempts that were damaged.
     pub damaged: u64,
-    /// What was asked of the bus.
-    pub load: Loads,
-    /// Times without a pause.
-    pub stretches: Stretches,
-    /// From wanting to send to the end of the intermission, in µs: all frames.
-    pub delay_us: Delays,
-    /// The same by kind; empty where the bus does not speak this project's protocol.
-    pub kinds: Vec<KindDelays>,
-    /// Answers to joints, where the bus speaks this project's protocol.
-    pub replies: Option<Replies>,
-    /// The most frames that waited at the same time.
-    pub queue: Most,
-    /// The most frames of one identifier of 11 bits that waited at the same time.
-    pub queue_of_one: Most,
-    /// That identifier.
-    pub queue_of_one_id: u32,
 }
 
 /// Start-up: cells claim numbers, are configured and organise themselves.
@@ -118,6 +126,15 @@ pub struct Most {
     pub value: f64,
     /// When that was or began, in ns of the capture's clock.
     pub at_ns: u64,
+}
+
+impl Most {
+    /// Takes a value of a time if it is greater than any before it.
+    pub(super) fn raise(&mut self, value: f64, at_ns: u64) {
+        if value > self.value {
+            *self = Self { value, at_ns };
+        }
+    }
 }
 
 /// Times in which the bus had no pause.
@@ -169,8 +186,8 @@ pub struct Replies {
 }
 
 impl Delays {
-    /// From a histogram of ns, and the exact greatest of them.
-    pub(super) fn of(histogram: &Histogram<u64>, most: u64) -> Self {
+    pub(super) fn of(times: &Times) -> Self {
+        let (histogram, most) = (times.histogram(), times.longest());
         let micros = |nanos: u64| nanos as f64 / 1e3;
         let quantile = |share| micros(histogram.value_at_quantile(share).min(most));
         Self { count: histogram.len(), p50: quantile(0.5), p99: quantile(0.99), max: micros(most) }

@@ -1,5 +1,7 @@
 //! The shadow of traffic whose times can be worked out by hand.
 
+mod run;
+
 use super::*;
 use protocol::can::{BIT_RATE_SWITCH, ERROR, EXTENDED, FD_FORMAT, Format};
 use protocol::fixed::{Q1_14, Q3_12};
@@ -63,7 +65,7 @@ fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
     );
     assert_eq!(frames[1].bits, Bits::of(&slow));
     let [can0, can1] = report.buses.as_slice() else { panic!("{report:?}") };
-    assert_eq!((can0.sent, can1.sent, report.frames), (3, 1, 4));
+    assert_eq!((can0.counts.sent, can1.counts.sent, report.frames), (3, 1, 4));
     assert_eq!((can0.queue.value, can0.queue_of_one.value, can0.queue_of_one_id), (3.0, 2.0, 0x700));
     assert!((can0.delay_us.max - (2 * a + b - 5) as f64 / 1e3).abs() < 1e-9);
     // In three digits.
@@ -89,7 +91,7 @@ fn a_recording_out_of_order_is_sorted_and_told_in_the_files_order() {
     times.into_iter().for_each(|time| shadow.frame("can0", time, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     assert_eq!(frames.iter().map(|frame| frame.sent.unwrap().0).collect::<Vec<_>>(), times);
-    assert_eq!((report.buses[0].out_of_order, report.buses[0].too_late_to_sort), (3, 0));
+    assert_eq!((report.buses[0].counts.out_of_order, report.buses[0].counts.too_late_to_sort), (3, 0));
     assert!((report.buses[0].duration_s - 0.011).abs() < 1e-12);
 }
 
@@ -101,12 +103,12 @@ fn what_is_too_far_out_of_order_counts_at_a_later_time() {
     let starts: Vec<_> = frames.iter().map(|frame| frame.sent.unwrap().0 / MS).collect();
     // 0 had gone before, so 100 ms could still be put in its place; but not before what was released.
     assert_eq!(starts, [0, 5_000, 100]);
-    assert_eq!(report.buses[0].too_late_to_sort, 0);
+    assert_eq!(report.buses[0].counts.too_late_to_sort, 0);
     let mut shadow = Shadow::new(options()).unwrap();
     [1_000, 3_000, 5_000, 100].into_iter().for_each(|time| shadow.frame("can0", time * MS, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     assert_eq!(frames[3].sent.unwrap().0 / MS, 3_000);
-    assert_eq!(report.buses[0].too_late_to_sort, 1);
+    assert_eq!(report.buses[0].counts.too_late_to_sort, 1);
 }
 
 #[test]
@@ -123,7 +125,7 @@ fn what_is_on_no_real_bus_takes_no_time() {
     let sent: Vec<_> = frames.iter().map(|frame| (frame.bits.is_some(), frame.sent)).collect();
     assert_eq!(sent, [(false, None), (false, None), (true, Some((0, took(&other))))]);
     let bus = &report.buses[0];
-    assert_eq!((bus.frames, bus.bench.wires, bus.error_frames, bus.sent), (3, 1, 1, 1));
+    assert_eq!((bus.frames, bus.counts.bench.wires, bus.counts.error_frames, bus.counts.sent), (3, 1, 1, 1));
 }
 
 #[test]
@@ -184,7 +186,7 @@ fn bit_errors_cost_time_and_are_the_same_for_the_same_seed() {
     assert_eq!(noisy, run(1e-3, 1).0);
     assert_ne!(noisy, run(1e-3, 2).0);
     // About one in six; the deviation of 2000 is 17.
-    assert!((200..600).contains(&report.buses[0].damaged), "{}", report.buses[0].damaged);
+    assert!((200..600).contains(&report.buses[0].counts.damaged), "{}", report.buses[0].counts.damaged);
     assert!(clean.iter().zip(&noisy).all(|(clean, noisy)| noisy.sent.unwrap().1 >= clean.sent.unwrap().1));
     assert!(Shadow::new(Options { bit_errors: 0.5, ..options() }).is_err());
 }
@@ -196,5 +198,5 @@ fn nothing_is_nothing() {
     let mut shadow = shadow();
     shadow.missing("can0", 7);
     let (_, report) = ended(shadow);
-    assert_eq!((report.buses[0].missing, report.buses[0].load.mean), (7, None));
+    assert_eq!((report.buses[0].counts.missing, report.buses[0].load.mean), (7, None));
 }

@@ -37,33 +37,27 @@ pub(super) struct Told {
 }
 
 impl Told {
-    pub(super) fn enter(&mut self, bus: Option<usize>, nanos: u64, id: u32, extended: bool) {
-        let shaded = Shaded { nanos, bus, id, extended, bits: None, sent: None };
-        self.entries.push_back(Entry { shaded, is_open: false });
-    }
-
-    /// It is on a real bus, and it is not known yet when.
-    pub(super) fn bits(&mut self, place: u64, bits: Bits) {
-        self.at(place, |entry| {
-            entry.shaded.bits = Some(bits);
-            entry.is_open = true;
-        });
+    /// A frame came; of one with bits it is not known yet when it goes out.
+    pub(super) fn enter(&mut self, shaded: Shaded) {
+        self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 
     /// No real bus carries it.
     pub(super) fn left_out(&mut self, place: u64) {
-        self.at(place, |entry| {
-            entry.shaded.bits = None;
-            entry.is_open = false;
-        });
+        self.settle(place, |shaded| shaded.bits = None);
     }
 
     /// When it went out; none if never.
     pub(super) fn sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
-        self.at(place, |entry| {
-            entry.shaded.sent = sent;
+        self.settle(place, |shaded| shaded.sent = sent);
+    }
+
+    fn settle(&mut self, place: u64, change: impl FnOnce(&mut Shaded)) {
+        let index = usize::try_from(place - self.first).ok();
+        if let Some(entry) = index.and_then(|index| self.entries.get_mut(index)) {
+            change(&mut entry.shaded);
             entry.is_open = false;
-        });
+        }
     }
 
     pub(super) fn finish(&mut self) {
@@ -75,10 +69,5 @@ impl Told {
         self.entries.pop_front();
         self.first += 1;
         Some(shaded)
-    }
-
-    fn at(&mut self, place: u64, change: impl FnMut(&mut Entry)) {
-        let index = usize::try_from(place - self.first).ok();
-        index.and_then(|index| self.entries.get_mut(index)).into_iter().for_each(change);
     }
 }

@@ -1,6 +1,6 @@
 //! The text of a `skin.toml`.
 
-use core::fmt::{self, Write};
+use protocol::skin::DenavitHartenberg;
 
 use super::arm::{self, Covered, Place};
 use super::{Format, Reply, Wanted};
@@ -9,92 +9,72 @@ use super::{Format, Reply, Wanted};
 const SLOTS_SHARE: f64 = 0.75;
 
 pub(super) fn toml(wanted: &Wanted, arm: &Covered) -> String {
-    let mut text = String::new();
-    write(&mut text, wanted, arm).expect("a string takes whatever is written");
-    text
-}
-
-fn write(out: &mut impl Write, wanted: &Wanted, arm: &Covered) -> fmt::Result {
     let Wanted { robot: _, cells, buses, broadcast_hz, reply, format } = wanted;
+    let usual = Wanted::default();
     let robot = arm.name.to_lowercase();
     let [(upper, on_upper), (lower, on_lower)] = arm.limbs;
-    write!(out, "# gateway skin generate --robot {robot} --cells {cells}")?;
-    let usual = Wanted::default();
-    if *buses != usual.buses {
-        write!(out, " --buses {buses}")?;
-    }
-    if broadcast_hz.to_bits() != usual.broadcast_hz.to_bits() {
-        write!(out, " --broadcast-hz {broadcast_hz}")?;
-    }
-    if *reply == Reply::Sum {
-        write!(out, " --reply sum")?;
-    }
-    if *format == Format::Classic {
-        write!(out, " --format classic")?;
-    }
-    writeln!(out, "\n#")?;
-    writeln!(out, "# Hexagonal cells, {} mm apart, in rings that are turned by half a cell", arm.pitch_mm)?;
-    writeln!(out, "# against each other: {on_upper} around the {upper}, {on_lower} around the {lower}.")?;
-    writeln!(out, "# Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.")?;
-    if arm.buses.len() == 1 && on_upper > 0 && on_lower > 0 {
-        writeln!(out, "# A cable leads from node {on_upper} over the elbow to node {}.", on_upper + 1)?;
-    }
-    writeln!(out, "version = 1\nname = \"{robot}-{cells}\"\n")?;
-
-    writeln!(out, "[robot]\nname = \"{}\"", arm.name)?;
-    writeln!(out, "joints = [   # standard Denavit-Hartenberg, base to tip; m, rad")?;
-    for row in &arm.joints {
-        let (a, alpha, d, theta_offset) = (row.a, row.alpha, row.d, row.theta_offset);
-        writeln!(out, "  {{ a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {theta_offset:?} }},")?;
-    }
-    writeln!(out, "]\n\n[timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = {broadcast_hz:?}\n")?;
-    writeln!(out, "[contact]   # the paper's Algorithm 1")?;
-    writeln!(out, "alpha_c = 1.0\nalpha_p = 0.0\ncontact_threshold_n = 0.1")?;
-    writeln!(out, "proximity_threshold = 0.05\nforce_threshold_n = 0.1\n")?;
-
-    for (bus, places) in arm.buses.iter().enumerate() {
-        let format = match format {
-            Format::Fd => "fd",
-            Format::Classic => "classic",
+    let options = [
+        (*buses != usual.buses, format!(" --buses {buses}")),
+        (broadcast_hz.to_bits() != usual.broadcast_hz.to_bits(), format!(" --broadcast-hz {broadcast_hz}")),
+        (*reply == Reply::Sum, " --reply sum".to_owned()),
+        (*format == Format::Classic, " --format classic".to_owned()),
+    ];
+    let options: String = options.into_iter().filter_map(|(asked, option)| asked.then_some(option)).collect();
+    let is_joined = arm.buses.len() == 1 && on_upper > 0 && on_lower > 0;
+    let cable = format!("# A cable leads from node {on_upper} over the elbow to node {}.\n", on_upper + 1);
+    let cable = if is_joined { &cable } else { "" };
+    let joints = arm.joints.map(|DenavitHartenberg { a, alpha, d, theta_offset }| {
+        format!("  {{ a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {theta_offset:?} }},\n")
+    });
+    let format = match format {
+        Format::Fd => "fd",
+        Format::Classic => "classic",
+    };
+    let places = || arm.buses.iter().enumerate();
+    let buses = places().map(|(bus, places)| {
+        let reply = match reply {
+            Reply::Torque => "\"torque\"".to_owned(),
+            Reply::Sum => format!("\"sum\"\nslot_us = {}", slot_us(places, *broadcast_hz)),
         };
-        match reply {
-            Reply::Torque => writeln!(out, "[[bus]]\nname = \"vcan{bus}\"\nreply = \"torque\"")?,
-            Reply::Sum => {
-                let slot_us = slot_us(places, *broadcast_hz);
-                writeln!(out, "[[bus]]\nname = \"vcan{bus}\"\nreply = \"sum\"\nslot_us = {slot_us}")?;
-            }
-        }
-        writeln!(out, "format = \"{format}\"\n")?;
-    }
-
-    writeln!(out, "[controller]   # M q'' + D q' = tau, joint by joint\nkind = \"kinesthetic\"")?;
-    writeln!(out, "inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]           # kg m2")?;
-    writeln!(out, "damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]           # Nm s/rad")?;
-    writeln!(out, "max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]")?;
-
-    for (bus, places) in arm.buses.iter().enumerate() {
-        for (at, place) in places.iter().enumerate() {
-            cell(out, bus, at, place)?;
-        }
-    }
-    Ok(())
+        format!("[[bus]]\nname = \"vcan{bus}\"\nreply = {reply}\nformat = \"{format}\"\n\n")
+    });
+    let described = places().flat_map(|(bus, places)| places.iter().zip(1..).map(move |it| cell(bus, it)));
+    format!(
+        "# gateway skin generate --robot {robot} --cells {cells}{options}\n#\n\
+         # Hexagonal cells, {pitch} mm apart, in rings that are turned by half a cell\n\
+         # against each other: {on_upper} around the {upper}, {on_lower} around the {lower}.\n\
+         # Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.\n{cable}\
+         version = 1\nname = \"{robot}-{cells}\"\n\n\
+         [robot]\nname = \"{name}\"\n\
+         joints = [   # standard Denavit-Hartenberg, base to tip; m, rad\n{joints}]\n\n\
+         [timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = {broadcast_hz:?}\n\n\
+         [contact]   # the paper's Algorithm 1\nalpha_c = 1.0\nalpha_p = 0.0\ncontact_threshold_n = 0.1\n\
+         proximity_threshold = 0.05\nforce_threshold_n = 0.1\n\n{buses}\
+         [controller]   # M q'' + D q' = tau, joint by joint\nkind = \"kinesthetic\"\n\
+         inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]           # kg m2\n\
+         damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]           # Nm s/rad\n\
+         max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]\n{described}",
+        pitch = arm.pitch_mm,
+        name = arm.name,
+        joints = joints.concat(),
+        buses = buses.collect::<String>(),
+        described = described.collect::<String>(),
+    )
 }
 
-fn cell(out: &mut impl Write, bus: usize, at: usize, place: &Place) -> fmt::Result {
-    let node = at + 1;
+/// A cell of a bus with its node there.
+fn cell(bus: usize, (place, node): (&Place, usize)) -> String {
     let [x, y, z] = place.position.map(|value| round(value, 1e6));
     // Turned about x, the limb's own direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
     let wires = place.wires.map(|wire| wire.map_or(0, |at| at + 1));
-    writeln!(out, "\n[[cell]]\nbus = \"vcan{bus}\"\nnode = {node}")?;
-    writeln!(out, "serial = {}\njoint = {}", 100_000 * (bus + 1) + node, place.joint)?;
-    writeln!(out, "position = [{x:?}, {y:?}, {z:?}]\norientation = [{qx:?}, 0.0, 0.0, {qw:?}]")?;
-    writeln!(out, "neighbors = {wires:?}")?;
-    if place.root {
-        writeln!(out, "root = true")?;
-    }
-    Ok(())
+    let (serial, joint) = (100_000 * (bus + 1) + node, place.joint);
+    let root = if place.root { "root = true\n" } else { "" };
+    format!(
+        "\n[[cell]]\nbus = \"vcan{bus}\"\nnode = {node}\nserial = {serial}\njoint = {joint}\n\
+         position = [{x:?}, {y:?}, {z:?}]\norientation = [{qx:?}, 0.0, 0.0, {qw:?}]\nneighbors = {wires:?}\n{root}"
+    )
 }
 
 /// Slots for every depth of the tree, within a part of the period, in whole 10 µs.

@@ -10,6 +10,7 @@ use protocol::id::CellId;
 use protocol::message::{Heartbeat, Ports, State, Tree, VERSION};
 use protocol::skin::Wires;
 use protocol::wire::{PORTS, UPLINK};
+use thiserror::Error;
 
 use super::tree::{Places, places};
 
@@ -58,12 +59,25 @@ pub enum Carries {
     Back,
 }
 
+impl Carries {
+    /// Of a wire between two cells that does not work both ways, for people.
+    fn between(self, first: CellId, second: CellId) -> String {
+        match self {
+            Self::Nothing => "does not work".to_owned(),
+            Self::There => format!("works only from cell {first} to cell {second}"),
+            Self::Back => format!("works only from cell {second} to cell {first}"),
+        }
+    }
+}
+
 /// One difference between a network and its description.
-#[derive(Clone, Debug, Eq, Ord, PartialEq, PartialOrd)]
+#[derive(Clone, Debug, Eq, Error, Ord, PartialEq, PartialOrd)]
 pub enum Difference {
     /// A described cell does not speak.
+    #[error("cell {0} does not speak: start it, or take it out of the description")]
     MissingCell(CellId),
     /// A cell speaks that is not described.
+    #[error("cell {cell} with serial number {serial} is not described: describe it, or take it off the bus")]
     ExtraCell {
         /// Its number.
         cell: CellId,
@@ -71,6 +85,7 @@ pub enum Difference {
         serial: u32,
     },
     /// A cell of another serial number than described has a number.
+    #[error("{}", other_cell(*cell, *serial, *described, *belongs))]
     OtherCell {
         /// The number.
         cell: CellId,
@@ -82,8 +97,10 @@ pub enum Difference {
         belongs: Option<CellId>,
     },
     /// Two cells have a number.
+    #[error("two cells have number {0}: stop one of the two")]
     Duplicate(CellId),
     /// A cell speaks another version of the protocol.
+    #[error("cell {cell} speaks {}", other_version(*version))]
     Version {
         /// The cell.
         cell: CellId,
@@ -91,8 +108,10 @@ pub enum Difference {
         version: Option<u16>,
     },
     /// A cell computes with other parameters than the skin's.
+    #[error("cell {0} is configured for another skin: configure it with `gateway commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
+    #[error("the wire from {first} to {second} {}: look at its plugs", carries.between(first.cell, second.cell))]
     MissingWire {
         /// The end with the lesser number.
         first: End,
@@ -102,8 +121,12 @@ pub enum Difference {
         carries: Carries,
     },
     /// A wire that is not described.
+    #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
     ExtraWire(End, End),
     /// A port leads elsewhere than described.
+    #[error(
+        "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
+    )]
     SwappedWire {
         /// The port.
         end: End,
@@ -113,11 +136,40 @@ pub enum Difference {
         described: End,
     },
     /// A cell without a number is at a port.
+    #[error("a cell without a number is at {0}: it gets one from the network, unless all are used")]
     Unnumbered(End),
     /// Cells that are each other's parents, in order.
+    #[error("{} are each other's parents, in a circle that would count twice: start them anew", names(.0))]
     Circle(Vec<CellId>),
     /// Cells without a way to the gateway's side.
+    #[error(
+        "{} {} no way to a root: no sum holds what they feel; look at their wires",
+        names(.0),
+        if .0.len() == 1 { "has" } else { "have" }
+    )]
     NoWay(Vec<CellId>),
+}
+
+fn other_cell(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
+    match belongs {
+        Some(belongs) => format!(
+            "number {cell} is that of the cell with serial number {serial}, which is described as cell {belongs}; \
+             {described} is described there: exchange the cells, or their serial numbers in the description"
+        ),
+        None => format!(
+            "cell {cell} has serial number {serial} and is described with {described}: write {serial} into the \
+             description, or put the other cell back"
+        ),
+    }
+}
+
+fn other_version(version: Option<u16>) -> String {
+    match version {
+        Some(version) => format!(
+            "version {version} of the protocol, and this gateway version {VERSION}: give both the same firmware"
+        ),
+        None => "another version of the protocol than its neighbours: give them the same firmware".to_owned(),
+    }
 }
 
 /// Some cells, for people: at most six of them, and how many more.
@@ -128,83 +180,6 @@ pub fn names(cells: &[CellId]) -> String {
     match cells.len().saturating_sub(6) {
         0 => format!("{word} {first}"),
         more => format!("{word} {first} (and {more} more)"),
-    }
-}
-
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::MissingCell(cell) => {
-                write!(f, "cell {cell} does not speak: start it, or take it out of the description")
-            }
-            Self::ExtraCell { cell, serial } => write!(
-                f,
-                "cell {cell} with serial number {serial} is not described: describe it, or take it off the bus"
-            ),
-            Self::OtherCell { cell, serial, described, belongs: Some(belongs) } => write!(
-                f,
-                "number {cell} is that of the cell with serial number {serial}, which is described as cell {belongs}; \
-                 {described} is described there: exchange the cells, or their serial numbers in the description"
-            ),
-            Self::OtherCell { cell, serial, described, belongs: None } => write!(
-                f,
-                "cell {cell} has serial number {serial} and is described with {described}: write {serial} into the \
-                 description, or put the other cell back"
-            ),
-            Self::Duplicate(cell) => write!(f, "two cells have number {cell}: stop one of the two"),
-            Self::Version { cell, version: Some(version) } => write!(
-                f,
-                "cell {cell} speaks version {version} of the protocol, and this gateway version {VERSION}: give both \
-                 the same firmware"
-            ),
-            Self::Version { cell, version: None } => write!(
-                f,
-                "cell {cell} speaks another version of the protocol than its neighbours: give them the same firmware"
-            ),
-            Self::OtherSkin(cell) => {
-                write!(
-                    f,
-                    "cell {cell} is configured for another skin: configure it with `gateway commission`"
-                )
-            }
-            Self::MissingWire { first, second, carries } => {
-                let how = match carries {
-                    Carries::Nothing => "does not work".to_owned(),
-                    Carries::There => format!("works only from cell {} to cell {}", first.cell, second.cell),
-                    Carries::Back => format!("works only from cell {} to cell {}", second.cell, first.cell),
-                };
-                write!(f, "the wire from {first} to {second} {how}: look at its plugs")
-            }
-            Self::ExtraWire(first, second) => {
-                write!(
-                    f,
-                    "a wire leads from {first} to {second} and is not described: describe it, or unplug it"
-                )
-            }
-            Self::SwappedWire { end, leads, described } => write!(
-                f,
-                "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
-            ),
-            Self::Unnumbered(end) => {
-                write!(
-                    f,
-                    "a cell without a number is at {end}: it gets one from the network, unless all are used"
-                )
-            }
-            Self::Circle(cells) => write!(
-                f,
-                "{} are each other's parents, in a circle that would count twice: start them anew",
-                names(cells)
-            ),
-            Self::NoWay(cells) => {
-                let has = if cells.len() == 1 { "has" } else { "have" };
-                write!(
-                    f,
-                    "{} {has} no way to a root: no sum holds what they feel; look at their wires",
-                    names(cells)
-                )
-            }
-        }
     }
 }
 

@@ -3,9 +3,8 @@
 use core::f64::consts::TAU;
 use std::collections::HashMap;
 
-use protocol::document::Fault as Wrong;
-use protocol::document::Step::{self, Index, Key};
-use protocol::fixed::{OutOfRange, Q, Q1_14};
+use protocol::document::{Fault as Wrong, Place};
+use protocol::fixed::{Q, Q1_14};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Reply, Skin};
 use protocol::time::{Micros, Span};
@@ -18,12 +17,12 @@ pub(super) type Checked<T> = Result<T, Wrong>;
 
 pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
-        return Err(Wrong::new(&[Key("version")], raw.version, "this program reads version 1"));
+        return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
     let end = EndS(raw.duration_s);
-    let duration = length(&[Key("duration_s")], raw.duration_s)?;
-    let seed =
-        u64::try_from(raw.seed).map_err(|_| Wrong::new(&[Key("seed")], raw.seed, "must not be negative"))?;
+    let duration = length(&Place::named("duration_s"), raw.duration_s)?;
+    let negative = |_| Place::named("seed").fault(raw.seed, "must not be negative");
+    let seed = u64::try_from(raw.seed).map_err(negative)?;
     let motion = motion(&raw.motion, skin)?;
     let modes = modes(&raw.mode, end)?;
     let names = Names::of(skin);
@@ -38,21 +37,21 @@ pub(super) struct EndS(f64);
 
 impl EndS {
     /// A moment within the scenario.
-    pub(super) fn moment(self, path: &[Step], seconds: f64) -> Checked<Micros> {
+    pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(micros(seconds)));
         }
         let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
-        Err(Wrong::new(path, seconds, why))
+        Err(at.fault(seconds, why))
     }
 }
 
 /// A length of time; the longest is a year.
-pub(super) fn length(path: &[Step], seconds: f64) -> Checked<Span> {
+pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
     if (1e-6..=3.2e7).contains(&seconds) {
         return Ok(Span(micros(seconds)));
     }
-    Err(Wrong::new(path, seconds, "must be above 0, and at most 3.2e7"))
+    Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
@@ -60,49 +59,32 @@ fn micros(seconds: f64) -> u64 {
     (seconds * 1e6).round() as u64
 }
 
-pub(super) fn quoted(text: &str) -> String {
-    format!("{text:?}")
-}
-
 fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
-    let at = |key| [Key("motion"), Key(key)];
+    let at = Place::named("motion");
     let robot = &skin.robot;
     let joints = |key, values: &[f64]| {
         if values.len() != robot.joints.len() {
             let why = format!("one for each of the robot's {} joints is needed", robot.joints.len());
-            return Err(Wrong::new(&at(key), format_args!("{} values", values.len()), why));
+            return Err(at.key(key).fault(format_args!("{} values", values.len()), why));
         }
-        let mut all = [0.0; MAX_JOINTS];
-        for (all, value) in all.iter_mut().zip(values) {
-            *all = *value;
-        }
-        Ok(all)
+        Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
     };
     let start_rad = raw.start_rad.as_ref().map_or(Ok([0.0; MAX_JOINTS]), |it| joints("start_rad", it))?;
-    let (kind, reach) = match (raw.kind.as_str(), &raw.amplitude_rad, raw.period_s) {
-        ("hold", None, None) => (MotionKind::Hold, [0.0; MAX_JOINTS]),
-        ("kinesthetic", None, None) => (MotionKind::Kinesthetic, [0.0; MAX_JOINTS]),
-        ("sine", Some(amplitude), Some(period_s)) => {
+    let kinds =
+        [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
+    let needed = "needed with kind = \"sine\"";
+    let only = "only with kind = \"sine\"";
+    let (kind, reach) = match (at.key("kind").word(&raw.kind, &kinds)?, &raw.amplitude_rad, raw.period_s) {
+        (Some(kind), None, None) => (kind, [0.0; MAX_JOINTS]),
+        (Some(_), Some(_), _) => return Err(at.key("amplitude_rad").fault("", only)),
+        (Some(_), None, Some(got)) => return Err(at.key("period_s").fault(got, only)),
+        (None, None, _) => return Err(at.key("amplitude_rad").fault("", needed)),
+        (None, Some(_), None) => return Err(at.key("period_s").fault("", needed)),
+        (None, Some(amplitude), Some(period_s)) => {
             let amplitude_rad = joints("amplitude_rad", amplitude)?;
-            length(&at("period_s"), period_s)?;
-            speeds(skin, &amplitude_rad, period_s)?;
+            length(&at.key("period_s"), period_s)?;
+            speeds(&at.key("amplitude_rad"), skin, &amplitude_rad, period_s)?;
             (MotionKind::Sine { amplitude_rad, period_s }, amplitude_rad.map(f64::abs))
-        }
-        ("sine", None, _) => {
-            return Err(Wrong::new(&at("amplitude_rad"), "", "needed with kind = \"sine\""));
-        }
-        ("sine", Some(_), None) => {
-            return Err(Wrong::new(&at("period_s"), "", "needed with kind = \"sine\""));
-        }
-        ("hold" | "kinesthetic", Some(_), _) => {
-            return Err(Wrong::new(&at("amplitude_rad"), "", "only with kind = \"sine\""));
-        }
-        ("hold" | "kinesthetic", None, Some(got)) => {
-            return Err(Wrong::new(&at("period_s"), got, "only with kind = \"sine\""));
-        }
-        (got, ..) => {
-            let why = "\"hold\", \"sine\" or \"kinesthetic\"";
-            return Err(Wrong::new(&at("kind"), quoted(got), why));
         }
     };
     for (index, ((start, reach), [least, greatest])) in
@@ -114,24 +96,23 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
                 "joint {} may go from {least} to {greatest}, and comes as far as {reach} from its start",
                 index + 1
             );
-            return Err(Wrong::new(&[Key("motion"), Key("start_rad"), Index(index)], start, why));
+            return Err(at.key("start_rad").nth(index).fault(start, why));
         }
     }
     Ok(Motion { start_rad, kind })
 }
 
 /// Whether every joint may be as quick as its swing is at the start.
-fn speeds(skin: &Skin, amplitude: &[f64; MAX_JOINTS], period_s: f64) -> Checked<()> {
+fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_JOINTS], period_s: f64) -> Checked<()> {
     for (index, (amplitude, &greatest)) in amplitude.iter().zip(&skin.controller.max_speed_rad_s).enumerate()
     {
         let speed = TAU * amplitude.abs() / period_s;
         if speed.is_nan() || speed > greatest {
-            let path = [Key("motion"), Key("amplitude_rad"), Index(index)];
             let why = format!(
                 "in {period_s} s this takes {speed:.3} rad/s, and joint {} may make {greatest}",
                 index + 1
             );
-            return Err(Wrong::new(&path, amplitude, why));
+            return Err(at.nth(index).fault(amplitude, why));
         }
     }
     Ok(())
@@ -140,19 +121,13 @@ fn speeds(skin: &Skin, amplitude: &[f64; MAX_JOINTS], period_s: f64) -> Checked<
 fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
     let mut modes: Vec<ModeChange> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let path = |key| [Key("mode"), Index(index), Key(key)];
-        let at = end.moment(&path("at_s"), raw.at_s)?;
+        let path = Place::named("mode").nth(index);
+        let at = end.moment(&path.key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
-            return Err(Wrong::new(&path("at_s"), raw.at_s, "modes come in the order of time"));
+            return Err(path.key("at_s").fault(raw.at_s, "modes come in the order of time"));
         }
-        let mode = match raw.kind.as_str() {
-            "compare" => Mode::Compare,
-            "distributed" => Mode::Distributed,
-            got => {
-                return Err(Wrong::new(&path("kind"), quoted(got), "\"compare\" or \"distributed\""));
-            }
-        };
-        modes.push(ModeChange { at, mode });
+        let kinds = [("compare", Mode::Compare), ("distributed", Mode::Distributed)];
+        modes.push(ModeChange { at, mode: path.key("kind").word(&raw.kind, &kinds)? });
     }
     Ok(modes)
 }
@@ -160,46 +135,32 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
 fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touch>> {
     let mut touches = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let touch = touch(index, raw, end, names)?;
-        touches.push(touch);
-        together(index, &touches, names)?;
+        let at = Place::named("touch").nth(index);
+        touches.push(touch(&at, raw, end, names)?);
+        together(&at.key("force_n"), &touches, names)?;
     }
     Ok(touches)
 }
 
-fn touch(index: usize, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
-    let path = [Key("touch"), Index(index)];
-    let at = |key| [Key("touch"), Index(index), Key(key)];
+fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
     if !(0.0..=GREATEST_FORCE_N).contains(&raw.force_n) {
         let why = format!("0 to {GREATEST_FORCE_N:.3} N are possible, what three contact words can say");
-        return Err(Wrong::new(&at("force_n"), raw.force_n, why));
+        return Err(at.key("force_n").fault(raw.force_n, why));
     }
     if !(0.0..=1.0).contains(&raw.proximity) {
-        return Err(Wrong::new(&at("proximity"), raw.proximity, "0 (nothing near) to 1 are possible"));
+        return Err(at.key("proximity").fault(raw.proximity, "0 (nothing near) to 1 are possible"));
     }
-    let degrees = |got| {
-        let words = |error: OutOfRange| {
-            let why = format!("its word holds [{}, {})", error.least, error.bound);
-            Wrong::new(&at("temperature_c"), got, why)
-        };
-        Q::try_nearest(got).map_err(words)
-    };
+    let degrees = |got| at.key("temperature_c").fit(got, Q::try_nearest);
     let temperature = match raw.temperature_c {
         Some([first, second]) => Some([degrees(first)?, degrees(second)?]),
         None => None,
     };
-    let profile = match raw.profile.as_str() {
-        "half-sine" => Profile::HalfSine,
-        "step" => Profile::Step,
-        "ramp" => Profile::Ramp,
-        got => {
-            return Err(Wrong::new(&at("profile"), quoted(got), "\"half-sine\", \"step\" or \"ramp\""));
-        }
-    };
+    let profiles = [("half-sine", Profile::HalfSine), ("step", Profile::Step), ("ramp", Profile::Ramp)];
+    let profile = at.key("profile").word(&raw.profile, &profiles)?;
     Ok(Touch {
-        at: end.moment(&at("at_s"), raw.at_s)?,
-        length: length(&at("for_s"), raw.for_s)?,
-        cells: names.cells(&path, raw.bus.as_deref(), raw.cells.as_deref(), raw.all)?,
+        at: end.moment(&at.key("at_s"), raw.at_s)?,
+        length: length(&at.key("for_s"), raw.for_s)?,
+        cells: names.cells(at, raw.bus.as_deref(), raw.cells.as_deref(), raw.all)?,
         force_n: raw.force_n,
         profile,
         proximity: Q1_14::nearest(raw.proximity),
@@ -209,7 +170,7 @@ fn touch(index: usize, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checke
 
 /// Whether the last of these touches, with those before it in the file, presses no cell with more than
 /// it can say. The greatest force is there when one of the touches begins.
-fn together(index: usize, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
+fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
     for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
         let at_once: Vec<&Touch> = before.iter().filter(|touch| touch.holds_at(start)).collect();
@@ -220,13 +181,12 @@ fn together(index: usize, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
             let others = at_once.iter().filter(|touch| touch.cells.binary_search(cell).is_ok());
             let force = last.force_n + others.map(|touch| touch.force_n).sum::<f64>();
             if force > GREATEST_FORCE_N {
-                let path = [Key("touch"), Index(index), Key("force_n")];
                 let why = format!(
                     "with the touches before it that makes {force} N on {}, more than the \
                      {GREATEST_FORCE_N:.3} N that three contact words can say",
                     names.name(*cell)
                 );
-                return Err(Wrong::new(&path, last.force_n, why));
+                return Err(at.fault(last.force_n, why));
             }
         }
     }
@@ -252,19 +212,16 @@ impl<'a> Names<'a> {
     }
 
     /// The bus of this name; it need not be named when there is only one.
-    pub(super) fn bus(&self, at: &[Step], name: Option<&str>) -> Checked<usize> {
-        let path = [at, &[Key("bus")]].concat();
-        let there_is = || {
-            let names = self.skin.buses.iter().map(|bus| quoted(&bus.name)).collect::<Vec<_>>();
-            format!("there is {}", names.join(", "))
-        };
+    pub(super) fn bus(&self, at: &Place, name: Option<&str>) -> Checked<usize> {
+        let names =
+            || self.skin.buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
         match name {
-            Some(name) => self
-                .skin
-                .bus_named(name)
-                .ok_or_else(|| Wrong::new(&path, quoted(name), format_args!("no such bus; {}", there_is()))),
+            Some(name) => self.skin.bus_named(name).ok_or_else(|| {
+                let why = format_args!("no such bus; there is {}", names());
+                at.key("bus").fault(format_args!("{name:?}"), why)
+            }),
             None if self.skin.buses.len() == 1 => Ok(0),
-            None => Err(Wrong::new(&path, "", format_args!("which bus? {}", there_is()))),
+            None => Err(at.key("bus").fault("", format_args!("which bus? there is {}", names()))),
         }
     }
 
@@ -272,71 +229,62 @@ impl<'a> Names<'a> {
     /// lead from one to the other.
     pub(super) fn wired(
         &self,
-        at: &[Step],
+        at: &Place,
         bus: Option<&str>,
         nodes: Option<&[i64]>,
     ) -> Checked<(usize, usize)> {
-        let path = [at, &[Key("cells")]].concat();
+        let path = at.key("cells");
         self.cells(at, bus, nodes, false)?;
         let &[from, to] = nodes.unwrap_or_default() else {
             let got = format!("{} cells", nodes.unwrap_or_default().len());
-            return Err(Wrong::new(&path, got, "a wire is between two"));
+            return Err(path.fault(got, "a wire is between two"));
         };
         let bus = self.bus(at, bus)?;
         let described = self.skin.buses.get(bus);
         if described.is_some_and(|bus| bus.reply == Reply::Torque) {
-            return Err(Wrong::new(&path, "", "wires are used on a bus with reply = \"sum\" only"));
+            return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
         }
         let find = |node: i64| self.index.get(&(bus, node)).copied();
         let wires = self.skin.wires(bus);
         let node = |cell: usize| self.skin.cells.get(cell).map(|cell| cell.node);
-        let leads = |(from, to): &(usize, usize)| {
-            let (Some(from), Some(to)) = (node(*from), node(*to)) else { return false };
+        let leads = |&(from, to): &(usize, usize)| {
+            let (Some(from), Some(to)) = (node(from), node(to)) else { return false };
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
-        let why = "no wire is between them";
         let pair = find(from).zip(find(to)).filter(leads);
-        pair.ok_or_else(|| Wrong::new(&path, format!("[{from}, {to}]"), why))
+        pair.ok_or_else(|| path.fault(format_args!("[{from}, {to}]"), "no wire is between them"))
     }
 
     /// The cells that the keys `bus` and `cells` of the table at `at` name, or all of them; sorted.
     pub(super) fn cells(
         &self,
-        at: &[Step],
+        at: &Place,
         bus: Option<&str>,
         nodes: Option<&[i64]>,
         all: bool,
     ) -> Checked<Vec<usize>> {
-        let path = [at, &[Key("cells")]].concat();
-        let nodes = match (nodes, all, bus) {
-            (Some(_), true, _) => {
-                let why = "either some cells, or all = true";
-                return Err(Wrong::new(&path, "", why));
-            }
-            (None, false, _) => {
-                return Err(Wrong::new(&path, "", "which cells? give their nodes, or all = true"));
-            }
-            (None, true, None) => return Ok((0..self.skin.cells.len()).collect()),
-            (None, true, Some(name)) => {
-                let bus = self.bus(at, Some(name))?;
+        let path = at.key("cells");
+        let nodes = match nodes {
+            Some(_) if all => return Err(path.fault("", "either some cells, or all = true")),
+            None if !all => return Err(path.fault("", "which cells? give their nodes, or all = true")),
+            None => {
+                let bus = bus.map(|name| self.bus(at, Some(name))).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
-                return Ok(cells.filter(|(_, cell)| cell.bus == bus).map(|(index, _)| index).collect());
+                let wanted = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
+                return Ok(wanted.map(|(index, _)| index).collect());
             }
-            (Some([]), false, _) => {
-                return Err(Wrong::new(&path, "[]", "at least one cell is needed"));
-            }
-            (Some(nodes), false, _) => nodes,
+            Some([]) => return Err(path.fault("[]", "at least one cell is needed")),
+            Some(nodes) => nodes,
         };
         let bus = self.bus(at, bus)?;
         let mut cells = Vec::with_capacity(nodes.len());
-        let mut seen = HashMap::new();
         for (index, &node) in nodes.iter().enumerate() {
-            let wrong = |why| Err(Wrong::new(&[&path[..], &[Index(index)]].concat(), node, why));
+            let wrong = |why| Err(path.nth(index).fault(node, why));
             let name = self.skin.buses.get(bus).map_or("", |bus| &bus.name);
             let Some(&cell) = self.index.get(&(bus, node)) else {
                 return wrong(format!("no cell of {name:?} has this node"));
             };
-            if let Some(first) = seen.insert(cell, index) {
+            if let Some(first) = cells.iter().position(|&before| before == cell) {
                 return wrong(format!("cells[{first}] names it already"));
             }
             cells.push(cell);

@@ -1,10 +1,9 @@
 //! From what a scenario's file says of faults to what it means.
 
-use protocol::document::Fault as Wrong;
-use protocol::document::Step::{Index, Key};
+use protocol::document::Place;
 use protocol::time::Span;
 
-use super::check::{Checked, EndS, Names, length, quoted};
+use super::check::{Checked, EndS, Names, length};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
 const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"cut\", \"mend\"; of sensors \"stuck\", \
@@ -14,7 +13,7 @@ const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\";
 pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
     let mut faults = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let entry = Entry { index, raw, names };
+        let entry = Entry { at: Place::named("fault").nth(index), raw, names };
         let fault = entry.fault(end)?;
         faults.extend(entry.end_of(&fault)?);
         faults.push(fault);
@@ -25,19 +24,15 @@ pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checke
 
 /// One `[[fault]]`.
 struct Entry<'a> {
-    index: usize,
+    at: Place,
     raw: &'a raw::Fault,
     names: &'a Names<'a>,
 }
 
 impl Entry<'_> {
-    fn wrong(&self, key: &'static str, got: impl core::fmt::Display, why: impl core::fmt::Display) -> Wrong {
-        Wrong::new(&[Key("fault"), Index(self.index), Key(key)], got, why)
-    }
-
     fn fault(&self, end: EndS) -> Checked<Fault> {
         let raw = self.raw;
-        let at = end.moment(&[Key("fault"), Index(self.index), Key("at_s")], raw.at_s)?;
+        let at = end.moment(&self.at.key("at_s"), raw.at_s)?;
         let kind = match raw.kind.as_str() {
             "kill" => self.process(ProcessAction::Kill)?,
             "stop" => self.process(ProcessAction::Stop)?,
@@ -64,12 +59,10 @@ impl Entry<'_> {
                 let frames_per_s = self.given("frames_per_s", raw.frames_per_s, 1.0, 100_000.0)?;
                 let got = raw.id.unwrap_or(0);
                 let id = u16::try_from(got).ok().filter(|&id| id < 0x800);
-                let id = id.ok_or_else(|| self.wrong("id", got, "an identifier is 0 to 0x7FF"))?;
+                let id = id.ok_or_else(|| self.at.key("id").fault(got, "an identifier is 0 to 0x7FF"))?;
                 self.bus(BusFault::Babble { frames_per_s, id }, &["for_s", "frames_per_s", "id"])?
             }
-            got => {
-                return Err(self.wrong("kind", quoted(got), KINDS));
-            }
+            got => return Err(self.at.key("kind").fault(format_args!("{got:?}"), KINDS)),
         };
         Ok(Fault { at, kind })
     }
@@ -81,11 +74,10 @@ impl Entry<'_> {
 
     fn wire(&self, cut: bool, keys: &[&str]) -> Checked<FaultKind> {
         self.only(keys)?;
-        let at = [Key("fault"), Index(self.index)];
         if self.raw.all {
-            return Err(self.wrong("all", true, "the two cells of a wire are needed"));
+            return Err(self.at.key("all").fault(true, "the two cells of a wire are needed"));
         }
-        let (from, to) = self.names.wired(&at, self.raw.bus.as_deref(), self.raw.cells.as_deref())?;
+        let (from, to) = self.names.wired(&self.at, self.raw.bus.as_deref(), self.raw.cells.as_deref())?;
         Ok(FaultKind::Wire { cut, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
@@ -111,30 +103,27 @@ impl Entry<'_> {
 
     fn bus(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
         self.only(keys)?;
-        let at = [Key("fault"), Index(self.index)];
-        let bus = self.names.bus(&at, self.raw.bus.as_deref())?;
+        let bus = self.names.bus(&self.at, self.raw.bus.as_deref())?;
         let cells = if self.raw.cells.is_some() { self.cells()? } else { Vec::new() };
         Ok(FaultKind::Bus { fault, length: self.length()?, bus, cells })
     }
 
     fn cells(&self) -> Checked<Vec<usize>> {
-        let at = [Key("fault"), Index(self.index)];
-        self.names.cells(&at, self.raw.bus.as_deref(), self.raw.cells.as_deref(), self.raw.all)
+        self.names.cells(&self.at, self.raw.bus.as_deref(), self.raw.cells.as_deref(), self.raw.all)
     }
 
     /// How long it lasts; without `for_s` it stays.
     fn length(&self) -> Checked<Span> {
-        let path = [Key("fault"), Index(self.index), Key("for_s")];
-        self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| length(&path, seconds))
+        self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| length(&self.at.key("for_s"), seconds))
     }
 
     fn delay(&self) -> Checked<Span> {
-        let why = "1 to 1000000 us are needed with kind = \"delay\"";
-        match self.raw.delay_us.map(u64::try_from) {
-            Some(Ok(delay @ 1..=1_000_000)) => Ok(Span(delay)),
-            Some(_) => Err(self.wrong("delay_us", self.raw.delay_us.unwrap_or_default(), why)),
-            None => Err(self.wrong("delay_us", "", why)),
-        }
+        let wrong = |got: String| {
+            self.at.key("delay_us").fault(got, "1 to 1000000 us are needed with kind = \"delay\"")
+        };
+        let got = self.raw.delay_us.ok_or_else(|| wrong(String::new()))?;
+        let delay = u64::try_from(got).ok().filter(|delay| (1..=1_000_000).contains(delay));
+        delay.map(Span).ok_or_else(|| wrong(got.to_string()))
     }
 
     /// A number that this kind of fault needs.
@@ -143,11 +132,9 @@ impl Entry<'_> {
             (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
             _ => format!("{least} to {greatest} are needed with kind = {:?}", self.raw.kind),
         };
-        match value {
-            Some(value) if value.is_finite() && (least..=greatest).contains(&value) => Ok(value),
-            Some(value) => Err(self.wrong(key, value, why())),
-            None => Err(self.wrong(key, "", why())),
-        }
+        let given = value.filter(|value| value.is_finite() && (least..=greatest).contains(value));
+        given
+            .ok_or_else(|| self.at.key(key).fault(value.map_or_else(String::new, |it| it.to_string()), why()))
     }
 
     /// Refuses the keys that mean nothing for this kind of fault.
@@ -162,11 +149,9 @@ impl Entry<'_> {
             ("frames_per_s", raw.frames_per_s.is_some()),
             ("id", raw.id.is_some()),
         ];
-        match given.into_iter().find(|(key, given)| *given && !keys.contains(key)) {
-            Some((key, _)) => {
-                Err(self.wrong(key, "", format_args!("means nothing with kind = {:?}", raw.kind)))
-            }
-            None => Ok(()),
-        }
+        let senseless = given.into_iter().find(|(key, given)| *given && !keys.contains(key));
+        senseless.map_or(Ok(()), |(key, _)| {
+            Err(self.at.key(key).fault("", format_args!("means nothing with kind = {:?}", raw.kind)))
+        })
     }
 }

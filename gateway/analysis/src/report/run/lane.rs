@@ -6,19 +6,14 @@ use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
-use super::{COLUMNS, GRAIN_S};
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use model::decode::{Decoded, Decoder};
-use model::table::{Replies, Table};
+use model::table::{Contributions, Replies, Table};
 use trace::capture::InForce;
 
 /// Time is let pass for the cells as often as a receiver does it.
 const LOOK_US: u64 = 20_000;
-/// Frames are counted over times that are so long at first, in s, and so many of them.
-const BIN_S: f64 = 0.1;
-const BINS: usize = 600;
-
 /// How long a cell took to answer, in µs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Latency {
@@ -27,28 +22,32 @@ pub(super) struct Latency {
     pub(super) count: u64,
 }
 
-/// Replies at some time, of all cells together.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Account {
-    pub(super) due: u64,
-    pub(super) in_time: u64,
-    pub(super) late: u64,
-    pub(super) missing: u64,
-}
-
 /// The epoch that is open.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Open {
     number: u64,
     at: f64,
     /// What was due in it.
     due: u64,
     /// What there was when it was opened.
-    before: Account,
+    before: Replies,
     /// Errors compared before it, and their sum.
     errors: (u64, f64),
     /// Its slowest reply, in µs.
     slowest: Option<u64>,
+}
+
+/// Lines over time with a point an epoch.
+#[derive(Debug, Default)]
+pub(super) struct Lines {
+    pub(super) due: Thinned,
+    pub(super) in_time: Thinned,
+    pub(super) late: Thinned,
+    pub(super) missing: Thinned,
+    /// In ms.
+    pub(super) slowest: Thinned,
+    /// Mean absolute error of the whole bus' torque in an epoch that all answered, in Nm.
+    pub(super) error: Thinned,
 }
 
 /// One bus.
@@ -61,14 +60,7 @@ pub(super) struct Lane {
     decoder: Decoder,
     open: Option<Open>,
     looked: Micros,
-    pub(super) due: Thinned,
-    pub(super) in_time: Thinned,
-    pub(super) late: Thinned,
-    pub(super) missing: Thinned,
-    /// In ms.
-    pub(super) slowest: Thinned,
-    /// Mean absolute error of the whole bus' torque in an epoch that all answered, in Nm.
-    pub(super) error: Thinned,
+    pub(super) lines: Lines,
     /// By place among the bus' cells.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
@@ -93,7 +85,6 @@ impl Lane {
             table.set_feeds(root, true);
         }
         let described = skin.buses.get(bus);
-        let thinned = || Thinned::new(COLUMNS, GRAIN_S);
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             latency: vec![Latency::default(); table.cells().len()],
@@ -102,17 +93,12 @@ impl Lane {
             decoder: Decoder::new(described.map(|bus| bus.format)),
             open: None,
             looked: Micros(0),
-            due: thinned(),
-            in_time: thinned(),
-            late: thinned(),
-            missing: thinned(),
-            slowest: thinned(),
-            error: thinned(),
+            lines: Lines::default(),
             frames: 0,
             joints: None,
             rates,
-            load: Binned::new(BINS, BIN_S),
-            load_of_all: Binned::new(BINS, BIN_S),
+            load: Binned::default(),
+            load_of_all: Binned::default(),
             dropped: 0,
         }
     }
@@ -125,14 +111,7 @@ impl Lane {
     /// The recording begins.
     pub(super) fn begin(&mut self) {
         self.table.begin_accounts();
-        self.open = self.table.newest().map(|(number, _, _)| Open {
-            number,
-            at: 0.0,
-            due: 0,
-            before: Account::default(),
-            errors: (0, 0.0),
-            slowest: None,
-        });
+        self.open = self.table.newest().map(|(number, _, _)| Open { number, ..Open::default() });
     }
 
     /// The next frame, `at` seconds after the recording's beginning.
@@ -184,17 +163,12 @@ impl Lane {
     }
 
     /// What is due and what has come of it, all epochs together.
-    pub(super) fn account(&self) -> Account {
-        if let Some((_, cells)) = self.table.sums() {
-            return Account {
-                due: cells.due,
-                in_time: cells.in_time,
-                late: cells.late,
-                missing: cells.missing,
-            };
-        }
-        let all = Replies::total(self.table.cells().iter().map(|cell| cell.replies));
-        Account { due: all.due, in_time: all.in_time, late: all.late, missing: all.missing }
+    pub(super) fn account(&self) -> Replies {
+        let Some((_, cells)) = self.table.sums() else {
+            return Replies::total(self.table.cells().iter().map(|cell| cell.replies));
+        };
+        let Contributions { due, in_time, late, missing, .. } = cells;
+        Replies { due, in_time, late, missing, ..Replies::default() }
     }
 
     /// Errors compared so far, and their sum.
@@ -208,32 +182,31 @@ impl Lane {
     fn next(&mut self, number: u64, at: f64) {
         let (first, _, count) = self.joints.unwrap_or((at, at, 0));
         self.joints = Some((first, at, count + 1));
-        let (account, errors) = (self.account(), self.errors());
-        let due = self.close(account, errors);
-        self.open = Some(Open { number, at, due, before: account, errors, slowest: None });
+        let (due, before, errors) = self.close();
+        self.open = Some(Open { number, at, due, before, errors, slowest: None });
     }
 
-    /// Ends the epoch that is open; what has become due since.
-    fn close(&mut self, account: Account, errors: (u64, f64)) -> u64 {
-        let Some(open) = self.open.take() else { return account.due };
-        let Open { at, before, .. } = open;
-        self.due.push(at, open.due as f64);
-        self.in_time.push(at, account.in_time.saturating_sub(before.in_time) as f64);
-        self.late.push(at, account.late.saturating_sub(before.late) as f64);
-        self.missing.push(at, account.missing.saturating_sub(before.missing) as f64);
-        self.slowest.push(at, open.slowest.map_or(f64::NAN, |took| took as f64 * 1e-3));
-        let compared = errors.0.saturating_sub(open.errors.0);
-        self.error.push(
-            at,
-            if compared > 0 { (errors.1 - open.errors.1).max(0.0) / compared as f64 } else { f64::NAN },
-        );
-        account.due.saturating_sub(before.due)
+    /// Ends the epoch that is open: what has become due since, and what there is now.
+    fn close(&mut self) -> (u64, Replies, (u64, f64)) {
+        let (account, errors) = (self.account(), self.errors());
+        let Some(Open { at, due, before, errors: errors_before, slowest, .. }) = self.open.take() else {
+            return (account.due, account, errors);
+        };
+        let compared = errors.0.saturating_sub(errors_before.0);
+        let error = (errors.1 - errors_before.1).max(0.0) / compared as f64;
+        let lines = &mut self.lines;
+        lines.due.push(at, due as f64);
+        lines.in_time.push(at, account.in_time.saturating_sub(before.in_time) as f64);
+        lines.late.push(at, account.late.saturating_sub(before.late) as f64);
+        lines.missing.push(at, account.missing.saturating_sub(before.missing) as f64);
+        lines.slowest.push(at, slowest.map_or(f64::NAN, |took| took as f64 * 1e-3));
+        lines.error.push(at, if compared > 0 { error } else { f64::NAN });
+        (account.due.saturating_sub(before.due), account, errors)
     }
 
     /// No more frames follow.
     pub(super) fn finish(&mut self) {
         self.table.finish();
-        let (account, errors) = (self.account(), self.errors());
-        self.close(account, errors);
+        self.close();
     }
 }

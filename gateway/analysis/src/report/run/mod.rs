@@ -30,11 +30,6 @@ use trace::capture::{CaptureError, Entry, Extras, Format, Item, Note, NoteKind, 
 use trace::recording::layout::Layout;
 use trace::ros2::read;
 
-/// Columns of a line; a page is not wider.
-const COLUMNS: usize = 1_000;
-/// A column's width at first, in s.
-const GRAIN_S: f64 = 0.002;
-
 /// Why there is no report.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -287,7 +282,7 @@ impl Run {
     }
 
     fn is_empty(&self) -> bool {
-        self.motion.ticks == 0 && self.lanes.iter().all(|lane| lane.frames == 0)
+        self.motion.counts.ticks == 0 && self.lanes.iter().all(|lane| lane.frames == 0)
     }
 
     /// A value of the recording's metadata.

@@ -1,10 +1,7 @@
 //! What the ticks of a recording say: joints, torques, the loop's timing.
 
-use hdrhistogram::Histogram;
-
-use super::{COLUMNS, GRAIN_S};
 use crate::report::thin::Thinned;
-use model::quantiles::histogram;
+use model::quantiles::Times;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
@@ -12,7 +9,7 @@ use trace::ros2::skin::LoopTiming;
 const TURNS: usize = 12;
 
 /// What the ticks said.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Motion {
     pub(super) position: Vec<Thinned>,
     pub(super) velocity: Vec<Thinned>,
@@ -20,22 +17,12 @@ pub(super) struct Motion {
     pub(super) central: Vec<Thinned>,
     pub(super) active: Thinned,
     pub(super) contributing: Thinned,
-    pub(super) late: Thinned,
-    pub(super) took: Thinned,
-    pub(super) central_took: Thinned,
-    /// In ns.
-    pub(super) late_ns: Histogram<u64>,
-    pub(super) took_ns: Histogram<u64>,
-    pub(super) central_ns: Histogram<u64>,
+    pub(super) late: Timed,
+    pub(super) took: Timed,
+    pub(super) central_took: Timed,
     /// Of ticks without a central computation.
-    pub(super) plain_ns: Histogram<u64>,
-    pub(super) ticks: u64,
-    pub(super) skipped: u64,
-    /// Ticks that happened, by their numbers, and are not in the recording.
-    pub(super) unrecorded: u64,
-    pub(super) bad: u64,
-    pub(super) halted: u64,
-    pub(super) refused: u64,
+    pub(super) plain: Times,
+    pub(super) counts: Counts,
     /// Active cells of all ticks with a central computation together, and these ticks.
     pub(super) active_sum: (u64, u64),
     /// The first and the last tick, in s.
@@ -48,58 +35,47 @@ pub(super) struct Motion {
     halt: u8,
 }
 
+/// How many ticks were what.
+#[derive(Debug, Default)]
+pub(super) struct Counts {
+    pub(super) ticks: u64,
+    pub(super) skipped: u64,
+    /// Ticks that happened, by their numbers, and are not in the recording.
+    pub(super) unrecorded: u64,
+    pub(super) bad: u64,
+    pub(super) halted: u64,
+    pub(super) refused: u64,
+}
+
+/// A length of time in each tick: a line in µs, and all of them.
+#[derive(Debug, Default)]
+pub(super) struct Timed {
+    pub(super) line: Thinned,
+    pub(super) times: Times,
+}
+
+impl Timed {
+    fn push(&mut self, at: f64, micros: f64) {
+        self.line.push(at, micros);
+        self.times.record(nanos(micros));
+    }
+}
+
 impl Motion {
     pub(super) fn new(joints: usize) -> Self {
-        let thinned = || Thinned::new(COLUMNS, GRAIN_S);
-        let each = || (0..joints).map(|_| thinned()).collect::<Vec<_>>();
-        Self {
-            position: each(),
-            velocity: each(),
-            distributed: each(),
-            central: each(),
-            active: thinned(),
-            contributing: thinned(),
-            late: thinned(),
-            took: thinned(),
-            central_took: thinned(),
-            late_ns: histogram(),
-            took_ns: histogram(),
-            central_ns: histogram(),
-            plain_ns: histogram(),
-            ticks: 0,
-            skipped: 0,
-            unrecorded: 0,
-            bad: 0,
-            halted: 0,
-            refused: 0,
-            active_sum: (0, 0),
-            first: None,
-            last: 0.0,
-            turns: Vec::new(),
-            number: None,
-            comparing: None,
-            halt: 0,
-        }
+        let each = || vec![Thinned::default(); joints];
+        Self { position: each(), velocity: each(), distributed: each(), central: each(), ..Self::default() }
     }
 
     pub(super) fn joints(&mut self, at: f64, joints: &Joints) {
-        for (series, value) in self.position.iter_mut().zip(&joints.position) {
-            series.push(at, *value);
-        }
-        for (series, value) in self.velocity.iter_mut().zip(&joints.velocity) {
-            series.push(at, *value);
-        }
+        push(&mut self.position, at, joints.position.iter().copied());
+        push(&mut self.velocity, at, joints.velocity.iter().copied());
     }
 
     pub(super) fn torques(&mut self, at: f64, torques: &Torques) {
-        for (series, value) in self.distributed.iter_mut().zip(&torques.distributed) {
-            series.push(at, *value);
-        }
+        push(&mut self.distributed, at, torques.distributed.iter().copied());
         // Without a central computation the line has a gap.
-        let central = torques.central.iter().copied().chain(std::iter::repeat(f64::NAN));
-        for (series, value) in self.central.iter_mut().zip(central) {
-            series.push(at, value);
-        }
+        push(&mut self.central, at, torques.central.iter().copied().chain(std::iter::repeat(f64::NAN)));
         let compared = !torques.central.is_empty();
         self.active.push(at, if compared { torques.active.into() } else { f64::NAN });
         if compared {
@@ -114,26 +90,15 @@ impl Motion {
     pub(super) fn timing(&mut self, at: f64, timing: &LoopTiming) {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
-        self.ticks += 1;
-        self.skipped = self.skipped.saturating_add(timing.skipped);
-        if let Some(before) = self.number.replace(timing.tick) {
-            let expected = before.saturating_add(1).saturating_add(timing.skipped);
-            self.unrecorded = self.unrecorded.saturating_add(timing.tick.saturating_sub(expected));
-        }
-        self.bad += u64::from(timing.bad != 0);
-        self.halted += u64::from(timing.halted != 0);
-        self.refused += u64::from(timing.refused);
+        self.counts.take(timing, self.number.replace(timing.tick));
         self.contributing.push(at, timing.contributing.into());
         self.late.push(at, timing.late_us);
         self.took.push(at, timing.took_us);
-        note(&mut self.late_ns, timing.late_us);
-        note(&mut self.took_ns, timing.took_us);
         if timing.central_us > 0.0 {
             self.central_took.push(at, timing.central_us);
-            note(&mut self.central_ns, timing.central_us);
         } else {
-            self.central_took.push(at, f64::NAN);
-            note(&mut self.plain_ns, timing.took_us);
+            self.central_took.line.push(at, f64::NAN);
+            self.plain.record(nanos(timing.took_us));
         }
         if timing.halted != self.halt {
             self.halt = timing.halted;
@@ -153,14 +118,32 @@ impl Motion {
     }
 }
 
+impl Counts {
+    /// Takes the next tick, behind one of this number.
+    fn take(&mut self, timing: &LoopTiming, before: Option<u64>) {
+        self.ticks += 1;
+        self.skipped = self.skipped.saturating_add(timing.skipped);
+        if let Some(before) = before {
+            let expected = before.saturating_add(1).saturating_add(timing.skipped);
+            self.unrecorded = self.unrecorded.saturating_add(timing.tick.saturating_sub(expected));
+        }
+        self.bad += u64::from(timing.bad != 0);
+        self.halted += u64::from(timing.halted != 0);
+        self.refused += u64::from(timing.refused);
+    }
+}
+
+fn push(lines: &mut [Thinned], at: f64, values: impl Iterator<Item = f64>) {
+    lines.iter_mut().zip(values).for_each(|(line, value)| line.push(at, value));
+}
+
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "not negative, and below 2^53 ns"
 )]
-fn note(histogram: &mut Histogram<u64>, micros: f64) {
-    // The histogram grows by itself; it cannot refuse.
-    let _ = histogram.record((micros.max(0.0) * 1e3).round() as u64);
+fn nanos(micros: f64) -> u64 {
+    (micros.max(0.0) * 1e3).round() as u64
 }
 
 #[cfg(test)]
@@ -173,6 +156,6 @@ mod tests {
         for tick in [u64::MAX - 1, 0, u64::MAX] {
             motion.timing(0.0, &LoopTiming { tick, skipped: u64::MAX, ..LoopTiming::default() });
         }
-        assert_eq!((motion.ticks, motion.skipped), (3, u64::MAX));
+        assert_eq!((motion.counts.ticks, motion.counts.skipped), (3, u64::MAX));
     }
 }

@@ -41,7 +41,7 @@ pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
         intro = format!("Not all of the run is here: {missing}. {intro}");
     }
     let mut sections = vec![draft.summary()];
-    if motion.ticks > 0 {
+    if motion.counts.ticks > 0 {
         sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
     }
     sections.extend([draft.replies(), draft.load(), draft.losses()]);
@@ -64,7 +64,7 @@ impl Draft<'_> {
 
     fn time(&self) -> Axis {
         let axis = Axis::new("time", "s");
-        if self.run.motion.ticks > 1 { axis.between(0.0, self.run.motion.seconds()) } else { axis }
+        if self.run.motion.counts.ticks > 1 { axis.between(0.0, self.run.motion.seconds()) } else { axis }
     }
 
     fn marks(&self) -> Vec<Mark> {
@@ -88,12 +88,13 @@ impl Draft<'_> {
         ] {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
-                Finding::less_is_better(what, (theirs, "Nm"), (mean, "Nm"))
+                Finding::less_is_better(what, theirs, (mean, "Nm"))
             };
             findings.extend(errors.mean().map(finding));
         }
-        if !motion.central_ns.is_empty() {
-            let median = motion.central_ns.value_at_quantile(0.5) as f64 * 1e-3;
+        let central = motion.central_took.times.histogram();
+        if !central.is_empty() {
+            let median = central.value_at_quantile(0.5) as f64 * 1e-3;
             let (active, ticks) = motion.active_sum;
             let active = active as f64 / ticks.max(1) as f64;
             let [of_active, of_each, of_none] = PAPER_CENTRAL_US;
@@ -103,20 +104,21 @@ impl Draft<'_> {
                 skin.cells.len(),
                 number((active * 10.0).round() / 10.0)
             );
-            findings.push(Finding::less_is_better(what, (law, "µs"), (median, "µs")));
+            findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
         findings.push(Finding::told("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
-            let loop_hz = hertz(motion.ticks.saturating_add(motion.unrecorded), motion.seconds());
-            findings.push(Finding::told("control loop", loop_hz).beside((PAPER_CONTROL_HZ, "Hz")));
+            let loop_hz =
+                hertz(motion.counts.ticks.saturating_add(motion.counts.unrecorded), motion.seconds());
+            findings.push(Finding::told("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
             let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
                 let finding = Finding::told("joints", hertz(count, last - first));
-                findings.push(finding.beside((PAPER_BROADCAST_HZ, "Hz")));
+                findings.push(finding.beside(PAPER_BROADCAST_HZ));
             }
-            findings.push(none("ticks skipped".to_owned(), motion.skipped));
+            findings.push(none("ticks skipped".to_owned(), motion.counts.skipped));
         }
         let accounts = self.run.lanes.iter().map(Lane::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));

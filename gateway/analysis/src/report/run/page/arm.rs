@@ -1,5 +1,6 @@
 //! What the ticks and the cells' torques come to.
 
+use hdrhistogram::Histogram;
 use protocol::packet::WORDS;
 
 use super::Draft;
@@ -22,12 +23,12 @@ impl Draft<'_> {
                 .series([self.line("distributed", distributed)])
                 .draw("central", Shape::Dashed, self.points(central))
         });
-        let errors: Vec<_> = self.run.lanes.iter().filter(|lane| lane.error.count() > 0).collect();
+        let errors: Vec<_> = self.run.lanes.iter().filter(|lane| lane.lines.error.count() > 0).collect();
         let error = (!errors.is_empty()).then(|| {
             let papers = |format: &str, mean| Mark::y(mean, format!("paper, {format}: {} Nm", number(mean)));
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
-                .series(errors.iter().map(|lane| self.line(self.named(lane), &lane.error)))
+                .series(errors.iter().map(|lane| self.line(self.named(lane), &lane.lines.error)))
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
         Section::new("torque", "Distributed and central torque")
@@ -97,23 +98,24 @@ impl Draft<'_> {
             let series = series.iter().map(|(label, thinned)| self.line(*label, thinned));
             self.figure(name, title, Axis::new("time", "µs").log()).series(series).marks(self.marks())
         };
-        let took = [("tick", &motion.took), ("central computation in it", &motion.central_took)];
+        let took = [("tick", &motion.took.line), ("central computation in it", &motion.central_took.line)];
         let figures = [
             figure("cycle", "How long each tick took, and the central computation in it", &took),
-            figure("lateness", "How late each tick began", &[("", &motion.late)]),
+            figure("lateness", "How late each tick began", &[("", &motion.late.line)]),
         ];
         let rows = [
-            ("tick began late", &motion.late_ns),
-            ("tick took", &motion.took_ns),
-            ("central computation in it", &motion.central_ns),
-            ("tick without central computation", &motion.plain_ns),
+            ("tick began late", &motion.late.times),
+            ("tick took", &motion.took.times),
+            ("central computation in it", &motion.central_took.times),
+            ("tick without central computation", &motion.plain),
         ];
-        let row = |(name, histogram): &(&str, &hdrhistogram::Histogram<u64>)| {
+        let rows = rows.into_iter().map(|(name, times)| (name, times.histogram()));
+        let row = |(name, histogram): (&str, &Histogram<u64>)| {
             let Quantiles { p50, p90, p99, max, count } = Quantiles::of(histogram, 1e-3);
             let values = [p50, p90, p99, max].map(number);
-            [(*name).to_owned()].into_iter().chain(values).chain([count.to_string()]).collect::<Vec<_>>()
+            [name.to_owned()].into_iter().chain(values).chain([count.to_string()]).collect::<Vec<_>>()
         };
-        let mut rows: Vec<_> = rows.iter().filter(|(_, histogram)| !histogram.is_empty()).map(row).collect();
+        let mut rows: Vec<_> = rows.filter(|(_, histogram)| !histogram.is_empty()).map(row).collect();
         let idle = ["idle_late_p50_us", "idle_late_p99_us", "idle_late_max_us"]
             .map(|key| self.run.fact("machine", key));
         if let [Some(p50), Some(p99), Some(max)] = idle {

@@ -37,14 +37,14 @@ impl Draft<'_> {
         let y_lost = if lost == 0 { y.clone().between(0.0, 1.0) } else { y.clone() };
         let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
         let [due, late] = [
-            [("due", &lane.due), ("in time", &lane.in_time)],
-            [("late", &lane.late), ("missing", &lane.missing)],
+            [("due", &lane.lines.due), ("in time", &lane.lines.in_time)],
+            [("late", &lane.lines.late), ("missing", &lane.lines.missing)],
         ];
         [
             steps("replies", "due and in time, epoch by epoch", y, due),
             steps("late", "late and missing, when that was settled", y_lost, late),
             self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"))
-                .series([self.line("", &lane.slowest)]),
+                .series([self.line("", &lane.lines.slowest)]),
         ]
     }
 
@@ -196,18 +196,18 @@ impl Draft<'_> {
     }
 
     pub(super) fn losses(&self) -> Section {
-        let (run, motion) = (self.run, &self.run.motion);
+        let (run, ticks) = (self.run, &self.run.motion.counts);
         let mut rows: Vec<Vec<String>> = Vec::new();
         let mut row = |what: String, count: u64, always: bool| {
             if always || count > 0 {
                 rows.push(vec![what, count.to_string()]);
             }
         };
-        row("ticks skipped by the loop".to_owned(), motion.skipped, true);
-        row("ticks that happened and are not in the recording".to_owned(), motion.unrecorded, true);
-        row("bad cycles".to_owned(), motion.bad, false);
-        row("ticks while the robot was halted".to_owned(), motion.halted, false);
-        row("ticks whose velocity was not finite".to_owned(), motion.refused, false);
+        row("ticks skipped by the loop".to_owned(), ticks.skipped, true);
+        row("ticks that happened and are not in the recording".to_owned(), ticks.unrecorded, true);
+        row("bad cycles".to_owned(), ticks.bad, false);
+        row("ticks while the robot was halted".to_owned(), ticks.halted, false);
+        row("ticks whose velocity was not finite".to_owned(), ticks.refused, false);
         for lane in &run.lanes {
             let name = &lane.name;
             let uplink = Uplink::total(lane.table.cells().iter().map(|cell| cell.uplink()));
@@ -255,8 +255,15 @@ fn carried(bus: &BusShadow) -> Table {
         let [second, short] = [start.load.worst_1_s, start.load.worst_16_ms].map(|it| percent(it.value));
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
     }
-    if bus.bench.total() > 0 {
-        row(["left out", "", "", "", "", &format!("{} frames that only a bench sends", bus.bench.total())]);
+    if bus.counts.bench.total() > 0 {
+        row([
+            "left out",
+            "",
+            "",
+            "",
+            "",
+            &format!("{} frames that only a bench sends", bus.counts.bench.total()),
+        ]);
     }
     let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
     Table::new(format!("{} at {}: does it fit", bus.bus, bus.name), head, rows)

@@ -8,8 +8,7 @@ use protocol::wire_time::{Bits, Coding, Shape};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::COMPUTATION_NS;
-use super::case::{Answers, Case};
+use super::{Answers, COMPUTATION_NS, Case};
 use crate::bus_model::{BusModel, Priority, Request};
 
 /// How long the cells of an epoch compute.

@@ -1,6 +1,6 @@
 //! What a shadow makes of a run: start-up and operation, what only a bench sends, who answered, and what fits.
 
-use super::*;
+use super::super::*;
 use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::Verdict;
 use model::generate::{Wanted, generate};
@@ -140,9 +140,9 @@ fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_asked_for() {
         let (plain, with) = (plain.shadow(options()), bench.shadow(options()));
         // A run without stimuli has reports in its start-up.
         let per_packet = if format == Format::Fd { 1 } else { 2 };
-        assert_eq!(plain.bench, BenchFrames { reports: 41 * per_packet, ..BenchFrames::default() });
+        assert_eq!(plain.counts.bench, BenchFrames { reports: 41 * per_packet, ..BenchFrames::default() });
         assert_eq!(
-            with.bench,
+            with.counts.bench,
             BenchFrames {
                 stimuli: 700 * per_packet,
                 syncs: 11 * per_packet,
@@ -155,9 +155,9 @@ fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_asked_for() {
         assert_eq!(with.delay_us, plain.delay_us);
         assert_eq!(with.answering, plain.answering);
         let all = bench.shadow(Options { bench_traffic: true, ..options() });
-        assert!(!all.bench_left_out && with.bench_left_out);
-        assert_eq!(all.bench, with.bench, "they are counted all the same");
-        assert_eq!(all.sent, with.sent + all.bench.total());
+        assert!(!all.counts.bench_left_out && with.counts.bench_left_out);
+        assert_eq!(all.counts.bench, with.counts.bench, "they are counted all the same");
+        assert_eq!(all.counts.sent, with.counts.sent + all.counts.bench.total());
         assert!(all.load.mean.unwrap() > 1.4 * with.load.mean.unwrap(), "{:?} {:?}", all.load, with.load);
     }
 }
@@ -185,7 +185,7 @@ fn start_up_stands_apart_and_what_follows_is_as_in_a_capture_that_begins_in_the_
             let middle = Run { frames: whole.frames[from..].to_vec(), ..Run::new(format) };
             let shadow = middle.shadow(options());
             assert!(shadow.start_up.is_none(), "{from}: {shadow:?}");
-            assert_eq!(shadow.frames, shadow.sent);
+            assert_eq!(shadow.frames, shadow.counts.sent);
         }
     }
 }
@@ -307,7 +307,10 @@ fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
         }
     }
     let shadow = run.shadow(options());
-    assert_eq!((shadow.sent, shadow.bench.total(), shadow.start_up.is_none()), (3_012, 0, true));
+    assert_eq!(
+        (shadow.counts.sent, shadow.counts.bench.total(), shadow.start_up.is_none()),
+        (3_012, 0, true)
+    );
     assert_eq!(shadow.this_run.unwrap().case(), "this capture");
     // Classic frames of some car.
     let mut run = Run::new(Format::Classic);
@@ -318,6 +321,9 @@ fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
         run.now += MS / 2;
     }
     let shadow = run.shadow(options());
-    assert_eq!((shadow.sent, shadow.bench.total(), shadow.start_up.is_none()), (3_000, 0, true));
+    assert_eq!(
+        (shadow.counts.sent, shadow.counts.bench.total(), shadow.start_up.is_none()),
+        (3_000, 0, true)
+    );
     assert!(shadow.this_run.unwrap().to_string().contains(" of classic 1M: fits (another protocol)"));
 }

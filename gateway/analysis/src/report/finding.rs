@@ -1,0 +1,226 @@
+//! Numbers that were found, how they compare, and how they are written.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// A number that was found, beside what the paper says.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Finding {
+    /// What was measured, with how.
+    pub what: String,
+    /// What the paper says, where it does.
+    pub paper: Option<Quantity>,
+    /// What was found.
+    pub ours: Quantity,
+    /// What it must reach, in words: `at most 0.005 Nm`.
+    pub bar: Option<String>,
+    /// How the two compare.
+    pub verdict: Verdict,
+}
+
+impl Finding {
+    /// A number of which less is better, beside the paper's: within 5 % of that it is the same.
+    #[must_use]
+    pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
+        let finding = Self::told(what, ours).beside(paper);
+        Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
+    }
+
+    /// A number of which more is better, beside the paper's: within 5 % of that it is the same.
+    #[must_use]
+    pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
+        let finding = Self::told(what, ours).beside(paper);
+        Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
+    }
+
+    /// A number that is told and not judged.
+    #[must_use]
+    pub fn told(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
+        Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Told }
+    }
+
+    /// The same, told beside the paper's in the same unit: of what is no better for being more or less.
+    #[must_use]
+    pub fn beside(mut self, paper: f64) -> Self {
+        self.paper = Some(Quantity::new(paper, self.ours.unit.clone()));
+        self
+    }
+
+    /// The same, judged by a limit in its own unit.
+    #[must_use]
+    pub fn at_most(self, limit: f64) -> Self {
+        let unit = if self.ours.unit.is_empty() { String::new() } else { format!(" {}", self.ours.unit) };
+        let kept = self.ours.value <= limit;
+        self.must(format!("at most {limit}{unit}"), kept)
+    }
+
+    /// The same, judged by whether it holds what it must: kept or better is [`Verdict::Better`].
+    #[must_use]
+    pub fn must(mut self, bar: impl Into<String>, kept: bool) -> Self {
+        self.bar = Some(bar.into());
+        self.verdict = if kept { Verdict::Better } else { Verdict::Worse };
+        self
+    }
+}
+
+/// How a number compares with the paper's, or with what it must reach.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub enum Verdict {
+    /// Better than the paper's, or within the bar.
+    Better,
+    /// The paper's, by 5 %.
+    Same,
+    /// Worse than the paper's, or outside of the bar.
+    Worse,
+    /// Not judged.
+    #[default]
+    Told,
+}
+
+impl Verdict {
+    /// Compares numbers of which less is better: within 5 % of `paper` they are the same.
+    #[must_use]
+    pub fn less_is_better(paper: f64, ours: f64) -> Self {
+        if !(paper.is_finite() && ours.is_finite()) {
+            Self::Told
+        } else if (ours - paper).abs() <= 0.05 * paper.abs() {
+            Self::Same
+        } else if ours < paper {
+            Self::Better
+        } else {
+            Self::Worse
+        }
+    }
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Better => "better",
+            Self::Same => "the same",
+            Self::Worse => "worse",
+            Self::Told => "",
+        })
+    }
+}
+
+/// A number with its unit.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Quantity {
+    /// How much.
+    pub value: f64,
+    /// Of what; empty for numbers of things.
+    pub unit: String,
+    /// Half the width of its 95 % interval, where it has one.
+    pub plus_minus: Option<f64>,
+}
+
+impl Quantity {
+    /// A number with its unit.
+    #[must_use]
+    pub fn new(value: f64, unit: impl Into<String>) -> Self {
+        Self { value, unit: unit.into(), plus_minus: None }
+    }
+
+    /// The same, with half the width of its 95 % interval.
+    #[must_use]
+    pub const fn plus_minus(mut self, half: f64) -> Self {
+        self.plus_minus = Some(half);
+        self
+    }
+}
+
+impl<T: Into<String>> From<(f64, T)> for Quantity {
+    fn from((value, unit): (f64, T)) -> Self {
+        Self::new(value, unit)
+    }
+}
+
+impl From<f64> for Quantity {
+    /// A number of things.
+    fn from(value: f64) -> Self {
+        Self::new(value, "")
+    }
+}
+
+impl fmt::Display for Quantity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&number(self.value))?;
+        if let Some(half) = self.plus_minus {
+            write!(f, " ± {}", number(half))?;
+        }
+        if self.unit.is_empty() { Ok(()) } else { write!(f, "\u{a0}{}", self.unit) }
+    }
+}
+
+/// A number for people: whole ones below a million as they are, else at most three significant digits; very
+/// small and very large ones by a power of ten; what is not finite is a dash.
+///
+/// ```
+/// # use analysis::report::figure::number;
+/// assert_eq!(number(24_364.0), "24364");
+/// assert_eq!(number(0.005_4), "0.0054");
+/// assert_eq!(number(6.25e-5), "6.25e-5");
+/// assert_eq!(number(1_919.4), "1919");
+/// ```
+#[must_use]
+pub fn number(value: f64) -> String {
+    let size = value.abs();
+    if !value.is_finite() {
+        return "–".to_owned();
+    }
+    if size < 1e6 && (value - value.round()).abs() < 1e-12 * size.max(1e-300) || size == 0.0 {
+        return format!("{:.0}", value + 0.0);
+    }
+    if !(1e-4..1e6).contains(&size) {
+        let text = format!("{value:.2e}");
+        let Some((digits, exponent)) = text.split_once('e') else { return text };
+        return format!("{}e{exponent}", digits.trim_end_matches('0').trim_end_matches('.'));
+    }
+    let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
+    let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
+    let text = format!("{value:.digits$}");
+    if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn verdicts_know_which_way_is_better_and_what_is_the_same() {
+        let quantity = |value| Quantity::new(value, "Nm");
+        let less = |ours| Finding::less_is_better("", 2.0, quantity(ours)).verdict;
+        let more = |ours| Finding::more_is_better("", 2.0, quantity(ours)).verdict;
+        assert_eq!(
+            [1.0, 1.91, 2.09, 2.2].map(less),
+            [Verdict::Better, Verdict::Same, Verdict::Same, Verdict::Worse]
+        );
+        assert_eq!(
+            [1.0, 1.95, 2.05, 3.0].map(more),
+            [Verdict::Worse, Verdict::Same, Verdict::Same, Verdict::Better]
+        );
+        assert_eq!(less(f64::NAN), Verdict::Told);
+        assert_eq!(Finding::told("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
+    }
+
+    #[test]
+    fn numbers_have_three_digits_and_no_more_zeros_than_they_need() {
+        for (value, text) in [
+            (0.0, "0"),
+            (-0.0, "0"),
+            (1.0, "1"),
+            (999_999.0, "999999"),
+            (2.5e7, "2.5e7"),
+            (0.012_345, "0.0123"),
+            (0.1, "0.1"),
+            (-12.349, "-12.3"),
+            (1.5e-7, "1.5e-7"),
+            (5e-5, "5e-5"),
+            (f64::NAN, "–"),
+        ] {
+            assert_eq!(number(value), text);
+        }
+    }
+}

@@ -1,0 +1,204 @@
+//! How many cells answered joints, and how quickly.
+
+use model::quantiles::Times;
+use protocol::id::CellId;
+use protocol::packet::Epoch;
+use serde::Serialize;
+
+use super::report::{Delays, Replies};
+use crate::fit::traffic::Says;
+use crate::fit::verdict::Cells;
+
+/// A set of cells of a bus.
+#[derive(Clone, Copy, Debug, Default)]
+struct Set([u64; 4]);
+
+impl Set {
+    fn insert(&mut self, cell: CellId) {
+        let (word, bit) = (cell.index() / 64, cell.index() % 64);
+        self.0.get_mut(word).into_iter().for_each(|word| *word |= 1 << bit);
+    }
+
+    fn len(&self) -> u32 {
+        self.0.iter().map(|word| word.count_ones()).sum()
+    }
+}
+
+/// Cells that answered, epoch by epoch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Answering {
+    /// Joints that were sent while cells were not halted.
+    pub epochs: u64,
+    /// Joints that were sent while they were.
+    pub epochs_halted: u64,
+    /// How many cells answered joints on average; none without joints.
+    pub mean: Option<f64>,
+    /// How many answered the same joints at most.
+    pub most: u32,
+    /// Cells of the bus, by the skin, else those that were heard.
+    pub cells: u32,
+    /// Whether the skin says so.
+    pub described: bool,
+}
+
+impl Answering {
+    /// In the words of [`crate::fit::verdict`].
+    #[must_use]
+    pub const fn cells(&self) -> Cells {
+        Cells::Some { most: self.most, cells: self.cells, described: self.described }
+    }
+}
+
+/// The joints of one number.
+#[derive(Clone, Copy, Debug, Default)]
+struct Numbered {
+    /// When they were to go out.
+    at: u64,
+    /// Who answered them, if they were sent while cells were not halted.
+    answered: Option<Set>,
+}
+
+/// Follows joints and what answers them, however long that lasts.
+#[derive(Debug, Default)]
+pub(super) struct Epochs {
+    heard: Set,
+    /// By the number of the epoch.
+    numbered: Vec<Numbered>,
+    newest: Option<Epoch>,
+    halted: bool,
+    closed: Counts,
+    epochs_halted: u64,
+    replies: Replies,
+    after_joints: Times,
+}
+
+/// What epochs add up to.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counts {
+    epochs: u64,
+    answers: u64,
+    most: u32,
+}
+
+impl Counts {
+    fn close(&mut self, answered: Set) {
+        self.epochs += 1;
+        self.answers += u64::from(answered.len());
+        self.most = self.most.max(answered.len());
+    }
+}
+
+impl Epochs {
+    /// What a frame says of joints and answers; the joints that it answers, and whether it is late.
+    pub(super) fn hear(&mut self, at: u64, says: Says, from: Option<CellId>) -> Option<(Epoch, bool)> {
+        from.into_iter().for_each(|cell| self.heard.insert(cell));
+        match says {
+            Says::Joints(epoch) => self.joints(at, epoch),
+            Says::Answer(epoch) => {
+                let answered = &mut self.numbered(epoch).answered;
+                from.into_iter().zip(answered).for_each(|(cell, answered)| answered.insert(cell));
+                return Some((epoch, self.newest.is_some_and(|newest| newest != epoch)));
+            }
+            Says::Halt => self.halted = true,
+            Says::Resume => self.halted = false,
+            Says::Preparation | Says::Other => {}
+        }
+        None
+    }
+
+    /// Joints were sent; the same ones again are no others.
+    fn joints(&mut self, at: u64, epoch: Epoch) {
+        let halted = self.halted;
+        let numbered = self.numbered(epoch);
+        numbered.at = at;
+        if self.newest.replace(epoch) == Some(epoch) {
+            return;
+        }
+        let numbered = self.numbered(epoch);
+        let before = std::mem::replace(&mut numbered.answered, (!halted).then(Set::default));
+        before.into_iter().for_each(|answered| self.closed.close(answered));
+        self.epochs_halted += u64::from(halted);
+    }
+
+    fn numbered(&mut self, epoch: Epoch) -> &mut Numbered {
+        self.numbered.resize(256, Numbered::default());
+        self.numbered.get_mut(usize::from(epoch.0)).expect("a number is one byte")
+    }
+
+    /// An answer that was to be sent at a time has come to its end.
+    pub(super) fn answered(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
+        let Some(newest) = self.newest else { return };
+        self.replies.count += 1;
+        if was_late {
+            self.replies.late_before += 1;
+            return;
+        }
+        let joints = self.numbered(epoch).at;
+        if newest != epoch {
+            self.replies.late += 1;
+            let next = Some(self.numbered(epoch.next()).at).filter(|&next| next > joints).unwrap_or(end);
+            let period = next.saturating_sub(joints);
+            let is_slow = at.saturating_sub(joints) > period / 8 * 7;
+            self.replies.late_when_ready += u64::from(is_slow);
+        }
+        self.after_joints.record(end.saturating_sub(joints));
+    }
+
+    /// Answers to joints, by when they came.
+    pub(super) fn replies(&self) -> Replies {
+        Replies { after_joints_us: Delays::of(&self.after_joints), ..self.replies }
+    }
+
+    /// Cells that answered; the skin may say how many there are.
+    pub(super) fn answering(&self, described: Option<u32>) -> Answering {
+        let mut all = self.closed;
+        self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.close(answered));
+        Answering {
+            epochs: all.epochs,
+            epochs_halted: self.epochs_halted,
+            mean: (all.epochs > 0).then(|| all.answers as f64 / all.epochs as f64),
+            most: all.most,
+            cells: described.unwrap_or_else(|| self.heard.len()),
+            described: described.is_some(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(number: i64) -> CellId {
+        CellId::new(number).unwrap()
+    }
+
+    #[test]
+    fn each_cell_counts_once_an_epoch_however_late_and_halted_epochs_not_at_all() {
+        let mut epochs = Epochs::default();
+        let answer = |epochs: &mut Epochs, number, epoch| {
+            epochs.hear(0, Says::Answer(Epoch(epoch)), Some(cell(number)));
+        };
+        let joints = |epochs: &mut Epochs, epoch| epochs.hear(0, Says::Joints(Epoch(epoch)), None);
+        answer(&mut epochs, 9, 255);
+        for epoch in 0..=255 {
+            joints(&mut epochs, epoch);
+            let cells = if epoch == 7 { 254 } else { 2 };
+            (1..=cells).chain([1]).for_each(|number| answer(&mut epochs, number, epoch));
+        }
+        // One is late, and joints come again.
+        joints(&mut epochs, 0);
+        answer(&mut epochs, 3, 254);
+        joints(&mut epochs, 0);
+        answer(&mut epochs, 1, 0);
+        epochs.hear(0, Says::Halt, None);
+        joints(&mut epochs, 1);
+        answer(&mut epochs, 1, 1);
+        let report = epochs.answering(None);
+        assert_eq!((report.epochs, report.epochs_halted, report.most), (257, 1, 254));
+        assert_eq!((report.cells, report.described), (254, false));
+        let answers = 256.0 * 2.0 + 252.0 + 1.0 + 1.0;
+        assert!((report.mean.unwrap() - answers / 257.0).abs() < 1e-12, "{report:?}");
+        assert_eq!(epochs.answering(Some(300)).cells, 300);
+        assert_eq!(Epochs::default().answering(None).mean, None);
+    }
+}
