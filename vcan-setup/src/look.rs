@@ -1,4 +1,4 @@
-//! Looks at this machine for the [`doctor`], and changes nothing.
+//! Looks at this machine for the [`doctor`](crate::doctor), and changes nothing.
 
 use std::fs;
 use std::io;
