@@ -18,6 +18,7 @@ mod agenda;
 pub mod bench;
 pub mod fault;
 pub mod gateway;
+mod life;
 pub mod network;
 pub mod real_bus;
 pub mod seat;

@@ -16,7 +16,7 @@ mod place;
 mod sums;
 mod survey;
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
@@ -35,7 +35,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
-use place::{Inlet, Life};
+use crate::life::Life;
+use place::Inlet;
 
 pub use place::Place;
 
@@ -224,25 +225,15 @@ impl Wiring {
 
     /// A cell hangs.
     pub fn hang(&mut self, cell: usize) {
-        let place = &mut self.cells[cell];
-        place.life = match std::mem::replace(&mut place.life, Life::Off) {
-            Life::Runs(node) => Life::Hangs(node, VecDeque::new()),
-            other @ (Life::Off | Life::Hangs(..)) => other,
-        };
+        self.cells[cell].life.hang();
     }
 
     /// A cell that hung goes on with what has gathered.
     pub fn go_on(&mut self, cell: usize) {
-        let place = &mut self.cells[cell];
-        match std::mem::replace(&mut place.life, Life::Off) {
-            Life::Hangs(node, waiting) => {
-                place.life = Life::Runs(node);
-                self.pass(cell);
-                for (stood, inlet) in waiting {
-                    self.hand(cell, stood, inlet);
-                }
-            }
-            other @ (Life::Off | Life::Runs(_)) => place.life = other,
+        let Some(waiting) = self.cells[cell].life.go_on() else { return };
+        self.pass(cell);
+        for (stood, inlet) in waiting {
+            self.hand(cell, stood, inlet);
         }
     }
 

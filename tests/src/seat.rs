@@ -1,7 +1,5 @@
 //! The place of one cell: the real [`Node`] with what a process around it does.
 
-use std::collections::VecDeque;
-
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
@@ -9,24 +7,13 @@ use protocol::can::{Format, Frame};
 use protocol::packet::Packet;
 use protocol::time::{Micros, Span};
 
+use crate::life::Life;
+
 /// Frames that a shell takes from its socket at once, before it sends what they lead to.
 const BATCH: usize = 64;
 
 /// A frame that waits in a socket, and when it stood on the wire.
 pub(crate) type Waiting = (Micros, Frame);
-
-/// How a cell is.
-#[derive(Debug)]
-enum Life {
-    /// Without power.
-    Off,
-    /// As it should be.
-    Runs(Box<Node>),
-    /// It does nothing, and frames gather in its socket.
-    Hangs(Box<Node>, VecDeque<Waiting>),
-    /// Another cell has its number; that one's serial number.
-    GaveUp(u32),
-}
 
 /// A cell, or the place for one.
 #[derive(Debug)]
@@ -40,7 +27,10 @@ pub struct Seat {
     /// How often it was switched on: packets of an earlier life are not this one's.
     pub lives: u32,
     format: Format,
-    life: Life,
+    /// While it hangs, frames gather in its socket.
+    life: Life<Waiting>,
+    /// Another cell has its number; that one's serial number.
+    gave_up: Option<u32>,
     /// When it wants to be woken.
     pub(crate) wake: Option<Micros>,
 }
@@ -50,62 +40,46 @@ impl Seat {
     #[must_use]
     pub const fn new(identity: Identity, flash: Flash, format: Format) -> Self {
         let thinks = Span(30);
-        Self { identity, flash, thinks, lives: 0, format, life: Life::Off, wake: None }
+        Self { identity, flash, thinks, lives: 0, format, life: Life::Off, gave_up: None, wake: None }
     }
 
     /// The cell, unless it is off or gave up.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
-        match &self.life {
-            Life::Runs(node) | Life::Hangs(node, _) => Some(node),
-            Life::Off | Life::GaveUp(_) => None,
-        }
+        self.life.node()
     }
 
     /// The serial number of the cell that it gave way to.
     #[must_use]
     pub const fn gave_up(&self) -> Option<u32> {
-        match self.life {
-            Life::GaveUp(serial) => Some(serial),
-            Life::Off | Life::Runs(_) | Life::Hangs(..) => None,
-        }
+        self.gave_up
     }
 
     /// Whether it works.
     #[must_use]
     pub const fn runs(&self) -> bool {
-        matches!(self.life, Life::Runs(_))
+        self.life.runs()
     }
 
     /// Switches it on; a simulated cell obeys stimuli from the start.
     pub(crate) fn start(&mut self, now: Micros) {
         self.lives += 1;
         self.life = Life::Runs(Box::new(Node::new(self.identity, self.format, &self.flash, true, now)));
-        self.wake = None;
+        (self.gave_up, self.wake) = (None, None);
     }
 
     /// Switches it off: what it knew is gone, but for its flash.
     pub(crate) fn kill(&mut self) {
-        self.life = Life::Off;
+        (self.life, self.gave_up) = (Life::Off, None);
     }
 
     pub(crate) fn hang(&mut self) {
-        self.life = match core::mem::replace(&mut self.life, Life::Off) {
-            Life::Runs(node) => Life::Hangs(node, VecDeque::new()),
-            other @ (Life::Off | Life::Hangs(..) | Life::GaveUp(_)) => other,
-        };
+        self.life.hang();
     }
 
     /// It goes on after a hang, as the shell does: timers first, then what has gathered, a batch at a time.
     pub(crate) fn go_on(&mut self, now: Micros) -> Vec<Packet> {
-        let (node, mut waiting) = match core::mem::replace(&mut self.life, Life::Off) {
-            Life::Hangs(node, waiting) => (node, waiting),
-            other @ (Life::Off | Life::Runs(_) | Life::GaveUp(_)) => {
-                self.life = other;
-                return Vec::new();
-            }
-        };
-        self.life = Life::Runs(node);
+        let Some(mut waiting) = self.life.go_on() else { return Vec::new() };
         let mut packets = self.time(now);
         while !waiting.is_empty() {
             let batch: Vec<_> = waiting.drain(..waiting.len().min(BATCH)).collect();
@@ -135,7 +109,7 @@ impl Seat {
             let Life::Runs(node) = &mut self.life else { break };
             node.handle_frame(now, now.since(stood), &frame);
             if let Some(serial) = node.taken() {
-                self.life = Life::GaveUp(serial);
+                (self.life, self.gave_up) = (Life::Off, Some(serial));
             }
         }
         self.sends()

@@ -284,16 +284,23 @@ impl Node {
             self.summing.begin(now, age, (epoch, in_use.period()), torque);
             return self.handle_sums(now);
         }
-        match torque {
+        self.answer_joints(epoch, torque);
+    }
+
+    /// Answers with its own torque; one that is zero says once that a contact has ended.
+    fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque>) {
+        let Some(from) = self.identity.cell else { return };
+        let torque = match torque {
             Some(torque) => {
                 self.active = true;
                 self.mark_saturated(torque.is_saturated());
-                self.push_torque(epoch, torque.words());
+                torque.words()
             }
-            // One zero torque says that a contact has ended.
-            None if core::mem::take(&mut self.active) => self.push_torque(epoch, [Q3_12::ZERO; WORDS]),
-            None => {}
-        }
+            None if core::mem::take(&mut self.active) => [Q3_12::ZERO; WORDS],
+            None => return,
+        };
+        count(&mut self.heard.torques);
+        self.push(Message::Torque { from, epoch, torque });
     }
 
     /// What is due before the next joints is said now, while the cell is awake: hellos and a heartbeat.
@@ -323,12 +330,6 @@ impl Node {
     /// A word that is sent may be saturated, which the next heartbeat says.
     fn mark_saturated(&mut self, saturated: bool) {
         self.flags = self.flags.with(State::SATURATED, saturated || self.flags.has(State::SATURATED));
-    }
-
-    fn push_torque(&mut self, epoch: Epoch, torque: [Q3_12; WORDS]) {
-        let Some(from) = self.identity.cell else { return };
-        count(&mut self.heard.torques);
-        self.push(Message::Torque { from, epoch, torque });
     }
 
     fn push_network(&mut self, page: NetworkPage) {

@@ -4,7 +4,6 @@ use std::collections::{HashMap, VecDeque};
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
-use cell_node::node::Node;
 use cell_node::sum::Words;
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, Q3_12, Q7_8};
@@ -18,15 +17,9 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 
 use super::{End, positions};
+use crate::life::Life;
 
-/// How a cell is.
-#[derive(Debug)]
-pub(super) enum Life {
-    Off,
-    Runs(Box<Node>),
-    Hangs(Box<Node>, VecDeque<(Micros, Inlet)>),
-}
-
+/// What comes in to a cell.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Inlet {
     Frame(Frame),
@@ -51,7 +44,7 @@ pub struct Place {
     pub(super) serial: u32,
     pub(super) parameters: Parameters,
     pub(super) force: Force,
-    pub(super) life: Life,
+    pub(super) life: Life<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
     /// What it hears aside, and when that stood on the bus: it does not wake it.
     pub(super) aside: VecDeque<(Micros, Frame)>,

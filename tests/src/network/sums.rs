@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::message::Message;
 use protocol::packet::{Epoch, WORDS};
 
-use super::place::{Inlet, Life};
+use super::place::Inlet;
 use super::{End, Event, Wiring};
 
 impl Wiring {
@@ -31,11 +31,8 @@ impl Wiring {
             })
             .collect();
         for other in neighbours {
-            let hears = match &self.cells[other].life {
-                Life::Runs(node) | Life::Hangs(node, _) => node.hears().any(|id| id == frame_id(from)),
-                Life::Off => false,
-            };
-            if hears {
+            let node = self.cells[other].life.node();
+            if node.is_some_and(|node| node.hears().any(|id| id == frame_id(from))) {
                 let at = self.arrival(Some(other));
                 self.agenda.enter(at, Event::Deliver(other, Inlet::Frame(frame)));
             }

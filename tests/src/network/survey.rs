@@ -4,14 +4,14 @@ use std::collections::BTreeSet;
 
 use protocol::id::{CellId, Command, Id};
 
-use super::place::Life;
 use super::{End, Wiring};
+use crate::life::Life;
 
 impl Wiring {
     /// Whether a cell works.
     #[must_use]
     pub fn runs(&self, cell: usize) -> bool {
-        matches!(self.cells[cell].life, Life::Runs(_))
+        self.cells[cell].life.runs()
     }
 
     /// Whether a cell is woken by its children and not by joints.
