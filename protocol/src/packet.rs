@@ -25,7 +25,7 @@ const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_IBM_3740);
 /// Words in a packet; joints that a robot can have.
 pub const WORDS: usize = 6;
 /// Bytes in a packet.
-pub const BYTES: usize = 16;
+pub const BYTES: usize = 2 * WORDS + 4;
 /// Bytes in each of its two classic frames.
 const HALF_BYTES: usize = BYTES / 2;
 
@@ -33,6 +33,17 @@ const HALF_BYTES: usize = BYTES / 2;
 #[must_use]
 pub fn crc16(bytes: &[u8]) -> u16 {
     CRC.checksum(bytes)
+}
+
+/// The words that begin so; the others are 0.
+#[must_use]
+pub fn words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
+    const { assert!(N <= WORDS, "a packet has no more words") }
+    let mut words = [0; WORDS];
+    for (word, first) in words.iter_mut().zip(first) {
+        *word = first;
+    }
+    words
 }
 
 /// The number of a joint broadcast, modulo 256.

@@ -10,7 +10,7 @@ use model::decode::settle::Settler;
 use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
-use protocol::message::Message;
+use protocol::id::Kind;
 use protocol::time::Micros;
 
 /// Colours of a terminal.
@@ -175,14 +175,12 @@ fn of(decoded: &Decoded) -> &'static str {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Half { .. } => DIM,
         Decoded::Damaged { .. } | Decoded::Meaningless { .. } => RED,
         Decoded::Message(_) if decoded.is_saturated() => YELLOW,
-        Decoded::Message(message) => match message {
-            Message::Halt | Message::Joints { .. } | Message::Sync | Message::Resume | Message::Report => {
-                CYAN
-            }
-            Message::Torque { .. } | Message::Sum { .. } => PLAIN,
-            Message::Stimulus { .. } | Message::Sensors { .. } => MAGENTA,
-            Message::Configure { .. } | Message::Configured { .. } => GREEN,
-            Message::Network { .. } => DIM,
+        Decoded::Message(message) => match message.id().kind {
+            Kind::Command => CYAN,
+            Kind::Torque | Kind::Sum => PLAIN,
+            Kind::Stimulus | Kind::Sensors => MAGENTA,
+            Kind::Configure | Kind::Configured => GREEN,
+            Kind::Network => DIM,
         },
     }
 }

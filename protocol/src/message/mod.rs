@@ -25,7 +25,7 @@ use thiserror::Error;
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
 use crate::id::{CellId, Command, Id, Kind, Node};
-use crate::packet::{Epoch, Packet, WORDS};
+use crate::packet::{self, Epoch, Packet, WORDS};
 
 /// The version of this protocol, in every heartbeat.
 pub const VERSION: u8 = 1;
@@ -344,7 +344,9 @@ impl Message {
                     Answer::Value { number, written, words } => {
                         (number | if written { WRITE } else { 0 }, words)
                     }
-                    Answer::Refused { number, reason } => (REFUSED, [i16::from(number), reason, 0, 0, 0, 0]),
+                    Answer::Refused { number, reason } => {
+                        (REFUSED, packet::words([i16::from(number), reason]))
+                    }
                 };
                 Packet { id: cell(Kind::Configured, from), words, epoch: Epoch(tag), count }
             }

@@ -2,7 +2,7 @@
 
 use super::{MessageError, State};
 use crate::id::Kind;
-use crate::packet::WORDS;
+use crate::packet::{self, WORDS};
 
 /// In a tree page: no parent.
 const NOBODY: u8 = 255;
@@ -147,7 +147,7 @@ impl PortState {
 
 impl NetworkPage {
     pub(super) fn decode(page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
-        let [a, b, c, d, e, f] = words.map(i16::cast_unsigned);
+        let [a, b, c, d, e, f, ..] = words.map(i16::cast_unsigned);
         match page {
             0 => Ok(Self::Heartbeat(Heartbeat {
                 serial: u32::from(a) | (u32::from(b) << 16),
@@ -220,6 +220,6 @@ impl NetworkPage {
                 (4, [a, b, c, d, changes, 0])
             }
         };
-        (page, words.map(u16::cast_signed))
+        (page, packet::words(words.map(u16::cast_signed)))
     }
 }

@@ -3,7 +3,7 @@
 use super::MessageError;
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::id::Kind;
-use crate::packet::WORDS;
+use crate::packet::{self, WORDS};
 
 /// What a cell measures, or shall feel.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -27,7 +27,7 @@ pub struct SkinSensors {
 
 impl SensorPage {
     pub(super) fn decode(kind: Kind, page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
-        let [a, b, c, d, e, f] = words;
+        let [a, b, c, d, e, f, ..] = words;
         match page {
             0 => Ok(Self::Skin(SkinSensors {
                 contact: [a, b, c].map(Q5_10::from_bits),
@@ -43,12 +43,9 @@ impl SensorPage {
         match self {
             Self::Skin(SkinSensors { contact, proximity, temperature }) => {
                 let ([a, b, c], [e, f]) = (contact.map(Q5_10::to_bits), temperature.map(Q9_6::to_bits));
-                (0, [a, b, c, proximity.to_bits(), e, f])
+                (0, packet::words([a, b, c, proximity.to_bits(), e, f]))
             }
-            Self::Acceleration(xyz) => {
-                let [x, y, z] = xyz.map(Q3_12::to_bits);
-                (1, [x, y, z, 0, 0, 0])
-            }
+            Self::Acceleration(xyz) => (1, packet::words(xyz.map(Q3_12::to_bits))),
         }
     }
 }

@@ -28,7 +28,7 @@ pub use switches::{Cuts, Events, Reply, Sensing, Slots};
 use thiserror::Error;
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10};
-use crate::packet::{WORDS, crc16};
+use crate::packet::{WORDS, crc16, words};
 
 /// The longest chain of joints.
 pub const MAX_JOINTS: usize = WORDS;
@@ -256,23 +256,22 @@ impl Parameters {
     #[must_use]
     pub fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         match parameter {
-            Parameter::Mount => [i16::from(self.joint), i16::from(self.joints), 0, 0, 0, 0],
+            Parameter::Mount => words([i16::from(self.joint), i16::from(self.joints)]),
             Parameter::Pose => {
                 let ([x, y, z], [nx, ny, nz]) = (self.pose.position, self.pose.normal);
-                [x, y, z, nx, ny, nz].map(Q1_14::to_bits)
+                words([x, y, z, nx, ny, nz].map(Q1_14::to_bits))
             }
-            Parameter::Contact => [
+            Parameter::Contact => words([
                 self.contact.alpha_c.to_bits(),
                 self.contact.alpha_p.to_bits(),
                 self.contact.contact_threshold.to_bits(),
                 self.contact.proximity_threshold.to_bits(),
                 self.contact.force_threshold.to_bits(),
-                0,
-            ],
-            Parameter::Timing => [self.period_us.cast_signed(), 0, 0, 0, 0, 0],
+            ]),
+            Parameter::Timing => words([self.period_us.cast_signed()]),
             Parameter::Row(row) => {
                 let row = self.rows.get(usize::from(row)).copied().unwrap_or_default();
-                [row.a.to_bits(), row.d.to_bits(), row.alpha.to_bits(), row.theta_offset.to_bits(), 0, 0]
+                words([row.a, row.d, row.alpha, row.theta_offset].map(Q1_14::to_bits))
             }
             Parameter::Identity
             | Parameter::Mode
@@ -289,7 +288,7 @@ impl Parameters {
     /// # Errors
     /// When the parameter is not one that is stored, or a count does not fit its byte.
     pub fn set(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), ParameterError> {
-        let [w0, w1, w2, w3, w4, w5] = words;
+        let [w0, w1, w2, w3, w4, w5, ..] = words;
         match parameter {
             Parameter::Mount => {
                 self.joints = u8::try_from(w1).map_err(|_| ParameterError::Joints { got: w1 })?;

@@ -1,7 +1,7 @@
 //! What is switched at run time: the parameters 6 to 9, which are volatile.
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
-use crate::packet::WORDS;
+use crate::packet::{self, WORDS};
 
 /// What a cell answers joints with, parameter 6. Volatile: a cell starts with [`Reply::Torque`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -27,11 +27,11 @@ pub struct Slots {
 impl Reply {
     /// The words of the parameter.
     #[must_use]
-    pub const fn words(self) -> [i16; WORDS] {
+    pub fn words(self) -> [i16; WORDS] {
         match self {
             Self::Torque => [0; WORDS],
             Self::Sum(Slots { slot_us, deepest, carry }) => {
-                [1, slot_us.cast_signed(), deepest as i16, carry as i16, 0, 0]
+                packet::words([1, slot_us.cast_signed(), i16::from(deepest), i16::from(carry)])
             }
         }
     }
@@ -71,11 +71,11 @@ pub enum Sensing {
 impl Sensing {
     /// The words of the parameter.
     #[must_use]
-    pub const fn words(self) -> [i16; WORDS] {
+    pub fn words(self) -> [i16; WORDS] {
         match self {
             Self::Off => [0; WORDS],
-            Self::Continuous { period_ms } => [1, period_ms.cast_signed(), 0, 0, 0, 0],
-            Self::Event => [2, 0, 0, 0, 0, 0],
+            Self::Continuous { period_ms } => packet::words([1, period_ms.cast_signed()]),
+            Self::Event => packet::words([2]),
         }
     }
 
@@ -125,21 +125,20 @@ impl Default for Events {
 impl Events {
     /// The words of the parameter.
     #[must_use]
-    pub const fn words(self) -> [i16; WORDS] {
-        [
+    pub fn words(self) -> [i16; WORDS] {
+        packet::words([
             self.contact.to_bits(),
             self.proximity.to_bits(),
             self.temperature.to_bits(),
             self.acceleration.to_bits(),
             self.hysteresis.to_bits(),
-            0,
-        ]
+        ])
     }
 
     /// What the words say; `None` when one is negative, or the hysteresis above 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
-        let [contact, proximity, temperature, acceleration, hysteresis, _] = words;
+        let [contact, proximity, temperature, acceleration, hysteresis, ..] = words;
         let sound = words.iter().all(|&word| word >= 0) && hysteresis <= 1 << 14;
         sound.then_some(Self {
             contact: Q5_10::from_bits(contact),
@@ -154,8 +153,8 @@ impl Events {
 impl Cuts {
     /// The words of the parameter.
     #[must_use]
-    pub const fn words(self) -> [i16; WORDS] {
-        [self.deaf as i16, 0, 0, 0, 0, 0]
+    pub fn words(self) -> [i16; WORDS] {
+        packet::words([i16::from(self.deaf)])
     }
 
     /// What the words say; other bits than those of ports are not looked at.

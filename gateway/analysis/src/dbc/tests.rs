@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use can_dbc::{AttributeValue, ByteOrder, Dbc, MessageId, MultiplexIndicator, ValueDescription, ValueType};
 use proptest::prelude::*;
-use protocol::fixed::{Q, Q1_14};
-use protocol::message::{Answer, From, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{Epoch, Packet, WORDS};
-use protocol::parameters::Parameter;
+use protocol::message::Message;
+use protocol::packet::{BYTES, Epoch, Packet, WORDS};
+
+mod said;
 
 use super::*;
 use model::generate::{self, Wanted};
@@ -23,7 +23,7 @@ fn parsed(skin: &Skin, bus: usize) -> Dbc {
 }
 
 /// What a frame says by the DBC alone: the message's name, and each signal that is there with its value.
-fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; 16]) -> (String, BTreeMap<String, f64>) {
+fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; BYTES]) -> (String, BTreeMap<String, f64>) {
     let whole = u128::from_le_bytes(*bytes);
     let raw = |signal: &can_dbc::Signal| {
         assert_eq!(signal.byte_order, ByteOrder::LittleEndian);
@@ -49,246 +49,6 @@ fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; 16]) -> (String, BTreeMap<String,
         }
     }
     (dbc.name.clone(), values)
-}
-
-/// What a message says, by names and in units, as the protocol's own types have it.
-#[derive(Default)]
-struct Said(BTreeMap<String, f64>);
-
-impl Said {
-    fn put(&mut self, name: impl Into<String>, value: impl Into<f64>) {
-        assert!(self.0.insert(name.into(), value.into()).is_none());
-    }
-
-    fn each<T>(&mut self, names: [&str; WORDS], values: [T; WORDS], value: impl Fn(T) -> f64) {
-        for (name, of) in names.into_iter().zip(values) {
-            self.put(name, value(of));
-        }
-    }
-
-    fn state(&mut self, state: State) {
-        for (bit, name) in State::NAMES {
-            self.put(format!("state_{}", name.replace('-', "_")), u8::from(state.has(bit)));
-        }
-        self.put("state_joint", state.joint());
-        self.put("state_version", state.version());
-    }
-
-    fn felt(&mut self, page: SensorPage) {
-        match page {
-            SensorPage::Skin(skin) => {
-                self.put("page", 0);
-                for (index, contact) in (1..).zip(skin.contact) {
-                    self.put(format!("contact_{index}"), contact.to_f64());
-                }
-                self.put("proximity", skin.proximity.to_f64());
-                self.put("temperature_1", skin.temperature[0].to_f64());
-                self.put("temperature_2", skin.temperature[1].to_f64());
-            }
-            SensorPage::Acceleration(xyz) => {
-                self.put("page", 1);
-                for (axis, value) in ["x", "y", "z"].into_iter().zip(xyz) {
-                    self.put(format!("acceleration_{axis}"), value.to_f64());
-                }
-            }
-        }
-    }
-
-    fn parameter(&mut self, number: u8, words: [i16; WORDS]) {
-        self.put("parameter", number);
-        let unsigned = words.map(i16::cast_unsigned);
-        let q14 = |index: usize| Q1_14::from_bits(words[index]);
-        let newtons = |index: usize| Q::<10>::from_bits(words[index]).to_f64();
-        match Parameter::from_number(number) {
-            None => {}
-            Some(Parameter::Identity) => {
-                self.put("serial", u32::from(unsigned[0]) + (u32::from(unsigned[1]) << 16));
-                self.put("version", unsigned[2]);
-                self.put("configuration", unsigned[3]);
-                self.state(State(unsigned[4]));
-            }
-            Some(Parameter::Mount) => {
-                self.put("mount_joint", words[0]);
-                self.put("mount_joints", words[1]);
-            }
-            Some(Parameter::Pose) => {
-                let names = ["pose_x", "pose_y", "pose_z", "normal_x", "normal_y", "normal_z"];
-                self.each(names, words.map(Q1_14::from_bits), Q::to_f64);
-            }
-            Some(Parameter::Contact) => {
-                self.put("alpha_c", Q::<12>::from_bits(words[0]).to_f64());
-                self.put("alpha_p", newtons(1));
-                self.put("contact_threshold", newtons(2));
-                self.put("proximity_threshold", q14(3).to_f64());
-                self.put("force_threshold", newtons(4));
-            }
-            Some(Parameter::Timing) => self.put("period", unsigned[0]),
-            Some(Parameter::Mode) => self.put("mode", words[0]),
-            Some(Parameter::Reply) => {
-                self.put("reply", words[0]);
-                self.put("reply_slot", unsigned[1]);
-                self.put("reply_deepest", words[2]);
-                self.put("reply_carry", words[3]);
-            }
-            Some(Parameter::Sensing) => {
-                self.put("sensing", words[0]);
-                self.put("sensing_period", unsigned[1]);
-            }
-            Some(Parameter::Events) => {
-                self.put("events_contact", newtons(0));
-                self.put("events_proximity", q14(1).to_f64());
-                self.put("events_temperature", Q::<6>::from_bits(words[2]).to_f64());
-                self.put("events_acceleration", Q::<12>::from_bits(words[3]).to_f64());
-                self.put("events_hysteresis", q14(4).to_f64());
-            }
-            Some(Parameter::Cuts) => {
-                for port in 0..5 {
-                    self.put(format!("cut_port_{port}"), words[0] >> port & 1);
-                }
-            }
-            Some(Parameter::Row(row)) => {
-                let row = row + 1;
-                self.put(format!("row{row}_a"), q14(0).to_f64());
-                self.put(format!("row{row}_d"), q14(1).to_f64());
-                self.put(format!("row{row}_alpha"), q14(2).to_radians());
-                self.put(format!("row{row}_theta_offset"), q14(3).to_radians());
-            }
-            Some(Parameter::Commit) => self.put("commit_hash", unsigned[0]),
-        }
-    }
-}
-
-/// The name of a message and what it says; `None` for values that no encoding has.
-fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
-    let mut said = Said::default();
-    let crc = u16::from_le_bytes(packet.encode()[14..].try_into().unwrap());
-    said.put("crc", crc);
-    let numbered = |name: &str| std::array::from_fn::<_, WORDS, _>(|index| format!("{name}_{}", index + 1));
-    let name = match *message {
-        Message::Halt => "halt".to_owned(),
-        Message::Sync => "sync".to_owned(),
-        Message::Resume => "resume".to_owned(),
-        Message::Report => "report".to_owned(),
-        Message::Joints { epoch, joints } => {
-            said.put("epoch", epoch.0);
-            said.put("count", joints.in_use);
-            said.each(
-                numbered("position").each_ref().map(String::as_str),
-                joints.positions,
-                Q1_14::to_radians,
-            );
-            "joints".to_owned()
-        }
-        Message::Sum { from, epoch, torque, count } => {
-            said.put("epoch", epoch.0);
-            said.put("count", count);
-            said.each(numbered("sum").each_ref().map(String::as_str), torque, Q::to_f64);
-            format!("sum_{from}")
-        }
-        Message::Torque { from, epoch, torque } => {
-            said.put("epoch", epoch.0);
-            said.put("count", 1);
-            said.each(numbered("torque").each_ref().map(String::as_str), torque, Q::to_f64);
-            format!("torque_{from}")
-        }
-        Message::Sensors { from, epoch, page } => {
-            said.put("epoch", epoch.0);
-            said.felt(page);
-            format!("sensors_{from}")
-        }
-        Message::Network { from, epoch, page } => {
-            said.put("epoch", epoch.0);
-            match page {
-                NetworkPage::Heartbeat(heartbeat) => {
-                    said.put("page", 0);
-                    said.put("serial", heartbeat.serial);
-                    said.put("configuration", heartbeat.configuration);
-                    said.put("sent", heartbeat.sent);
-                    said.put("rejected", heartbeat.rejected);
-                    said.state(heartbeat.state);
-                }
-                NetworkPage::Heard(heard) => {
-                    said.put("page", 1);
-                    said.put("heard_joints", heard.joints);
-                    said.put("heard_joints_skipped", heard.joints_late);
-                    said.put("heard_joints_repeated", heard.joints_repeated);
-                    said.put("heard_stimuli", heard.stimuli);
-                    said.put("heard_stimuli_late", heard.stimuli_late);
-                    said.put("heard_torques", heard.torques);
-                }
-                NetworkPage::Refused(refused) => {
-                    said.put("page", 2);
-                    said.put("refused_length", refused.length);
-                    said.put("refused_crc", refused.crc);
-                    said.put("refused_foreign", refused.foreign);
-                    said.put("refused_meaning", refused.meaning);
-                    said.put("refused_incomplete", refused.incomplete);
-                    said.put("refused_stimuli", refused.stimuli);
-                }
-                NetworkPage::Tree(tree) => {
-                    said.put("page", 3);
-                    said.put("parent", tree.parent.unwrap_or(255));
-                    said.put("up", tree.up);
-                    said.put("depth", tree.depth);
-                    said.put("round", tree.round);
-                    for port in 0..4 {
-                        said.put(format!("child_at_{port}"), tree.children >> port & 1);
-                    }
-                    for port in 0..5 {
-                        said.put(format!("port_{port}_works"), tree.works >> port & 1);
-                    }
-                    said.put("sums_sent", tree.sent);
-                    said.put("sums_taken", tree.taken);
-                    said.put("sums_dropped", tree.dropped);
-                }
-                NetworkPage::Ports(ports) => {
-                    said.put("page", 4);
-                    for (index, port) in ports.ports.into_iter().enumerate() {
-                        said.put(format!("port_{index}_leads_to"), port.number);
-                        said.put(format!("port_{index}_leads_to_port"), port.port);
-                        said.put(format!("port_{index}_hears"), u8::from(port.hears));
-                        said.put(format!("port_{index}_both_ways"), u8::from(port.works));
-                        said.put(format!("port_{index}_other_version"), u8::from(port.other_version));
-                    }
-                    said.put("parent_changes", ports.changes);
-                }
-            }
-            format!("network_{from}")
-        }
-        Message::Configure { to, tag, request } => {
-            said.put("tag", tag);
-            let (number, words) = match request {
-                Request::Read { number } => (number, [0; WORDS]),
-                Request::Write { number, words } => (number, words),
-            };
-            said.put("write", u8::from(matches!(request, Request::Write { .. })));
-            said.parameter(number, words);
-            format!("configure_{to}")
-        }
-        Message::Configured { from, tag, answer } => {
-            said.put("tag", tag);
-            match answer {
-                Answer::Value { number, written, words } => {
-                    said.put("written", u8::from(written));
-                    said.parameter(number, words);
-                }
-                Answer::Refused { number, reason } => {
-                    said.put("written", 0);
-                    said.put("parameter", 126);
-                    said.put("refused_parameter", number);
-                    said.put("refused_reason", reason);
-                }
-            }
-            format!("configured_{from}")
-        }
-        Message::Stimulus { to, from, page } => {
-            said.put("epoch", if let From::Epoch(epoch) = from { epoch.0 } else { 0 });
-            said.put("from_next", u8::from(from == From::Next));
-            said.felt(page);
-            format!("stimulus_{to}")
-        }
-    };
-    (name, said.0)
 }
 
 /// Every message of the DBC by its identifier.
@@ -323,7 +83,7 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
         let packet = Packet { id: Id::from_bits(id), words, epoch: Epoch(epoch), count };
         let Ok(message) = Message::decode(&packet) else { return Ok(()) };
         let packet = message.encode();
-        let (name, expected) = by_protocol(&message, &packet);
+        let (name, expected) = said::by_protocol(&message, &packet);
         let (named, found) = by_dbc(messages[&id], &packet.encode());
         prop_assert_eq!(named, name);
         prop_assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());

@@ -271,7 +271,8 @@ mod tests {
     }
 
     fn mode(to: Node, words: i16) -> Message {
-        let request = Request::Write { number: Parameter::Mode.number(), words: [words, 0, 0, 0, 0, 0] };
+        let request =
+            Request::Write { number: Parameter::Mode.number(), words: protocol::packet::words([words]) };
         Message::Configure { to, tag: 0, request }
     }
 

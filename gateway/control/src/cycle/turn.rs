@@ -180,10 +180,10 @@ impl Turn {
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
         }
-        match outcome.command {
-            Some(Command::Halt) => self.command(Message::Halt, &mut send),
-            Some(Command::Resume) => self.command(Message::Resume, &mut send),
-            Some(Command::Joints | Command::Sync | Command::Report) | None => {}
+        if outcome.command == Some(Command::Halt) {
+            self.command(Message::Halt, &mut send);
+        } else if outcome.command == Some(Command::Resume) {
+            self.command(Message::Resume, &mut send);
         }
         let timed = Timed {
             record: outcome.record,

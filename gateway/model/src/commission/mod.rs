@@ -150,35 +150,27 @@ impl Commission {
 
     /// Takes what somebody else said on the bus; [`Commission::handle_time`] says what that leads to.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
-        match *message {
-            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => self.end(Trouble::Rival),
-            Message::Configure { request: Request::Write { number, .. }, .. } if is_stored(number) => {
-                self.end(Trouble::Meddler);
+        if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
+            self.end(Trouble::Rival);
+        } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message
+            && is_stored(number)
+        {
+            self.end(Trouble::Meddler);
+        } else if let Message::Network {
+            from: Node::Cell(number),
+            page: NetworkPage::Heartbeat(heartbeat),
+            ..
+        } = *message
+        {
+            self.hear(now, number, &heartbeat);
+        } else if let Message::Configured { from, tag, answer } = *message {
+            let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
+            let wish = self.wish;
+            let Some(task) = self.holder(from) else { return };
+            task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
+            if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
+                call.attempt.extend(now);
             }
-            Message::Network {
-                from: Node::Cell(number), page: NetworkPage::Heartbeat(heartbeat), ..
-            } => {
-                self.hear(now, number, &heartbeat);
-            }
-            Message::Configured { from, tag, answer } => {
-                let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
-                let wish = self.wish;
-                let Some(task) = self.holder(from) else { return };
-                task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
-                if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
-                    call.attempt.extend(now);
-                }
-            }
-            Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Halt
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Stimulus { .. } => {}
         }
     }
 

@@ -119,7 +119,7 @@ impl Task {
     /// The words of a parameter as the cell should have them.
     pub(super) fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         if parameter == Parameter::Commit {
-            return [self.hash.cast_signed(), 0, 0, 0, 0, 0];
+            return protocol::packet::words([self.hash.cast_signed()]);
         }
         self.wanted.words(parameter)
     }
