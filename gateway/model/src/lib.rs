@@ -18,7 +18,6 @@ pub mod listing;
 pub mod network;
 pub mod quantiles;
 pub mod scenario;
-pub mod stimuli;
 pub mod table;
 #[doc(hidden)]
 pub mod testing;

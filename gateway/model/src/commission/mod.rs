@@ -17,6 +17,7 @@
 
 pub mod numbers;
 mod outcome;
+mod report;
 mod roster;
 mod task;
 
@@ -33,6 +34,7 @@ use roster::Roster;
 use task::{Stage, Task};
 
 pub use outcome::{Ask, Outcome, Reason, Trouble};
+pub use report::{CellReport, Progress, Report, Stranger};
 pub use task::Wish;
 
 /// How long a bus is listened to before anything is said: two gateways notice each other in this time.
@@ -79,60 +81,6 @@ struct Call {
     tries: u8,
     /// When it is over, unless somebody answers before that.
     due: Micros,
-}
-
-/// How far it is, for people.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Progress {
-    /// What is being done: listening, looking for cells, writing, reading back, waiting for heartbeats.
-    pub doing: &'static str,
-    /// Cells of the description on this bus.
-    pub cells: usize,
-    /// Of these, heard.
-    pub found: usize,
-    /// Of these, finished well.
-    pub done: usize,
-    /// Of these, given up.
-    pub failed: usize,
-}
-
-/// What became of one cell.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CellReport {
-    /// Its number in the description.
-    pub described: CellId,
-    /// Its serial number.
-    pub serial: u32,
-    /// Its number on the bus, if it was heard.
-    pub number: Option<CellId>,
-    /// What became of it.
-    pub outcome: Outcome,
-}
-
-/// A cell that the description does not have on this bus.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Stranger {
-    /// Its number on the bus.
-    pub number: CellId,
-    /// Its serial number.
-    pub serial: u32,
-    /// The bus on which the description has it.
-    pub belongs: Option<String>,
-}
-
-/// What became of one bus.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Report {
-    /// The described cells, in the file's order.
-    pub cells: Vec<CellReport>,
-    /// The others, by number; they were left alone.
-    pub strangers: Vec<Stranger>,
-    /// Requests to one cell or to everyone.
-    pub requests: u64,
-    /// Of these, said again because nobody answered.
-    pub repeated: u64,
-    /// Why the bus was left alone from some moment on.
-    pub trouble: Option<Trouble>,
 }
 
 /// The commissioning of one bus.
@@ -202,35 +150,27 @@ impl Commission {
 
     /// Takes what somebody else said on the bus; [`Commission::handle_time`] says what that leads to.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
-        match *message {
-            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => self.end(Trouble::Rival),
-            Message::Configure { request: Request::Write { number, .. }, .. } if is_stored(number) => {
+        if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
+            self.end(Trouble::Rival);
+        } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message {
+            if is_stored(number) {
                 self.end(Trouble::Meddler);
             }
-            Message::Network {
-                from: Node::Cell(number), page: NetworkPage::Heartbeat(heartbeat), ..
-            } => {
-                self.hear(now, number, &heartbeat);
+        } else if let Message::Network {
+            from: Node::Cell(number),
+            page: NetworkPage::Heartbeat(heartbeat),
+            ..
+        } = *message
+        {
+            self.hear(now, number, &heartbeat);
+        } else if let Message::Configured { from, tag, answer } = *message {
+            let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
+            let wish = self.wish;
+            let Some(task) = self.holder(from) else { return };
+            task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
+            if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
+                call.due = now + QUIET;
             }
-            Message::Configured { from, tag, answer } => {
-                let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
-                let wish = self.wish;
-                let Some(task) = self.holder(from) else { return };
-                task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
-                if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
-                    call.due = now + QUIET;
-                }
-            }
-            Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Halt
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Stimulus { .. } => {}
         }
     }
 
@@ -483,57 +423,6 @@ impl Commission {
         let announcement = self.announced.map(|at| at + ANNOUNCE);
         let tasks = self.tasks.iter().filter_map(Task::due);
         tasks.chain([phase, call, announcement].into_iter().flatten()).min()
-    }
-
-    /// How far it is.
-    #[must_use]
-    pub fn progress(&self) -> Progress {
-        let count = |is: &dyn Fn(&Task) -> bool| self.tasks.iter().filter(|task| is(task)).count();
-        let failed = count(&|task| is_failed(task.stage));
-        let doing = match self.phase {
-            Phase::Listen(_) => "listening",
-            Phase::Find(_) => "looking for cells",
-            Phase::Write => "writing",
-            Phase::Read => "reading back",
-            Phase::Beat(_) => "waiting for heartbeats",
-            Phase::Over => "done",
-        };
-        Progress {
-            doing,
-            cells: self.tasks.len(),
-            found: count(&|task| task.number.is_some()),
-            done: count(&|task| task.is_done()) - failed,
-            failed,
-        }
-    }
-
-    /// What has become of everybody; of cells that are not done, as if it were stopped now.
-    #[must_use]
-    pub fn report(&self) -> Report {
-        let cell = |task: &Task| CellReport {
-            described: task.described,
-            serial: task.serial,
-            number: task.number,
-            outcome: match task.stage {
-                Stage::Done(outcome) => outcome,
-                Stage::Missing | Stage::Write | Stage::Read | Stage::Beat(_) => {
-                    Outcome::Failed(Reason::Stopped)
-                }
-            },
-        };
-        let stranger = |(number, serial): (CellId, u32)| Stranger {
-            number,
-            serial,
-            belongs: self.elsewhere.get(&serial).cloned(),
-        };
-        let unknown = self.roster.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
-        Report {
-            cells: self.tasks.iter().map(cell).collect(),
-            strangers: unknown.map(stranger).collect(),
-            requests: self.requests,
-            repeated: self.repeated,
-            trouble: self.trouble,
-        }
     }
 }
 

@@ -1,0 +1,114 @@
+//! How far a commissioning is, and what has become of every cell.
+
+use protocol::id::CellId;
+
+use super::outcome::{Outcome, Reason, Trouble};
+use super::task::{Stage, Task};
+use super::{Commission, Phase, is_failed};
+
+/// How far it is, for people.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Progress {
+    /// What is being done: listening, looking for cells, writing, reading back, waiting for heartbeats.
+    pub doing: &'static str,
+    /// Cells of the description on this bus.
+    pub cells: usize,
+    /// Of these, heard.
+    pub found: usize,
+    /// Of these, finished well.
+    pub done: usize,
+    /// Of these, given up.
+    pub failed: usize,
+}
+
+/// What became of one cell.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CellReport {
+    /// Its number in the description.
+    pub described: CellId,
+    /// Its serial number.
+    pub serial: u32,
+    /// Its number on the bus, if it was heard.
+    pub number: Option<CellId>,
+    /// What became of it.
+    pub outcome: Outcome,
+}
+
+/// A cell that the description does not have on this bus.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Stranger {
+    /// Its number on the bus.
+    pub number: CellId,
+    /// Its serial number.
+    pub serial: u32,
+    /// The bus on which the description has it.
+    pub belongs: Option<String>,
+}
+
+/// What became of one bus.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// The described cells, in the file's order.
+    pub cells: Vec<CellReport>,
+    /// The others, by number; they were left alone.
+    pub strangers: Vec<Stranger>,
+    /// Requests to one cell or to everyone.
+    pub requests: u64,
+    /// Of these, said again because nobody answered.
+    pub repeated: u64,
+    /// Why the bus was left alone from some moment on.
+    pub trouble: Option<Trouble>,
+}
+
+impl Commission {
+    /// How far it is.
+    #[must_use]
+    pub fn progress(&self) -> Progress {
+        let count = |is: &dyn Fn(&Task) -> bool| self.tasks.iter().filter(|task| is(task)).count();
+        let failed = count(&|task| is_failed(task.stage));
+        let doing = match self.phase {
+            Phase::Listen(_) => "listening",
+            Phase::Find(_) => "looking for cells",
+            Phase::Write => "writing",
+            Phase::Read => "reading back",
+            Phase::Beat(_) => "waiting for heartbeats",
+            Phase::Over => "done",
+        };
+        Progress {
+            doing,
+            cells: self.tasks.len(),
+            found: count(&|task| task.number.is_some()),
+            done: count(&|task| task.is_done()) - failed,
+            failed,
+        }
+    }
+
+    /// What has become of everybody; of cells that are not done, as if it were stopped now.
+    #[must_use]
+    pub fn report(&self) -> Report {
+        let cell = |task: &Task| CellReport {
+            described: task.described,
+            serial: task.serial,
+            number: task.number,
+            outcome: match task.stage {
+                Stage::Done(outcome) => outcome,
+                Stage::Missing | Stage::Write | Stage::Read | Stage::Beat(_) => {
+                    Outcome::Failed(Reason::Stopped)
+                }
+            },
+        };
+        let stranger = |(number, serial): (CellId, u32)| Stranger {
+            number,
+            serial,
+            belongs: self.elsewhere.get(&serial).cloned(),
+        };
+        let unknown = self.roster.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
+        Report {
+            cells: self.tasks.iter().map(cell).collect(),
+            strangers: unknown.map(stranger).collect(),
+            requests: self.requests,
+            repeated: self.repeated,
+            trouble: self.trouble,
+        }
+    }
+}
