@@ -82,41 +82,25 @@ impl Judge {
             return;
         };
         lane.record_state(message, is_in_part);
-        match *message {
-            Message::Configured { from, tag, answer }
-                if is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer) =>
-            {
-                tally.lacking.asked_earlier += 1;
-            }
-            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Tree(tree) } => {
+        if let Message::Configured { from, tag, answer } = *message {
+            let is_lacking = is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer);
+            tally.lacking.asked_earlier += u64::from(is_lacking);
+        } else if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
+            if let NetworkPage::Tree(tree) = page {
                 lane.record_parent(cell, epoch, tree.parent);
-            }
-            Message::Network { from: Node::Cell(cell), epoch, page: NetworkPage::Heartbeat(_) }
-                if lane.is_claiming(cell) =>
-            {
+            } else if matches!(page, NetworkPage::Heartbeat(_)) && lane.is_claiming(cell) {
                 lane.record_parent(cell, epoch, None);
             }
-            Message::Sum { from, epoch, torque, count } => match lane.recorded_round(epoch) {
+        } else if let Message::Sum { from, epoch, torque, count } = *message {
+            match lane.recorded_round(epoch) {
                 Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
                 None if is_in_part => lane.count_without_joints(epoch, &mut tally.lacking),
                 None => {}
-            },
-            Message::Configure { request: Request::Write { number, words }, .. }
-                if number == Parameter::Sensing.number() =>
-            {
-                lane.senses |= Sensing::from_words(words).is_some_and(|sensing| sensing != Sensing::Off);
             }
-            Message::Halt
-            | Message::Joints { .. }
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. }
-            | Message::Stimulus { .. } => {}
+        } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message {
+            let is_sensing = number == Parameter::Sensing.number();
+            let sensing = Sensing::from_words(words).filter(|_| is_sensing);
+            lane.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
         }
         take_first_joints(&mut lane.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
