@@ -174,7 +174,7 @@ impl Survey {
             bus.heard(cell, nanos);
         }
         if let Decoded::Message(message) = decoded {
-            bus.format.get_or_insert(record.frame.format());
+            bus.format.get_or_insert_with(|| record.frame.format());
             let place = if nanos < begins {
                 Place::Before
             } else if nanos < ends {

@@ -94,10 +94,10 @@ impl Tracked {
             return News { revived, ..News::default() };
         };
         let away = self.account.is_interrupted();
-        let word = match self.claim.hear(heartbeat) {
-            Word::Started { .. } if !is_first => Word::Started { again: true },
-            word => word,
-        };
+        let mut word = self.claim.hear(heartbeat);
+        if let Word::Started { again } = &mut word {
+            *again |= !is_first;
+        }
         match word {
             Word::Known => self.account.settle(heartbeat.sent),
             Word::First => self.account.begin(heartbeat.sent, false),
