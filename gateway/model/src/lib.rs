@@ -20,7 +20,6 @@ pub mod network;
 pub mod quantiles;
 pub mod repeat;
 pub mod scenario;
-pub mod stimuli;
 pub mod table;
 #[doc(hidden)]
 pub mod testing;

@@ -3,8 +3,9 @@
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::Epoch;
+use protocol::parameters::Parameter;
 
 /// The document's cell 12 on the second link of a UR5: its configuration, its joints, its touch, its torque.
 fn skin() -> Skin {
@@ -247,4 +248,22 @@ fn a_claim_of_a_number_that_is_taken_changes_nothing() {
     let with = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(with, without);
     assert_eq!((with.missing, with.cells.len()), (Vec::new(), 1));
+}
+
+#[test]
+fn a_late_stimulus_is_called_late_and_a_written_mode_forgets_it() {
+    let skin = skin();
+    let said = [heartbeat(0x266D), joints(6), press(From::Epoch(Epoch(6)), 1.0), joints(7)];
+    let origin = |said: &[Message]| {
+        let force =
+            explained(&skin, &[said, &[torque(7, [0, 0])]].concat(), first(7)).unwrap().cells[0].force;
+        force.map(|force| (force.origin, force.force_steps))
+    };
+    let late = Origin::Stimulus { at_ns: 3_000_000, from_epoch: Some(6), late: true };
+    assert_eq!(origin(&said), Some((late, 196_608)));
+    let request = Request::Write { number: Parameter::Mode.number(), words: [1, 0, 0, 0, 0, 0] };
+    let mode = Message::Configure { to: Node::Everyone, tag: 0, request };
+    let (before, joints) = said.split_at(3);
+    let written = [before, &[mode], joints].concat();
+    assert_eq!(origin(&written), Some((Origin::Mode { at_ns: 4_000_000 }, 0)));
 }

@@ -220,54 +220,44 @@ impl InForce {
             before: self.joints.as_ref().map(|(_, joints)| Arc::clone(joints)),
             since: None,
         };
-        match *message {
-            Message::Joints { epoch, .. } => {
-                // Cells drop joints of the last epoch.
-                if last != Some(epoch) {
-                    for (_, cell) in self.cells.iter_mut() {
-                        cell.contact.latch(epoch, |felt| felt.since = Some(Arc::clone(said)));
-                    }
-                }
-                self.joints = Some((epoch, Arc::clone(said)));
-            }
-            Message::Halt | Message::Resume => self.halt = Some(Arc::clone(said)),
-            Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                self.cells.named(from).iter_mut().for_each(|cell| cell.heartbeat(&heartbeat, said));
-            }
-            Message::Network { from, page: NetworkPage::Tree(_), .. } => {
-                self.cells.named(from).iter_mut().for_each(|cell| cell.tree = Some(Arc::clone(said)));
-            }
-            Message::Configure { to, request: Request::Write { number, words }, .. } => {
-                let obeys = words.first() == Some(&1);
-                self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, said, obeys));
-            }
-            Message::Configured { from, answer: Answer::Value { number, written: true, .. }, .. } => {
-                if let Some(cell) = self.cells.get_mut(from).filter(|_| number == Parameter::Commit.number())
-                {
-                    cell.commit();
+        if let Message::Joints { epoch, .. } = *message {
+            // Cells drop joints of the last epoch.
+            if last != Some(epoch) {
+                for (_, cell) in self.cells.iter_mut() {
+                    cell.contact.latch(epoch, |felt| felt.since = Some(Arc::clone(said)));
                 }
             }
-            Message::Stimulus { to, from, page } => {
-                let felt = felt();
-                self.cells
-                    .named(to)
-                    .iter_mut()
-                    .for_each(|cell| cell.contact.push(from, page, felt.clone(), last));
+            self.joints = Some((epoch, Arc::clone(said)));
+        } else if let Message::Halt | Message::Resume = message {
+            self.halt = Some(Arc::clone(said));
+        } else if let Message::Network { from, page, .. } = *message {
+            let Some(cell) = self.cells.named(from).first_mut() else { return };
+            if let NetworkPage::Heartbeat(heartbeat) = page {
+                cell.heartbeat(&heartbeat, said);
+            } else if let NetworkPage::Tree(_) = page {
+                cell.tree = Some(Arc::clone(said));
             }
-            Message::Sensors { from, epoch, page } => {
-                let felt = felt();
-                if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch))
-                {
-                    cell.learn(page, felt);
-                }
+        } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
+            let obeys = words.first() == Some(&1);
+            self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, said, obeys));
+        } else if let Message::Configured {
+            from, answer: Answer::Value { number, written: true, .. }, ..
+        } = *message
+        {
+            if let Some(cell) = self.cells.get_mut(from).filter(|_| number == Parameter::Commit.number()) {
+                cell.commit();
             }
-            Message::Sync
-            | Message::Report
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. } => {}
+        } else if let Message::Stimulus { to, from, page } = *message {
+            let felt = felt();
+            self.cells
+                .named(to)
+                .iter_mut()
+                .for_each(|cell| cell.contact.push(from, page, felt.clone(), last));
+        } else if let Message::Sensors { from, epoch, page } = *message {
+            let felt = felt();
+            if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch)) {
+                cell.learn(page, felt);
+            }
         }
     }
 

@@ -46,7 +46,7 @@ pub struct Survey {
 }
 
 /// One bus.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Bus {
     /// Its name in the capture.
     pub name: String,
@@ -220,7 +220,7 @@ impl Survey {
 
     fn bus(&mut self, name: &str) -> &mut Bus {
         let at = self.bus_named(name).unwrap_or_else(|| {
-            self.buses.push(Bus::new(name));
+            self.buses.push(Bus { name: name.to_owned(), ..Bus::default() });
             self.buses.len() - 1
         });
         self.buses.get_mut(at).expect("found, or just made")
@@ -228,25 +228,6 @@ impl Survey {
 }
 
 impl Bus {
-    fn new(name: &str) -> Self {
-        Self {
-            name: name.to_owned(),
-            frames: 0,
-            has_fd: false,
-            format: None,
-            joints: 0,
-            last_joints: 0,
-            at_report: None,
-            is_accounted: false,
-            in_force: Vec::new(),
-            state: State::default(),
-            first_joints: None,
-            sums: 0,
-            cells: BTreeMap::new(),
-            before: BTreeMap::new(),
-        }
-    }
-
     /// Takes in what was said before the capture and is in force at its beginning.
     fn take_before(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =

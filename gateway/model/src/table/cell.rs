@@ -1,9 +1,9 @@
 //! One cell, as the gateway sees it.
 
 use protocol::id::CellId;
-use protocol::message::{From, Heard, Heartbeat, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, From, Heard, Heartbeat, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::{Events, Parameters};
+use protocol::parameters::{Cuts, Events, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
@@ -99,7 +99,7 @@ pub struct Cell {
     /// What it feels, as far as the bus tells.
     contact: Contact<()>,
     /// What it shall be switched to, and has confirmed.
-    pub(super) switched: Switched,
+    switched: Switched,
     halt: Halt,
     sent: Sent,
     pub(super) owed: Owed,
@@ -229,6 +229,17 @@ impl Cell {
     pub(super) fn tells(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.sensed.hear(at, page, events);
         self.contact.learn(*page, ());
+    }
+
+    /// It answered a request.
+    pub(super) fn answers(&mut self, answer: &Answer) {
+        self.switched.answered(answer);
+        let Answer::Value { number, written: true, words } = *answer else { return };
+        if number == Parameter::Reply.number() {
+            self.reply = Some(words);
+        } else if number == Parameter::Cuts.number() {
+            self.deaf = Cuts::from_words(words).deaf;
+        }
     }
 
     /// What it is to be switched to and has not confirmed.

@@ -2,9 +2,8 @@
 
 use protocol::fixed::Q;
 use protocol::id::{Id, Node};
-use protocol::message::{Answer, Heartbeat, Message, NetworkPage, State};
+use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, State};
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::{Cuts, Parameter};
 use protocol::time::Micros;
 
 use super::cell::Cell;
@@ -16,19 +15,16 @@ use crate::tracker::{News, Word};
 impl Table {
     /// A frame of this gateway's, as it stood on the bus.
     pub(super) fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
-        match *message {
-            Message::Joints { epoch, joints } => self.open_epoch(at, epoch, &joints, positions(epoch)),
-            Message::Stimulus { .. } => self.hear_stimulus(message),
-            Message::Halt => self.each_cell(Cell::halt),
-            Message::Sync => self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false),
-            Message::Report => self.cells.iter_mut().for_each(|cell| cell.said.counters = false),
-            Message::Resume
-            | Message::Sum { .. }
-            | Message::Torque { .. }
-            | Message::Sensors { .. }
-            | Message::Network { .. }
-            | Message::Configure { .. }
-            | Message::Configured { .. } => {}
+        if let Message::Joints { epoch, joints } = *message {
+            self.open_epoch(at, epoch, &joints, positions(epoch));
+        } else if let Message::Stimulus { to, from, page } = *message {
+            self.feel(to, from, page);
+        } else if *message == Message::Halt {
+            self.each_cell(Cell::halt);
+        } else if *message == Message::Sync {
+            self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false);
+        } else if *message == Message::Report {
+            self.cells.iter_mut().for_each(|cell| cell.said.counters = false);
         }
     }
 
@@ -49,7 +45,7 @@ impl Table {
                 self.snapshot.sums.resumes += 1;
                 self.cells.iter_mut().for_each(Cell::resume);
             }
-            Message::Stimulus { .. } => self.hear_stimulus(message),
+            Message::Stimulus { to, from, page } => self.feel(to, from, page),
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
             | Message::Torque { .. }
@@ -59,8 +55,7 @@ impl Table {
         }
     }
 
-    fn hear_stimulus(&mut self, message: &Message) {
-        let Message::Stimulus { to, from, page } = *message else { return };
+    fn feel(&mut self, to: Node, from: From, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
         for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
             cell.feel(from, page, last);
@@ -84,38 +79,23 @@ impl Table {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
-        match *message {
-            Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                self.take_heartbeat(place, &news, &heartbeat, epoch)
-            }
-            Message::Network { epoch, page: NetworkPage::Heard(_), .. } => {
-                cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
-            }
-            Message::Network { page: NetworkPage::Refused(_), .. } => cell.said.counters = true,
-            Message::Sensors { page, .. } => cell.tells(at, &page, &self.events),
-            Message::Configured { answer, .. } => {
-                cell.switched.answered(&answer);
-                if let Answer::Value { number, written: true, words } = answer {
-                    if number == Parameter::Reply.number() {
-                        cell.reply = Some(words);
-                    } else if number == Parameter::Cuts.number() {
-                        cell.deaf = Cuts::from_words(words).deaf;
-                    }
+        if let Message::Network { epoch, page, .. } = *message {
+            match page {
+                NetworkPage::Heartbeat(heartbeat) => self.take_heartbeat(place, &news, &heartbeat, epoch),
+                NetworkPage::Heard(_) => {
+                    cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
                 }
+                NetworkPage::Refused(_) => cell.said.counters = true,
+                NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
             }
-            Message::Torque { .. } if self.trunk.is_some() => self.counters.count(Event::Stranger),
-            Message::Torque { epoch, torque, .. } => self.take_torque(at, place, epoch, torque.map(i32_of)),
-            Message::Sum { epoch, count, torque, .. } => {
-                self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) })
-            }
-            Message::Network { .. }
-            | Message::Halt
-            | Message::Joints { .. }
-            | Message::Sync
-            | Message::Resume
-            | Message::Report
-            | Message::Configure { .. }
-            | Message::Stimulus { .. } => {}
+        } else if let Message::Sensors { page, .. } = *message {
+            cell.tells(at, &page, &self.events);
+        } else if let Message::Configured { answer, .. } = *message {
+            cell.answers(&answer);
+        } else if let Message::Torque { epoch, torque, .. } = *message {
+            self.take_torque(at, place, epoch, torque.map(i32_of));
+        } else if let Message::Sum { epoch, count, torque, .. } = *message {
+            self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) });
         }
     }
 
@@ -136,6 +116,9 @@ impl Table {
     }
 
     fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
+        if self.trunk.is_some() {
+            return self.counters.count(Event::Stranger);
+        }
         let Some(broadcast) = &mut self.broadcast else {
             return self.counters.count(Event::StaleTorque);
         };

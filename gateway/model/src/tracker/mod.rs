@@ -95,8 +95,8 @@ impl Tracked {
         };
         let away = self.account.is_interrupted();
         let mut word = self.claim.hear(heartbeat);
-        if !is_first && let Word::Started { again } = &mut word {
-            *again = true;
+        if let Word::Started { again } = &mut word {
+            *again |= !is_first;
         }
         match word {
             Word::Known => self.account.settle(heartbeat.sent),

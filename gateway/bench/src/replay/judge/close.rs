@@ -18,7 +18,7 @@ impl Judge {
         if !self.expects || round.fate == Fate::Waiting {
             return;
         }
-        let (is_last, begins_later) = (lane.last_round == Some(number), lane.begins_later);
+        let (is_last, begins_later) = (lane.last_round == Some(number), lane.begins_later());
         let at = Some((number, round.epoch, round.nanos));
         if round.is_first {
             lane.excuses.values_mut().for_each(|excuse| excuse.speaks = None);

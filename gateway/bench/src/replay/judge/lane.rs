@@ -51,9 +51,10 @@ pub(super) struct Asked {
 }
 
 /// What has become of recorded joints.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) enum Fate {
     /// Not sent yet.
+    #[default]
     Waiting,
     Sent,
     /// A bus did not take them.
@@ -68,7 +69,7 @@ pub(super) struct Pair {
 }
 
 /// Joints of the capture and their replies.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Round {
     pub(super) epoch: Epoch,
     /// When they were recorded, in ns since 1970.
@@ -88,20 +89,6 @@ pub(super) struct Round {
 }
 
 impl Round {
-    pub(super) fn new(epoch: Epoch, nanos: u64) -> Self {
-        Self {
-            epoch,
-            nanos,
-            fate: Fate::Waiting,
-            replies: BTreeMap::new(),
-            sums: Both::default(),
-            asked_as: epoch,
-            asked: 0,
-            touched: [Touched::default(); 2],
-            is_first: false,
-        }
-    }
-
     /// Whether something touches a cell at these joints, if that is known.
     pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
         self.touched.last().and_then(|touched| touched.is(cell))
@@ -142,8 +129,21 @@ struct Question {
     nanos: u64,
 }
 
+/// One pass over the capture, as far as it has been read.
+#[derive(Debug, Default)]
+struct Pass {
+    /// What holds at the last recorded joints, and who is touched at them.
+    state: State,
+    touched: Touched,
+    /// The number of its first round.
+    first_round: u64,
+    /// Whether something was said before that, and the last joints of that time.
+    begins_later: bool,
+    earlier: Option<Epoch>,
+}
+
 /// One bus.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Lane {
     pub(super) name: String,
     pub(super) roll: BTreeMap<CellId, Present>,
@@ -166,14 +166,7 @@ pub(super) struct Lane {
     /// Cells that had taken no joints when they last told their counters, with the epoch that they say until they have:
     /// it is of no joints.
     pub(super) untouched: Both<BTreeMap<CellId, Epoch>>,
-    /// What holds at the last recorded joints, and who is touched at them.
-    state: State,
-    touched: Touched,
-    /// The number of the first round of this pass.
-    first_round: u64,
-    /// Whether something was said before it, and the last joints of that time.
-    pub(super) begins_later: bool,
-    earlier: Option<Epoch>,
+    pass: Pass,
     /// Rounds that were announced.
     pub(super) sent: u64,
     /// The round after which the capture has no more joints.
@@ -186,27 +179,16 @@ impl Lane {
         let excuse = |(node, cell)| (node, Excuse { cell, ended_earlier: false, speaks: None });
         Self {
             name,
-            roll: BTreeMap::new(),
             excuses: cells.into_iter().map(excuse).collect(),
-            announcements: 0,
             asked: vec![None; 256],
             recorded: vec![None; 256],
-            base: 0,
-            rounds: VecDeque::new(),
-            trees: Both::default(),
-            answers: BTreeMap::new(),
-            speaking: BTreeSet::new(),
-            senses: false,
-            untouched: Both::default(),
-            state: State::default(),
-            touched: Touched::default(),
-            first_round: 0,
-            begins_later: false,
-            earlier: None,
-            sent: 0,
-            last_round: None,
-            is_down: false,
+            ..Self::default()
         }
+    }
+
+    /// Whether something was said before the first round of this pass.
+    pub(super) const fn begins_later(&self) -> bool {
+        self.pass.begins_later
     }
 
     pub(super) fn round(&mut self, number: u64) -> Option<&mut Round> {
@@ -261,8 +243,7 @@ impl Lane {
     /// Takes in that the capture begins anew.
     pub(super) fn begin(&mut self) {
         self.recorded.fill(None);
-        (self.state, self.touched) = (State::default(), Touched::default());
-        (self.first_round, self.begins_later, self.earlier) = (self.rounds_so_far(), false, None);
+        self.pass = Pass { first_round: self.rounds_so_far(), ..Pass::default() };
     }
 
     fn rounds_so_far(&self) -> u64 {
@@ -272,16 +253,17 @@ impl Lane {
     /// Takes in that joints stood on the bus in the capture; returns the number of their round, if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
-        let is_first = number == self.first_round;
+        let is_first = number == self.pass.first_round;
         if is_first {
-            self.earlier = self.state.last_epoch();
+            self.pass.earlier = self.pass.state.last_epoch();
         }
         let before = self.take_joints(epoch);
         if is_sent {
-            let touched = [before, self.touched];
-            self.rounds.push_back(Round { touched, is_first, ..Round::new(epoch, nanos) });
+            let touched = [before, self.pass.touched];
+            let asked_as = epoch;
+            self.rounds.push_back(Round { epoch, nanos, asked_as, touched, is_first, ..Round::default() });
         } else {
-            self.begins_later |= is_first;
+            self.pass.begins_later |= is_first;
         }
         let round = is_sent.then_some(number);
         *self.recorded.get_mut(usize::from(epoch.0))? = round;
@@ -289,17 +271,17 @@ impl Lane {
     }
 
     fn take_joints(&mut self, epoch: Epoch) -> Touched {
-        self.state.take(&Message::Joints { epoch, joints: Joints::default() });
-        std::mem::replace(&mut self.touched, self.state.touched())
+        self.pass.state.take(&Message::Joints { epoch, joints: Joints::default() });
+        std::mem::replace(&mut self.pass.touched, self.pass.state.touched())
     }
 
     /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
-        self.begins_later |= !is_in_part && self.rounds_so_far() == self.first_round;
+        self.pass.begins_later |= !is_in_part && self.rounds_so_far() == self.pass.first_round;
         if let Message::Joints { epoch, .. } = *message {
             self.take_joints(epoch);
         } else {
-            self.state.take(message);
+            self.pass.state.take(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
             let round = self.rounds_so_far();
@@ -316,14 +298,16 @@ impl Lane {
 
     /// Whether the cell that has a node id in the capture claims it only.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
-        self.state.claim(cell).is_some_and(|claim| !claim.is_settled())
+        self.pass.state.claim(cell).is_some_and(|claim| !claim.is_settled())
     }
 
     /// Whether a reply of this epoch, which no joints of the part have had yet, answers joints from before it.
     fn is_earlier(&self, epoch: Epoch) -> bool {
-        let rounds = self.rounds_so_far() - self.first_round;
-        let last = if rounds == 0 { self.state.last_epoch() } else { self.earlier };
-        self.begins_later && rounds < WINDOW && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
+        let rounds = self.rounds_so_far() - self.pass.first_round;
+        let last = if rounds == 0 { self.pass.state.last_epoch() } else { self.pass.earlier };
+        self.pass.begins_later
+            && rounds < WINDOW
+            && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
     }
 
     /// Takes in a recorded answer to `configure`; whether what it answers stands in the part.
@@ -332,7 +316,7 @@ impl Lane {
         let answers = self.answers.entry(from).or_default();
         match answers.asked.iter().position(|asked| asked.tag == tag) {
             Some(at) => drop(answers.asked.remove(at)),
-            None if self.begins_later => return false,
+            None if self.pass.begins_later => return false,
             None => {}
         }
         answers.recorded.push_back((rounds, tag, answer));

@@ -83,9 +83,8 @@ impl Judge {
         };
         lane.record_state(message, is_in_part);
         if let Message::Configured { from, tag, answer } = *message {
-            if is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer) {
-                tally.lacking.asked_earlier += 1;
-            }
+            let is_lacking = is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer);
+            tally.lacking.asked_earlier += u64::from(is_lacking);
         } else if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
             if let NetworkPage::Tree(tree) = page {
                 lane.record_parent(cell, epoch, tree.parent);
@@ -98,10 +97,10 @@ impl Judge {
                 None if is_in_part => lane.count_without_joints(epoch, &mut tally.lacking),
                 None => {}
             }
-        } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message
-            && number == Parameter::Sensing.number()
-        {
-            lane.senses |= Sensing::from_words(words).is_some_and(|sensing| sensing != Sensing::Off);
+        } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message {
+            let is_sensing = number == Parameter::Sensing.number();
+            let sensing = Sensing::from_words(words).filter(|_| is_sensing);
+            lane.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
         }
         take_first_joints(&mut lane.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
