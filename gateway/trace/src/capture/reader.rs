@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use protocol::can::Frame;
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
+use serde::Serialize;
 use thiserror::Error;
 
 use super::log::LogReader;
@@ -106,9 +107,10 @@ pub struct InForce {
 }
 
 /// A topic that is neither frames nor notes.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Topic {
     /// Its name.
+    #[serde(rename = "topic")]
     pub name: String,
     /// The type of its messages.
     pub schema: String,
