@@ -2,15 +2,13 @@
 
 mod show;
 
-use std::fs::File;
-use std::io::Write;
-use std::os::fd::AsRawFd;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use analysis::dbc;
 use bench::record::{self, Candump};
+use bench::run::launch::in_memory;
 use bench::run::{self, Options};
 use bench::summary::{Outcome, Summary};
 use clap::Args;
@@ -20,7 +18,6 @@ use protocol::document;
 use protocol::skin::Skin;
 use protocol::time::Span;
 use protocol::usage::{Failure, print, quoted};
-use rustix::fs::{MemfdFlags, memfd_create};
 use trace::recording::series::{Attached, Split};
 
 use super::arguments::{BusKinds, Programs, bus_names, seconds};
@@ -184,21 +181,9 @@ pub(crate) struct Run {
     flash: Option<PathBuf>,
 }
 
-/// A file in memory that goes with this program, and how its cells name it.
-fn in_memory(text: &str) -> Result<(File, PathBuf), Failure> {
-    let make = || -> std::io::Result<File> {
-        let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
-        file.write_all(text.as_bytes())?;
-        Ok(file)
-    };
-    let file = make().map_err(|error| Failure::run(format!("a file in memory: {error}")))?;
-    let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
-    Ok((file, path))
-}
-
 impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let (_file, skin_file) = in_memory(SKIN)?;
+        let (_file, skin_file) = in_memory(SKIN.as_bytes()).map_err(Failure::run)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
@@ -243,7 +228,7 @@ impl Run {
         let (_file, skin_file) = if self.skin.is_file() {
             (None, self.skin)
         } else {
-            let (file, path) = in_memory(&skin_text)?;
+            let (file, path) = in_memory(skin_text.as_bytes()).map_err(Failure::run)?;
             (Some(file), path)
         };
         let mut options = self.common.options(skin_file, skin, scenario);

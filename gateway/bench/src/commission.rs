@@ -7,16 +7,14 @@ use std::time::{Duration, Instant};
 
 use model::commission::{Commission, Progress, Report, Wish};
 use model::decode::Decoded;
-use model::network::Uplinks;
 use protocol::bus::{BusError, Filter, GATEWAY_RECEIVE_BUFFER, Kinds, Options};
-use protocol::can::{Format, Frame};
-use protocol::id::{Command, Id, Kind, Node};
-use protocol::message::Message;
-use protocol::skin::{Reply, Skin};
+use protocol::can::Format;
+use protocol::id::{Command, Id, Kind};
+use protocol::skin::Skin;
 use protocol::time::Micros;
-use protocol::wire::Lane;
 
 use crate::listen::{self, Listener, passing, send};
+use crate::run::roots::Roots;
 
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
@@ -34,7 +32,7 @@ pub struct Bench {
     listener: Listener,
     format: Format,
     /// Where this side speaks to the roots of a network, whose cells may have no numbers yet.
-    roots: Vec<Lane>,
+    roots: Option<Roots>,
 }
 
 /// What became of a bus.
@@ -59,17 +57,18 @@ pub struct Done {
 pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
-    let sums = described.is_some_and(|bus| matches!(bus.reply, Reply::Sum { .. }));
-    let mut roots: Vec<_> = skin.wires(index).roots().map(|(_, lane)| lane).filter(|_| sums).collect();
+    let mut roots = Roots::of(skin, index);
+    // What they say is heard from the beginning.
+    roots.iter_mut().for_each(Roots::explore);
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
-    filters.extend(roots.iter().map(|lane| Filter::lane(lane.reversed())));
+    filters.extend(roots.iter().flat_map(Roots::filters));
     let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
     let options = Options { filters, receive_buffer, ..Options::default() };
     let bus = listen::open(name, kinds.of(name), Some(format), options)?;
-    if !roots.is_empty() && !bus.is_virtual()? {
+    if roots.is_some() && !bus.is_virtual()? {
         // Simulated wires have no place among real cells, which have real ones.
-        roots.clear();
+        roots = None;
     }
     Ok(Bench { index, listener: Listener::new(bus, Some(format)), format, roots })
 }
@@ -142,77 +141,31 @@ impl Bench {
         mut tell: impl FnMut(Progress),
     ) -> Result<(), BusError> {
         let Self { listener, roots, format, .. } = self;
-        let mut network = Network::new(roots, clock());
         loop {
             if stopped.load(Ordering::Relaxed) {
                 commission.stop();
             }
             commission.handle_time(clock());
             tell(commission.progress());
-            if commission.speaks() {
-                let frames = network.frames(clock());
-                passing(listener.bus().send(&frames).map_err(BusError::from), DOWN)?;
+            if let Some(roots) = roots.as_mut().filter(|_| commission.speaks()) {
+                roots.speak(listener.bus());
             }
             while let Some(message) = commission.poll_transmit() {
                 // What was not sent is not answered, and is sent again.
                 passing(send(listener.bus(), &message, *format), DOWN)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
-            let next = if commission.speaks() { next.min(network.due()) } else { next };
-            let wait = Duration::from_micros(next.since(clock()).0).min(LOOK);
+            let quiet = roots.as_ref().filter(|_| commission.speaks()).map_or(LOOK, Roots::patience);
+            let wait = Duration::from_micros(next.since(clock()).0).min(quiet).min(LOOK);
             passing(listener.hear(wait), DOWN)?;
             for (received, decoded) in listener.decoded() {
+                if roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
+                    continue;
+                }
                 if let Decoded::Message(message) = decoded {
-                    network.hear(&message);
                     commission.handle_message(clock(), &message);
-                } else {
-                    network.take(clock(), &received.frame);
                 }
             }
         }
-    }
-}
-
-/// This side's ends of the wires to the roots: cells without numbers get theirs from here.
-struct Network<'a> {
-    roots: &'a [Lane],
-    uplinks: Uplinks,
-}
-
-impl<'a> Network<'a> {
-    fn new(roots: &'a [Lane], now: Micros) -> Self {
-        // Another number than that of the walks of whoever was here before.
-        let walk = std::process::id().to_le_bytes()[0].wrapping_mul(37);
-        Self { roots, uplinks: Uplinks::new(roots.len(), walk, now) }
-    }
-
-    /// Somebody with a number speaks.
-    fn hear(&mut self, message: &Message) {
-        if let Message::Network { from: Node::Cell(cell), .. } = message {
-            self.uplinks.claimed(*cell);
-        }
-    }
-
-    fn take(&mut self, now: Micros, frame: &Frame) {
-        for (root, lane) in self.roots.iter().enumerate() {
-            if let Some(message) = lane.reversed().read(frame) {
-                self.uplinks.handle(now, root, message);
-            }
-        }
-    }
-
-    /// What is to be said to the roots now.
-    fn frames(&mut self, now: Micros) -> Vec<Frame> {
-        if self.roots.is_empty() {
-            return Vec::new();
-        }
-        self.uplinks.handle_time(now);
-        let (uplinks, roots) = (&mut self.uplinks, self.roots);
-        let said = std::iter::from_fn(|| uplinks.poll_transmit());
-        said.filter_map(|(root, message)| Some(roots.get(root)?.frame(message))).collect()
-    }
-
-    fn due(&self) -> Micros {
-        if self.roots.is_empty() { Micros(u64::MAX) } else { self.uplinks.poll_timeout() }
     }
 }

@@ -4,11 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use model::decode::Decoded;
+use model::repeat::Repeats;
 use protocol::bus::{Bus, BusError, Choice, Filter, Options};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::parameters::{Parameter, Sensing};
+use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use crate::listen::{self, Listener, send};
@@ -16,7 +18,7 @@ use crate::listen::{self, Listener, send};
 /// So long cells show that they are there: two heartbeats and some.
 const LISTEN: Duration = Duration::from_millis(600);
 /// From one word to a cell that does not answer to the next.
-const AGAIN: Duration = Duration::from_millis(250);
+const AGAIN: Span = Span::from_millis(250);
 /// Who has not answered by then will not.
 const PATIENCE: Duration = Duration::from_secs(3);
 /// Comes back in the answers, so that they are not taken for those to somebody else.
@@ -83,7 +85,9 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     };
     tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
-    let mut told = began;
+    let clock = || Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX));
+    let mut told = Repeats::new(AGAIN);
+    told.said_to_all(clock());
     while began.elapsed() < PATIENCE && !answers.are_complete(began.elapsed() >= LISTEN) {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
@@ -91,11 +95,8 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
                 answers.take(&message);
             }
         }
-        if told.elapsed() >= AGAIN {
-            told = Instant::now();
-            for cell in answers.missing() {
-                tell(listener.bus(), Node::Cell(cell))?;
-            }
+        for cell in told.due(clock(), answers.missing()) {
+            tell(listener.bus(), Node::Cell(cell))?;
         }
     }
     answers.verdict(listener.bus().name(), format)

@@ -1,29 +1,25 @@
 //! From options to buses that are open and cells that are as they have to be.
 
 use std::collections::BTreeSet;
-use std::io::Write as _;
-use std::os::fd::AsRawFd;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Kinds, Options as BusOptions};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::Message;
 use protocol::skin::Skin;
-use protocol::time::Micros;
-use rustix::fs::{MemfdFlags, memfd_create};
 
 use super::reel::Only;
 use super::survey::Survey;
 use super::{Options, ReplayError, Spawn};
-use crate::run::RunError;
-use crate::run::launch::{LISTEN, Plan, Processes, ServedBus, open_or_serve, program};
+use crate::listen::{self, Listener};
+use crate::run::launch::{LISTEN, Plan, Processes, ServedBus, in_memory, open_or_serve, program};
 use crate::run::roots::{Ears, Roots};
 use crate::setup::names;
-use model::decode::{Decoded, Decoder};
+use model::decode::Decoded;
 use trace::capture::Extras;
 
 /// How often it is looked.
@@ -138,13 +134,7 @@ pub(super) fn wearing(
         };
         let text = String::from_utf8_lossy(bytes);
         let skin = Skin::parse(&format!("the skin in {file}"), &text)?;
-        let in_memory = || -> std::io::Result<std::fs::File> {
-            let mut file = std::fs::File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
-            file.write_all(bytes)?;
-            Ok(file)
-        };
-        let memory = in_memory().map_err(RunError::Memory)?;
-        let file = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), memory.as_raw_fd()));
+        let (memory, file) = in_memory(bytes)?;
         Wearing { skin, file, _memory: Some(memory) }
     };
     for (_, name) in &routes.names {
@@ -210,35 +200,29 @@ impl Buses {
     /// Listens on the buses that were there before, as long as two gateways need to notice each other.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
         let mut heard = vec![BTreeSet::new(); self.lanes.len()];
-        let wanted = BusOptions {
-            filters: vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)],
-            ..BusOptions::default()
-        };
+        let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)];
         let again = |(index, lane): (usize, &Lane)| {
-            let options = BusOptions { fd: lane.format == Format::Fd, ..wanted.clone() };
-            Ok((index, Bus::open(lane.bus.name(), Choice::Only(lane.bus.kind()), &options)?))
+            let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
+            let kind = Choice::Only(lane.bus.kind());
+            let bus = listen::open(lane.bus.name(), kind, Some(lane.format), options)?;
+            Ok((index, Listener::new(bus, None)))
         };
         let others = self.lanes.iter().enumerate().filter(|(_, lane)| !lane.own);
-        let open = others.map(again).collect::<Result<Vec<_>, BusError>>()?;
-        let (until, mut inbox, mut decoder) = (Instant::now() + LISTEN, Inbox::new(), Decoder::new(None));
+        let mut open = others.map(again).collect::<Result<Vec<_>, BusError>>()?;
+        let until = Instant::now() + LISTEN;
         while !open.is_empty() && Instant::now() < until {
             thread::sleep(LOOK);
-            for (index, bus) in &open {
-                if bus.receive(&mut inbox)? == 0 {
-                    continue;
-                }
-                for received in inbox.frames() {
-                    let at = Micros(received.at_nanos / 1_000);
-                    match speaker(&decoder.decode(at, bus.name(), &received.frame)) {
-                        Some(Node::Gateway) => {
-                            return Err(ReplayError::Rival(bus.name().to_owned()));
+            for (index, listener) in &mut open {
+                listener.hear(Duration::ZERO)?;
+                let speakers: Vec<_> =
+                    listener.decoded().filter_map(|(_, decoded)| speaker(&decoded)).collect();
+                for speaker in speakers {
+                    match (speaker, heard.get_mut(*index)) {
+                        (Node::Gateway, _) => {
+                            return Err(ReplayError::Rival(listener.bus().name().to_owned()));
                         }
-                        Some(Node::Cell(cell)) => {
-                            if let Some(cells) = heard.get_mut(*index) {
-                                cells.insert(cell);
-                            }
-                        }
-                        Some(Node::Everyone) | None => {}
+                        (Node::Cell(cell), Some(cells)) => _ = cells.insert(cell),
+                        (Node::Cell(_), None) | (Node::Everyone, _) => {}
                     }
                 }
             }

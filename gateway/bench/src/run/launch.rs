@@ -2,7 +2,9 @@
 //! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
 
 use std::fmt::{self, Display, Formatter};
-use std::io::{BufRead, BufReader};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -12,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
 use protocol::skin::Skin;
+use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Signal, kill_process};
 use thiserror::Error;
 
@@ -70,6 +73,20 @@ pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, Laun
     // A bare name would be looked for in PATH, and not here.
     let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
+}
+
+/// A file in memory that is there as long as this program has it open, and how cells name it.
+///
+/// # Errors
+/// When the system gives none.
+pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), RunError> {
+    let memory = || {
+        let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
+        file.write_all(bytes).map(|()| file)
+    };
+    let file = memory().map_err(RunError::Memory)?;
+    let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
+    Ok((file, path))
 }
 
 /// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is

@@ -82,6 +82,11 @@ impl Roots {
         })
     }
 
+    /// What of the wires has to pass to hear the roots.
+    pub fn filters(&self) -> impl Iterator<Item = Filter> {
+        self.roots.iter().map(|(_, lane, _)| Filter::lane(lane.reversed()))
+    }
+
     /// The gateway speaks from now on.
     pub const fn explore(&mut self) {
         self.explores = true;
