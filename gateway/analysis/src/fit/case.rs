@@ -4,7 +4,6 @@ use protocol::can::Format;
 use protocol::parameters::Sensing;
 use protocol::skin::{Reply, Skin};
 use protocol::wire_time::{BitRates, Coding, Shape};
-use serde::Serialize;
 
 use super::response::{Response, Stream, response};
 
@@ -83,7 +82,7 @@ pub struct Case {
 }
 
 /// Shares of a bus' time, each of the longest frames there can be.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Load {
     /// Joints.
     pub joints: f64,

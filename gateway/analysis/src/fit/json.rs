@@ -5,24 +5,30 @@ use protocol::skin::Skin;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
-use super::case::Answers;
+use super::case::{Answers, Load};
 use super::limits::Need;
 use super::{BusFit, Judged, Row, Whole, name};
+
+#[derive(Serialize)]
+struct Document<'a> {
+    skin: &'a str,
+    cells: usize,
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    buses: &'a [BusFit],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    whole: Option<&'a Whole>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    table: Vec<BusFit>,
+}
 
 /// What was found of single buses with their whole, or of common rates; all times in µs, loads as shares of 1, and what
 /// has no bound as null.
 #[must_use]
 pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> Value {
-    let mut document = json!({ "skin": skin.name, "cells": skin.cells.len() });
-    let mut add = |key: &str, value: Option<Value>| {
-        value.into_iter().for_each(|value| document[key] = value);
-    };
-    add("buses", (!buses.is_empty()).then(|| json!(buses)));
-    add("whole", whole.map(|whole| json!(whole)));
     // A row's buses are those for all cells of the skin.
-    let rows = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
-    add("table", (!table.is_empty()).then(|| rows.map(|row| json!(row)).collect()));
-    document
+    let table = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
+    let cells = skin.cells.len();
+    json!(Document { skin: &skin.name, cells, buses, whole, table: table.collect() })
 }
 
 /// How many buses, and what asks for so many.
@@ -46,8 +52,7 @@ impl Serialize for Judged {
             Answers::Sums { shared: true, .. } => "sums",
             Answers::Sums { shared: false, .. } => "sums of roots",
         };
-        let mut load_and_total = json!(load);
-        load_and_total["total"] = load.total().into();
+        let Load { joints, answers: of_answers, sensors, heartbeats } = *load;
         json!({
             "name": name(case.format, case.rates),
             "verdict": self.verdict(),
@@ -59,7 +64,13 @@ impl Serialize for Judged {
             "period_us": micros(case.period_ns),
             "computation_us": micros(case.computation_ns),
             "packet_us": micros(case.packet_ns()),
-            "load": load_and_total,
+            "load": {
+                "joints": joints,
+                "answers": of_answers,
+                "sensors": sensors,
+                "heartbeats": heartbeats,
+                "total": load.total(),
+            },
             "joints_us": times.joints_ns.map(micros),
             "last_answer_us": times.last_ns().map(micros),
             "by_chain_us": times.chain_ns.map(micros),
