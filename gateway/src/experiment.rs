@@ -131,16 +131,15 @@ impl Experiment {
         let command = words.collect::<Vec<_>>().join(" ");
         let about = facts::program(std::slice::from_ref(&command), 0);
         let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
-        let mut facts = vec![("command".to_owned(), command)];
-        facts.push(("program".to_owned(), format!("{}, revision {}", fact("program"), fact("git_revision"))));
-        facts.push(("machine".to_owned(), machine()));
-        facts.extend(idle.map(|idle| ("idle lateness".to_owned(), idle)));
-        if self.quick {
-            facts.push((
-                "effort".to_owned(),
-                "quick: few cells, few measurements; no figures of these are results".to_owned(),
-            ));
-        }
+        let quick = "quick: few cells, few measurements; no figures of these are results";
+        let facts = [
+            ("command", Some(command)),
+            ("program", Some(format!("{}, revision {}", fact("program"), fact("git_revision")))),
+            ("machine", Some(machine())),
+            ("idle lateness", idle),
+            ("effort", self.quick.then(|| quick.to_owned())),
+        ];
+        let facts = facts.into_iter().filter_map(|(name, fact)| Some((name.to_owned(), fact?))).collect();
         Page {
             title: "The paper's experiments".to_owned(),
             intro: "Efficient Distributed Torque Computation for Large Scale Robot Skin, done again on a simulated skin: \

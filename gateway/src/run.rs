@@ -24,7 +24,7 @@ use rustix::fs::{MemfdFlags, memfd_create};
 use trace::recording::series::{Attached, Split};
 
 use super::arguments::{BusKinds, Programs, bus_names, seconds};
-use super::buses::Buses;
+use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
 
@@ -78,21 +78,17 @@ enum Limit {
 
 fn limit(text: &str) -> Result<Limit, String> {
     let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
-    let letters = text.find(|letter: char| !letter.is_ascii_digit()).ok_or(allowed)?;
-    let (number, unit) = text.split_at_checked(letters).ok_or(allowed)?;
-    let number: u64 = number.parse().map_err(|_| allowed)?;
-    let times = |factor: u64| number.checked_mul(factor).ok_or(allowed);
-    let limit = match unit {
-        "MB" => Limit::Bytes(times(1_000_000)?),
-        "MiB" => Limit::Bytes(times(1 << 20)?),
-        "GB" => Limit::Bytes(times(1_000_000_000)?),
-        "GiB" => Limit::Bytes(times(1 << 30)?),
-        "s" => Limit::Age(Duration::from_secs(number)),
-        "min" => Limit::Age(Duration::from_secs(times(60)?)),
-        "h" => Limit::Age(Duration::from_secs(times(3_600)?)),
-        _ => return Err(allowed.to_owned()),
+    let unit = text.trim_start_matches(|letter: char| letter.is_ascii_digit());
+    let number: Option<u64> = text.strip_suffix(unit).and_then(|number| number.parse().ok());
+    let number = number.filter(|number| *number > 0).ok_or(allowed)?;
+    let bytes = [("MB", 1_000_000), ("MiB", 1 << 20), ("GB", 1_000_000_000), ("GiB", 1 << 30)];
+    let seconds = [("s", 1), ("min", 60), ("h", 3_600)];
+    let in_units = |units: &[(&str, u64)]| {
+        let (_, each) = units.iter().find(|(name, _)| *name == unit)?;
+        number.checked_mul(*each)
     };
-    if number == 0 { Err(allowed.to_owned()) } else { Ok(limit) }
+    let age = || in_units(&seconds).map(Duration::from_secs).map(Limit::Age);
+    in_units(&bytes).map(Limit::Bytes).or_else(age).ok_or_else(|| allowed.to_owned())
 }
 
 impl Recording {
@@ -101,9 +97,9 @@ impl Recording {
         &self,
         candump: Option<Candump>,
         skin: &Skin,
-        skin_file: impl FnOnce() -> Result<Vec<u8>, Failure>,
-        scenario_file: impl FnOnce() -> Result<Option<Vec<u8>>, Failure>,
-    ) -> Result<record::Options, Failure> {
+        skin_file: String,
+        scenario_file: Option<String>,
+    ) -> record::Options {
         let mut split = Split::default();
         for &limit in &self.record_split {
             match limit {
@@ -112,23 +108,25 @@ impl Recording {
             }
         }
         let mcap = self.record.clone().map(|path| {
-            let toml =
-                |name: &str, bytes| Attached { name: name.to_owned(), media_type: "application/toml", bytes };
-            let mut attachments = vec![toml("skin.toml", skin_file()?)];
-            attachments.extend(scenario_file()?.map(|bytes| toml("scenario.toml", bytes)));
+            let toml = |name: &str, text: String| Attached {
+                name: name.to_owned(),
+                media_type: "application/toml",
+                bytes: text.into_bytes(),
+            };
+            let mut attachments = vec![toml("skin.toml", skin_file)];
+            attachments.extend(scenario_file.map(|text| toml("scenario.toml", text)));
             attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
-                name: if skin.buses.len() == 1 {
-                    "skin.dbc".to_owned()
-                } else {
-                    format!("skin-{}.dbc", bus.name)
+                name: match skin.buses.as_slice() {
+                    [_] => "skin.dbc".to_owned(),
+                    _ => format!("skin-{}.dbc", bus.name),
                 },
                 media_type: "text/plain",
                 bytes: dbc::dbc(skin, index).into_bytes(),
             }));
             let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
-            Ok::<_, Failure>(record::Mcap { path, split, attachments, command_line })
+            record::Mcap { path, split, attachments, command_line }
         });
-        Ok(record::Options { candump, mcap: mcap.transpose()?, force: self.force.force })
+        record::Options { candump, mcap, force: self.force.force }
     }
 }
 
@@ -209,8 +207,8 @@ impl Demo {
         let kind = self.bus_kind.resolve();
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
         let own = given.is_none() && kind == BusKind::Embedded;
-        let buses = own.then(|| Buses::create("demo")).transpose()?;
-        options.directory = buses.as_ref().map(|buses| buses.0.clone()).or(given);
+        let buses = own.then(|| buses::directory("demo")).transpose()?;
+        options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
         if !options.quiet {
             let place = options.directory.as_ref().map(|path| {
                 let path = path.to_string_lossy();
@@ -223,8 +221,8 @@ impl Demo {
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
-        let texts = (|| Ok(SKIN.into()), || Ok(Some(SCENARIO.into())));
-        options.record = recording.options(candump, &options.skin, texts.0, texts.1)?;
+        options.record =
+            recording.options(candump, &options.skin, SKIN.to_owned(), Some(SCENARIO.to_owned()));
         bench(&options, summary.as_deref(), recording.force, &[])
     }
 }
@@ -251,12 +249,8 @@ impl Run {
         let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
-        options.record = recording.options(
-            self.candump.map(|path| Candump { path, numbered: false }),
-            &options.skin,
-            || Ok(skin_text.into_bytes()),
-            || Ok(scenario_text.map(String::into_bytes)),
-        )?;
+        let candump = self.candump.map(|path| Candump { path, numbered: false });
+        options.record = recording.options(candump, &options.skin, skin_text, scenario_text);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;

@@ -16,7 +16,7 @@ use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::arguments::Programs;
-use crate::buses::Buses;
+use crate::buses;
 
 /// Where benches are run, and with what.
 #[derive(Debug)]
@@ -46,7 +46,7 @@ impl Benches {
             fs::write(path, text).map_err(|error| failed(path, &error))?;
         }
         let own = std::env::current_exe().map_err(|error| failed(Path::new("gateway"), &error))?;
-        let buses = Buses::create("experiment")?;
+        let buses = buses::directory("experiment")?;
         let mut command = Command::new(&own);
         command.arg("run").arg(&skin).arg("--scenario").arg(&scenario).arg("--record").arg(&recording);
         command.arg("--summary").arg(&summary).args(["--bus-kind", "embedded", "--quiet"]);
@@ -58,7 +58,7 @@ impl Benches {
             }
         }
         command
-            .env("SKINBUS_DIR", &buses.0)
+            .env("SKINBUS_DIR", buses.path())
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::piped());
