@@ -15,6 +15,7 @@ use protocol::usage::{Failure, print};
 use self::show::{Known, Shown};
 use super::arguments::{BusKind, bus_of, seconds};
 use super::input;
+use super::print::{json, json_line};
 
 /// How long is listened, unless it is told.
 const LISTEN_S: f64 = 1.0;
@@ -60,7 +61,11 @@ impl Cells {
         let seconds = self.seconds.or_else(|| (!self.watch).then_some(LISTEN_S));
         let show = |watch: &Watch| {
             let shown = Shown::of(watch, known.as_ref());
-            if self.json { shown.json(self.watch) } else { Ok(shown.table()) }
+            match (self.json, self.watch) {
+                (false, _) => Ok(shown.table()),
+                (true, false) => json(&shown),
+                (true, true) => json_line(&shown),
+            }
         };
         let terminal = io::stdout().is_terminal() && !self.json;
         let mut drawn = Instant::now();

@@ -19,6 +19,11 @@ pub(crate) fn json(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string_pretty(value).map(|text| text + "\n").map_err(Failure::run)
 }
 
+/// The same in one line.
+pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string(value).map(|text| text + "\n").map_err(Failure::run)
+}
+
 /// What stands between commas.
 pub(crate) fn list(items: impl IntoIterator<Item: Display>) -> String {
     joined(", ", items)

@@ -109,34 +109,11 @@ impl Listing {
     }
 }
 
-/// A cell's parent, for people: a number, `gateway`, or `none`.
-#[must_use]
-pub fn parent(tree: &Tree) -> String {
-    match tree.parent {
-        None => "none".to_owned(),
-        Some(0) => "gateway".to_owned(),
-        Some(number) => number.to_string(),
-    }
-}
-
-/// What the ports lead to, for people: numbers, `?` after one that does not hear back, `0` for a cell without a
-/// number, `.` where nothing is heard.
-#[must_use]
-pub fn ports(ports: &Ports) -> String {
-    let port = |port: &protocol::message::PortState| match (port.hears, port.works, port.other_version) {
-        (false, _, _) => ".".to_owned(),
-        (true, _, true) => format!("{}!", port.number),
-        (true, false, false) => format!("{}?", port.number),
-        (true, true, false) => port.number.to_string(),
-    };
-    ports.ports.iter().map(port).collect::<Vec<_>>().join(" ")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use protocol::id::{CellId, Node};
-    use protocol::message::{PortState, State};
+    use protocol::message::State;
     use protocol::packet::Epoch;
 
     fn says(number: i64, page: NetworkPage) -> Message {
@@ -169,33 +146,5 @@ mod tests {
         }
         let (_, cell) = listing.cells().next().unwrap();
         assert_eq!((cell.other, cell.heard), (Some(7), None));
-    }
-
-    #[test]
-    fn places_in_the_tree_are_words() {
-        let tree = |parent| parent_of(Tree { parent, ..Tree::default() });
-        assert_eq!([tree(None), tree(Some(0)), tree(Some(12))], ["none", "gateway", "12"]);
-        let heard = PortState { number: 12, hears: true, ..PortState::default() };
-        let works = PortState { works: true, ..heard };
-        let other = PortState { other_version: true, ..works };
-        let all = Ports { ports: [PortState::default(), heard, works, other], changes: 0 };
-        assert_eq!(ports(&all), ". 12? 12 12!");
-    }
-
-    fn parent_of(tree: Tree) -> String {
-        parent(&tree)
-    }
-
-    #[test]
-    fn a_cell_whose_number_another_one_claims_stays_and_both_are_named() {
-        let mut listing = Listing::new();
-        let owner = Heartbeat { serial: 7, sent: 40, state: State::CONFIGURED, ..Heartbeat::default() };
-        let claim = Heartbeat { serial: 8, state: State::CLAIMING, ..Heartbeat::default() };
-        let heard = NetworkPage::Heard(Heard::default());
-        for page in [NetworkPage::Heartbeat(owner), heard, NetworkPage::Heartbeat(claim)] {
-            listing.hear(Micros(0), Format::Fd, &says(3, page));
-        }
-        let (_, cell) = listing.cells().next().unwrap();
-        assert_eq!((cell.heartbeat, cell.heard, cell.other), (Some(owner), Some(Heard::default()), Some(8)));
     }
 }

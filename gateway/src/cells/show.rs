@@ -1,20 +1,20 @@
 //! The list as a table and as JSON.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 
 use bench::cells::Watch;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
-use model::listing::{self, Cell, Listing};
+use model::listing::Cell;
 use protocol::can::Format;
 use protocol::id::CellId;
 use protocol::message::{Heard, Heartbeat, PortState, Refused, State, Tree};
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use protocol::usage::Failure;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::print::{self, filled, some, words};
+use crate::print::{filled, some, words};
 
 /// What a description says of a bus.
 pub(super) struct Known {
@@ -24,73 +24,87 @@ pub(super) struct Known {
     cells: BTreeMap<u32, (CellId, u16)>,
 }
 
-/// What is shown now.
-pub(super) struct Shown<'a> {
-    bus: &'a str,
-    kind: String,
-    listing: &'a Listing,
-    known: Option<&'a Known>,
-    now: Micros,
-}
+/// A column: its head, and what stands there of a cell that has said it.
+type Column = (&'static str, fn(&CellShown) -> Option<String>);
 
-/// What stands in a column of a cell that has said it.
-type Text<'a> = Box<dyn Fn(&(u8, &'a Cell)) -> Option<String> + 'a>;
+const COLUMNS: [Column; 10] = [
+    ("cell", |it| text(Some(it.node))),
+    ("serial", |it| text(it.serial)),
+    ("state", CellShown::state),
+    ("joint", |it| text(it.joint)),
+    ("up", |it| it.tree.as_ref().map(TreeShown::up)),
+    ("depth", |it| text(it.tree.as_ref()?.depth)),
+    ("ports", |it| it.ports.as_ref().map(|ports| words(ports.iter().map(PortShown::leads_to)))),
+    ("hash", |it| it.hash.clone()),
+    ("skin", |it| it.skin.clone()),
+    ("age", |it| Some(format!("{:.2}", it.age_s))),
+];
 
-/// A column: its head and its text.
-type Column<'a> = (&'static str, Text<'a>);
-
-/// A counter: its head and its value.
-type Counter = (&'static str, fn(&Cell) -> Option<u16>);
-
-/// What stands in a column of what heartbeats say.
-fn of_heartbeat<'a>(what: fn(&Heartbeat) -> Option<String>) -> Text<'a> {
-    Box::new(move |(_, cell)| what(cell.heartbeat.as_ref()?))
-}
+/// For who has the room.
+const COUNTERS: [Column; 9] = [
+    ("sent", |it| text(it.sent)),
+    ("refused", |it| text(it.refused)),
+    ("joints", |it| text(it.heard.map(|it| it.joints))),
+    ("late", |it| text(it.heard.map(|it| it.joints_late))),
+    ("torques", |it| text(it.heard.map(|it| it.torques))),
+    ("stimuli", |it| text(it.heard.map(|it| it.stimuli))),
+    ("sums", |it| text(it.tree.as_ref().map(|it| it.sums_sent))),
+    ("taken", |it| text(it.tree.as_ref().map(|it| it.sums_taken))),
+    ("dropped", |it| text(it.tree.as_ref().map(|it| it.sums_dropped))),
+];
 
 /// Columns that are not of numbers.
 const OF_WORDS: [&str; 3] = ["state", "ports", "skin"];
 
+fn text(value: Option<impl Display>) -> Option<String> {
+    value.map(|value| value.to_string())
+}
+
+/// A bus and the cells that are heard on it.
+#[derive(Serialize)]
+pub(super) struct Shown<'a> {
+    bus: &'a str,
+    kind: String,
+    gateway_heard: bool,
+    cells: Vec<CellShown>,
+    /// Cells of the description that were not heard.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    missing: Option<Vec<u8>>,
+    #[serde(skip)]
+    file: &'a str,
+}
+
 impl<'a> Shown<'a> {
     /// What was heard, beside what a description says.
     pub(super) fn of(watch: &'a Watch, known: Option<&'a Known>) -> Self {
-        let (bus, kind) = (watch.bus().name(), watch.bus().kind().to_string());
-        Self { bus, kind, listing: watch.listing(), known, now: watch.now() }
+        let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
+        let missing = |known: &Known| {
+            let silent = known.cells.iter().filter(|(serial, _)| listing.number_of(**serial).is_none());
+            silent.map(|(_, (cell, _))| cell.get()).collect()
+        };
+        Self {
+            bus: bus.name(),
+            kind: bus.kind().to_string(),
+            gateway_heard: listing.has_gateway(),
+            cells: listing.cells().map(|(node, cell)| CellShown::of(node, cell, known, now)).collect(),
+            missing: known.map(missing),
+            file: known.map_or("", |known| &known.file),
+        }
     }
 
     /// One line a cell, and what is odd; without counters where there is no room for them.
     pub(super) fn table(&self) -> String {
-        let whole = self.lines(self.columns().into_iter().chain(counters()));
-        let wide = Table::new().width();
-        let text = match wide {
-            Some(wide) if width(&whole) > usize::from(wide) => self.lines(self.columns()),
+        let whole = self.lines(COLUMNS.into_iter().chain(COUNTERS));
+        let text = match Table::new().width() {
+            Some(wide) if width(&whole) > usize::from(wide) => self.lines(COLUMNS),
             _ => whole,
         };
         text + &self.end()
     }
 
-    fn columns(&self) -> Vec<Column<'_>> {
-        let now = self.now;
-        let mut columns: Vec<Column<'_>> = vec![
-            ("cell", Box::new(|(number, _)| Some(number.to_string()))),
-            ("serial", of_heartbeat(|it| Some(it.serial.to_string()))),
-            ("state", of_heartbeat(|it| Some(state(it.state)))),
-            ("joint", of_heartbeat(|it| configured(it).then(|| it.state.joint().to_string()))),
-            ("up", Box::new(|(_, cell)| cell.tree.as_ref().map(listing::parent))),
-            ("depth", Box::new(|(_, cell)| depth(cell.tree.as_ref()?).map(|depth| depth.to_string()))),
-            ("ports", Box::new(|(_, cell)| cell.ports.as_ref().map(listing::ports))),
-            ("hash", of_heartbeat(hash)),
-        ];
-        if let Some(known) = self.known {
-            columns.push(("skin", Box::new(|(number, cell)| known.says(*number, cell.heartbeat.as_ref()?))));
-        }
-        columns.push(("age", Box::new(move |(_, cell)| Some(format!("{:.2}", age_s(cell, now))))));
-        columns
-    }
-
     /// One line a cell; a column in which nobody has said anything is left out.
-    fn lines<'b>(&'b self, columns: impl IntoIterator<Item = Column<'b>>) -> String {
-        let cells: Vec<_> = self.listing.cells().collect();
-        let (heads, lines) = filled(columns, &cells, "-");
+    fn lines(&self, columns: impl IntoIterator<Item = Column>) -> String {
+        let (heads, lines) = filled(columns, &self.cells, "-");
         let mut table = Table::new();
         table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
         table.set_header(&heads).add_rows(lines);
@@ -105,130 +119,29 @@ impl<'a> Shown<'a> {
 
     /// How many there are, and what is odd.
     fn end(&self) -> String {
-        let number = |is: fn(&Heartbeat) -> bool| {
-            self.listing.cells().filter(|(_, cell)| cell.heartbeat.as_ref().is_some_and(is)).count()
-        };
-        let all = self.listing.cells().len();
-        let mut text = format!("{all} cells on {} ({})", self.bus, self.kind);
-        let (active, bare) = (number(|it| it.state.has(State::ACTIVE)), number(|it| !configured(it)));
+        let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
+        let active = self.cells.iter().filter(|cell| cell.is("active")).count();
+        let bare = self.cells.iter().filter(|cell| cell.configured == Some(false)).count();
         for (count, what) in [(active, "in contact"), (bare, "without parameters")] {
             if count > 0 {
                 text += &format!(", {count} {what}");
             }
         }
-        if self.listing.has_gateway() {
-            text += ", and a gateway";
-        }
-        text.push('\n');
-        let shared = self.listing.cells().filter_map(|(number, cell)| {
-            let (one, other) = (cell.other?, cell.heartbeat?.serial);
-            Some(format!("{number} by the serial numbers {one} and {other}"))
+        text += if self.gateway_heard { ", and a gateway\n" } else { "\n" };
+        let shared = self.cells.iter().filter_map(|cell| {
+            let (node, one, other) = (cell.node, cell.other_serial?, cell.serial?);
+            Some(format!("{node} by the serial numbers {one} and {other}"))
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
             text += &format!("numbers under which two cells speak: {}\n", some(&shared));
         }
-        if let Some(known) = self.known {
-            let missing: Vec<_> = self.missing(known).map(|cell| cell.to_string()).collect();
-            if !missing.is_empty() {
-                text += &format!("cells of {} that were not heard: {}\n", known.file, some(&missing));
-            }
+        let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
+        if !missing.is_empty() {
+            text += &format!("cells of {} that were not heard: {}\n", self.file, some(&missing));
         }
         text
     }
-
-    fn missing<'b>(&'b self, known: &'b Known) -> impl Iterator<Item = CellId> + 'b {
-        let silent = known.cells.iter().filter(|(serial, _)| self.listing.number_of(**serial).is_none());
-        silent.map(|(_, (cell, _))| *cell)
-    }
-
-    /// One object, in one line if it is one of many.
-    pub(super) fn json(&self, is_one_of_many: bool) -> Result<String, Failure> {
-        let whole = Whole {
-            bus: self.bus,
-            kind: &self.kind,
-            gateway_heard: self.listing.has_gateway(),
-            cells: self.listing.cells().map(|(node, cell)| self.cell(node, cell)).collect(),
-            missing: self.known.map(|known| self.missing(known).map(CellId::get).collect()),
-        };
-        if is_one_of_many {
-            return serde_json::to_string(&whole).map(|text| text + "\n").map_err(Failure::run);
-        }
-        print::json(&whole)
-    }
-
-    fn cell(&self, node: u8, cell: &Cell) -> CellShown {
-        let beat = cell.heartbeat.as_ref();
-        CellShown {
-            node,
-            age_s: age_s(cell, self.now),
-            serial: beat.map(|it| it.serial),
-            configured: beat.map(configured),
-            state: beat.map(|it| names(it.state).collect()),
-            joint: beat.filter(|it| configured(it)).map(|it| it.state.joint()),
-            version: beat.map(|it| it.state.version()),
-            hash: beat.and_then(hash),
-            skin: self.known.and_then(|known| known.says(node, beat?)),
-            sent: beat.map(|it| it.sent),
-            refused: beat.map(|it| it.rejected),
-            heard: cell.heard,
-            refused_by: cell.refused,
-            tree: cell.tree.as_ref().map(TreeShown::of),
-            ports: cell.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
-            parent_changes: cell.ports.map(|it| it.changes),
-            other_serial: cell.other,
-        }
-    }
-}
-
-/// Counters, for who has the room.
-fn counters<'a>() -> impl Iterator<Item = Column<'a>> {
-    let counters: [Counter; 9] = [
-        ("sent", |cell| cell.heartbeat.map(|it| it.sent)),
-        ("refused", |cell| cell.heartbeat.map(|it| it.rejected)),
-        ("joints", |cell| cell.heard.map(|it| it.joints)),
-        ("late", |cell| cell.heard.map(|it| it.joints_late)),
-        ("torques", |cell| cell.heard.map(|it| it.torques)),
-        ("stimuli", |cell| cell.heard.map(|it| it.stimuli)),
-        ("sums", |cell| cell.tree.map(|it| it.sent)),
-        ("taken", |cell| cell.tree.map(|it| it.taken)),
-        ("dropped", |cell| cell.tree.map(|it| it.dropped)),
-    ];
-    counters.into_iter().map(|(head, of)| -> Column<'a> {
-        (head, Box::new(move |(_, cell)| of(cell).map(|count| count.to_string())))
-    })
-}
-
-const fn configured(heartbeat: &Heartbeat) -> bool {
-    heartbeat.state.has(State::CONFIGURED)
-}
-
-/// The names of the bits that are set.
-fn names(state: State) -> impl Iterator<Item = &'static str> {
-    State::NAMES.into_iter().filter(move |(bit, _)| state.has(*bit)).map(|(_, name)| name)
-}
-
-/// In words; that a cell is configured is said when there is nothing else to say.
-fn state(state: State) -> String {
-    let bare = (!state.has(State::CONFIGURED)).then_some("unconfigured");
-    let others: Vec<_> = bare.into_iter().chain(names(state).filter(|name| *name != "configured")).collect();
-    if others.is_empty() { "configured".to_owned() } else { words(others) }
-}
-
-/// Of a cell that has a parent.
-fn depth(tree: &Tree) -> Option<u8> {
-    tree.parent.map(|_| tree.depth)
-}
-
-/// The configuration, of a cell that has one.
-fn hash(heartbeat: &Heartbeat) -> Option<String> {
-    configured(heartbeat).then(|| format!("{:04X}", heartbeat.configuration))
-}
-
-#[expect(clippy::cast_precision_loss, reason = "seconds")]
-fn age_s(cell: &Cell, now: Micros) -> f64 {
-    // To the ms, which is what it is known to.
-    (cell.age(now).0 as f64 / 1e3).round() / 1e3
 }
 
 impl Known {
@@ -244,7 +157,7 @@ impl Known {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
         };
-        let is = match (configured(heartbeat), heartbeat.configuration == *hash) {
+        let is = match (heartbeat.state.has(State::CONFIGURED), heartbeat.configuration == *hash) {
             (false, _) => "none",
             (true, true) => "yes",
             (true, false) => "other",
@@ -267,16 +180,6 @@ pub(super) fn screen(text: &str) -> String {
     let lines = text.lines().take(shown).chain(more.as_deref());
     let lines: String = lines.map(|line| format!("{line}\x1b[K\n")).collect();
     format!("\x1b[H{lines}\x1b[J")
-}
-
-#[derive(Serialize)]
-struct Whole<'a> {
-    bus: &'a str,
-    kind: &'a str,
-    gateway_heard: bool,
-    cells: Vec<CellShown>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    missing: Option<Vec<u8>>,
 }
 
 /// What it has not said is null.
@@ -303,6 +206,47 @@ struct CellShown {
     other_serial: Option<u32>,
 }
 
+impl CellShown {
+    fn of(node: u8, cell: &Cell, known: Option<&Known>, now: Micros) -> Self {
+        let beat = cell.heartbeat.as_ref();
+        let configured = beat.filter(|it| it.state.has(State::CONFIGURED));
+        #[expect(clippy::cast_precision_loss, reason = "seconds, to the ms, which is what it is known to")]
+        let age_s = (cell.age(now).0 as f64 / 1e3).round() / 1e3;
+        Self {
+            node,
+            age_s,
+            serial: beat.map(|it| it.serial),
+            configured: beat.map(|_| configured.is_some()),
+            state: beat.map(|it| it.state.names().collect()),
+            joint: configured.map(|it| it.state.joint()),
+            version: beat.map(|it| it.state.version()),
+            hash: configured.map(|it| format!("{:04X}", it.configuration)),
+            skin: known.and_then(|known| known.says(node, beat?)),
+            sent: beat.map(|it| it.sent),
+            refused: beat.map(|it| it.rejected),
+            heard: cell.heard,
+            refused_by: cell.refused,
+            tree: cell.tree.as_ref().map(TreeShown::of),
+            ports: cell.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
+            parent_changes: cell.ports.map(|it| it.changes),
+            other_serial: cell.other,
+        }
+    }
+
+    /// Whether it says that it is in this state.
+    fn is(&self, state: &str) -> bool {
+        self.state.iter().flatten().any(|name| *name == state)
+    }
+
+    /// The state in words; that a cell is configured is said when there is nothing else to say.
+    fn state(&self) -> Option<String> {
+        let bare = (self.configured == Some(false)).then_some(&"unconfigured");
+        let others = self.state.as_ref()?.iter().filter(|name| **name != "configured");
+        let said = words(bare.into_iter().chain(others));
+        Some(if said.is_empty() { "configured".to_owned() } else { said })
+    }
+}
+
 #[derive(Serialize)]
 struct TreeShown {
     /// 0 is the gateway's side.
@@ -315,8 +259,18 @@ struct TreeShown {
 
 impl TreeShown {
     fn of(it: &Tree) -> Self {
-        let Tree { parent, sent, taken, dropped, .. } = *it;
-        Self { parent, depth: depth(it), sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
+        let Tree { parent, depth, sent, taken, dropped, .. } = *it;
+        let depth = parent.map(|_| depth);
+        Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
+    }
+
+    /// The parent in words.
+    fn up(&self) -> String {
+        match self.parent {
+            None => "none".to_owned(),
+            Some(0) => "gateway".to_owned(),
+            Some(number) => number.to_string(),
+        }
     }
 }
 
@@ -333,5 +287,31 @@ impl PortShown {
     fn of(it: &PortState) -> Self {
         let PortState { number, port, hears, works, other_version } = *it;
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
+    }
+
+    /// In words: `?` after a cell that does not hear back, `!` after one of another version.
+    fn leads_to(&self) -> String {
+        match (self.node, self.works, self.other_version) {
+            (None, _, _) => ".".to_owned(),
+            (Some(node), _, true) => format!("{node}!"),
+            (Some(node), false, false) => format!("{node}?"),
+            (Some(node), true, false) => node.to_string(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_in_the_tree_are_words() {
+        let up = |parent| TreeShown::of(&Tree { parent, ..Tree::default() }).up();
+        assert_eq!([up(None), up(Some(0)), up(Some(12))], ["none", "gateway", "12"]);
+        let heard = PortState { number: 12, hears: true, ..PortState::default() };
+        let works = PortState { works: true, ..heard };
+        let other = PortState { other_version: true, ..works };
+        let all = [PortState::default(), heard, works, other];
+        assert_eq!(words(all.map(|port| PortShown::of(&port).leads_to())), ". 12? 12 12!");
     }
 }
