@@ -4,23 +4,18 @@ mod show;
 
 use std::path::PathBuf;
 
-use analysis::explain::{Asked, Explanation, Watch, explain};
+use analysis::explain::{Asked, Explanation, explain, find};
 use clap::Args;
-use model::decode::{Decoded, Decoder};
 use protocol::id::CellId;
 use protocol::packet::Epoch;
 use protocol::skin::Skin;
-use protocol::time::Micros;
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use trace::capture::{Entry, NoteKind, Reader};
+use trace::capture::{Format, Reader};
 
 use super::arguments::{bus_names, nanos};
 use super::output;
 use super::print::{json, list};
-
-/// The skin in a recording.
-const ATTACHED: &str = "skin.toml";
 
 /// Say why the torque of one epoch is what it is
 ///
@@ -97,8 +92,16 @@ impl Explain {
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
         let asked = Asked { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
-        let (moments, first) = find(&mut reader, &skin, asked)?;
-        let moments = moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
+        let found = find(&mut reader, &skin, asked).map_err(Failure::run)?;
+        for (count, what) in [
+            (found.dropped, "frames are missing before this point; what was felt may be older"),
+            (found.unreadable, "lines before this point could not be read"),
+        ] {
+            if count > 0 {
+                output::note(format_args!("{name}: {count} {what}"));
+            }
+        }
+        let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
         let mut explanation = explain(&skin, &moments);
         if let Some(wanted) = &self.cell {
             let named = |bus: &str, node: u8| {
@@ -121,7 +124,7 @@ impl Explain {
             (false, Some(_)) => show::What::Joint,
             (false, None) => show::What::All,
         };
-        print(&show::text(&name, self.epoch, first, &explanation, what))
+        print(&show::text(&name, self.epoch, found.first_ns, &explanation, what))
     }
 
     /// The cell and the joint must be the skin's.
@@ -160,49 +163,6 @@ impl Explain {
     }
 }
 
-type Found = Result<Vec<Option<analysis::explain::Moment>>, analysis::explain::NotFound>;
-
-/// Reads up to what is asked for; also the time of the first frame.
-fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<(Found, u64), Failure> {
-    let name = reader.name().to_owned();
-    let mut watch = Watch::new(skin, asked);
-    let mut decoder = Decoder::new(None);
-    for before in &reader.extras().in_force {
-        let at = Micros(before.nanos / 1_000);
-        if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
-            watch.begin(before.nanos, &before.bus, &message);
-        }
-    }
-    let (mut first, mut dropped, mut unreadable) = (None, 0, 0_u64);
-    while let Some(entry) = reader.next().map_err(Failure::run)? {
-        match entry {
-            Entry::Frame(record) => {
-                let nanos = record.time.nanos;
-                first.get_or_insert(nanos);
-                let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
-                let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
-                if watch.take(nanos, record.interface, message) {
-                    break;
-                }
-            }
-            Entry::Note(note) => match note.kind {
-                NoteKind::Dropped(frames) => dropped = frames.saturating_add(dropped),
-                NoteKind::Unreadable(_) => unreadable += 1,
-                NoteKind::Text | NoteKind::CanXl => {}
-            },
-        }
-    }
-    if dropped > 0 {
-        output::note(format_args!(
-            "{name}: {dropped} frames are missing before this point; what was felt may be older"
-        ));
-    }
-    if unreadable > 0 {
-        output::note(format_args!("{name}: {unreadable} lines before this point could not be read"));
-    }
-    Ok((watch.moments(), first.unwrap_or_default()))
-}
-
 /// The skin that a recording has with it.
 fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| file.as_os_str() == "-") {
@@ -217,17 +177,14 @@ fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
         )));
     }
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
-    let name = reader.name().to_owned();
-    loop {
-        let more = reader.next().map_err(Failure::run)?.is_some();
-        let found = reader.extras().attachments.iter().find(|(name, _)| name == ATTACHED);
-        if let Some((_, bytes)) = found {
-            let text = std::str::from_utf8(bytes)
-                .map_err(|error| Failure::run(format!("{name}: its {ATTACHED} is no text: {error}")))?;
-            return Skin::parse(&format!("{name}, {ATTACHED}"), text).map_err(Failure::usage);
-        }
-        if !more || reader.format() == trace::capture::Format::Candump {
-            return Err(Failure::usage(format!("{name} has no skin in it: say which with --skin")));
-        }
+    // It may stand behind the frames.
+    while reader.format() == Format::Mcap
+        && reader.extras().skin().is_none()
+        && reader.next().map_err(Failure::run)?.is_some()
+    {}
+    let name = reader.name();
+    match reader.extras().skin() {
+        Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
+        None => Err(Failure::usage(format!("{name} has no skin in it: say which with --skin"))),
     }
 }

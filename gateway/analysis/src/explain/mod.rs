@@ -11,8 +11,10 @@
 //! the exact one that makes the very word. What a capture does not tell is named in [`Explanation::missing`] and
 //! left open.
 
+mod read;
 mod watch;
 
+pub use read::{Found, find};
 pub use watch::{Asked, CellMoment, Moment, NotFound, Origin, Watch};
 
 use protocol::fixed::{Q, Q3_12};
