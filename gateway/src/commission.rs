@@ -84,8 +84,8 @@ impl Commission {
         let interrupted = stopped.load(Ordering::Relaxed);
         nobody(&file, &done, interrupted)?;
         let whole = show::Whole {
-            skin: skin.name.clone(),
-            file,
+            skin: &skin.name,
+            file: &file,
             seconds: began.elapsed().as_secs_f64(),
             dry_run: self.dry_run,
             interrupted,

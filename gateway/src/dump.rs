@@ -19,7 +19,7 @@ use protocol::stop::{self, Stoppable};
 use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
-use trace::capture::{Entry, Extras, NoteKind, Reader};
+use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 
 use self::show::{How, Show};
 use super::arguments::{BusKind, Word, nanos, one_of};
@@ -165,21 +165,12 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>)
         format: &'a str,
         #[serde(flatten)]
         report: &'a Report,
-        other_topics: Vec<Topic<'a>>,
+        other_topics: &'a [Topic],
         attachments: Vec<&'a str>,
     }
-    #[derive(Serialize)]
-    struct Topic<'a> {
-        topic: &'a str,
-        schema: &'a str,
-        messages: u64,
-    }
-    let topics = extras.iter().flat_map(|extras| &extras.topics);
-    let other_topics =
-        topics.map(|topic| Topic { topic: &topic.name, schema: &topic.schema, messages: topic.messages });
+    let other_topics = extras.map_or(&[][..], |extras| &extras.topics);
     let attachments = extras.iter().flat_map(|extras| &extras.attachments).map(|(name, _)| name.as_str());
-    let (other_topics, attachments) = (other_topics.collect(), attachments.collect());
-    let whole = Whole { source, format, report, other_topics, attachments };
+    let whole = Whole { source, format, report, other_topics, attachments: attachments.collect() };
     json(&whole)
 }
 

@@ -12,6 +12,7 @@ use thiserror::Error;
 
 /// The number of a cell on its bus, 1 to 254; 0 is the gateway and 255 is everyone.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+#[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct CellId(u8);
 
 /// A number that is no cell's.

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use bench::commission::Done;
-use model::commission::{CellReport, Outcome, Stranger};
+use model::commission::{CellReport, Outcome, Report, Stranger};
+use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
@@ -14,22 +15,22 @@ const LINES: usize = 8;
 
 /// All of it.
 #[derive(Debug, Serialize)]
-pub(super) struct Whole {
-    pub(super) skin: String,
+pub(super) struct Whole<'a> {
+    pub(super) skin: &'a str,
     #[serde(skip)]
-    pub(super) file: String,
+    pub(super) file: &'a str,
     #[serde(rename = "duration_s")]
     pub(super) seconds: f64,
     pub(super) dry_run: bool,
     pub(super) interrupted: bool,
-    pub(super) buses: Vec<BusShown>,
+    pub(super) buses: Vec<BusShown<'a>>,
 }
 
 /// One bus.
 #[derive(Debug, Serialize)]
-pub(super) struct BusShown {
-    name: String,
-    kind: String,
+pub(super) struct BusShown<'a> {
+    name: &'a str,
+    kind: &'a str,
     written: usize,
     already_so: usize,
     verified: usize,
@@ -38,77 +39,35 @@ pub(super) struct BusShown {
     requests: u64,
     repeated: u64,
     frames_dropped: u32,
-    failure: Option<String>,
-    cells: Vec<CellShown>,
-    strangers: Vec<StrangerShown>,
+    failure: Option<&'a str>,
+    cells: &'a [CellReport],
+    strangers: &'a [Stranger],
 }
 
-/// One cell.
-#[derive(Debug, Serialize)]
-struct CellShown {
-    /// In the description.
-    described: u8,
-    /// On the bus.
-    node: Option<u8>,
-    serial: u32,
-    outcome: &'static str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    why: Option<String>,
-}
-
-/// A cell that the description does not have there.
-#[derive(Debug, Serialize)]
-struct StrangerShown {
-    node: u8,
-    serial: u32,
-    /// The bus on which the description has it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    belongs_to: Option<String>,
-}
-
-impl CellShown {
-    fn of(cell: &CellReport) -> Self {
-        let (outcome, why) = match cell.outcome {
-            Outcome::Written => ("written", None),
-            Outcome::AlreadySo => ("already so", None),
-            Outcome::Verified => ("verified", None),
-            Outcome::WouldWrite => ("would be written", None),
-            Outcome::Failed(reason) => ("failed", Some(reason.to_string())),
-        };
-        let node = cell.number.map(|number| number.get());
-        Self { described: cell.described.get(), node, serial: cell.serial, outcome, why }
-    }
-}
-
-impl BusShown {
-    pub(super) fn of(done: &Done) -> Self {
-        let Done { name, kind, report, failure, dropped } = done;
-        let count = |is: fn(&Outcome) -> bool| report.cells.iter().filter(|cell| is(&cell.outcome)).count();
-        let stranger = |Stranger { number, serial, belongs }: &Stranger| StrangerShown {
-            node: number.get(),
-            serial: *serial,
-            belongs_to: belongs.clone(),
-        };
+impl<'a> BusShown<'a> {
+    pub(super) fn of(Done { name, kind, report, failure, dropped }: &'a Done) -> Self {
+        let Report { cells, strangers, requests, repeated, trouble: _ } = report;
+        let count = |is: fn(&Outcome) -> bool| cells.iter().filter(|cell| is(&cell.outcome)).count();
         Self {
-            name: name.clone(),
-            kind: kind.clone(),
+            name,
+            kind,
             written: count(|it| *it == Outcome::Written),
             already_so: count(|it| *it == Outcome::AlreadySo),
             verified: count(|it| *it == Outcome::Verified),
             would_write: count(|it| *it == Outcome::WouldWrite),
             failed: count(|it| matches!(it, Outcome::Failed(_))),
-            requests: report.requests,
-            repeated: report.repeated,
+            requests: *requests,
+            repeated: *repeated,
             frames_dropped: *dropped,
-            failure: failure.clone(),
-            cells: report.cells.iter().map(CellShown::of).collect(),
-            strangers: report.strangers.iter().map(stranger).collect(),
+            failure: failure.as_deref(),
+            cells,
+            strangers,
         }
     }
 
-    /// Cells under another number than the description's.
-    fn moved(&self) -> impl Iterator<Item = (u8, &CellShown)> {
-        self.cells.iter().filter_map(|cell| Some((cell.node.filter(|&node| node != cell.described)?, cell)))
+    /// Cells under another number than the description's, and which.
+    fn moved(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
+        self.cells.iter().filter_map(|cell| Some((cell.number.filter(|&node| node != cell.described)?, cell)))
     }
 
     fn rows(&self, rows: &mut Rows) {
@@ -126,10 +85,10 @@ impl BusShown {
         rows.any("would be written", self.would_write, "");
         rows.any("failed", self.failed, "");
         // One row for each reason, whatever the number of cells.
-        let mut reasons = BTreeMap::<&str, Vec<String>>::new();
-        for cell in &self.cells {
-            if let Some(why) = &cell.why {
-                reasons.entry(why).or_default().push(cell.described.to_string());
+        let mut reasons = BTreeMap::<String, Vec<String>>::new();
+        for cell in self.cells {
+            if let Outcome::Failed(why) = cell.outcome {
+                reasons.entry(why.to_string()).or_default().push(cell.described.to_string());
             }
         }
         for (why, cells) in reasons {
@@ -145,16 +104,16 @@ impl BusShown {
     }
 }
 
-impl Whole {
+impl Whole<'_> {
     /// What people should know beside the table.
     pub(super) fn notes(&self, has_copy: bool) -> Vec<String> {
-        let file = &self.file;
+        let file = self.file;
         let mut notes = Vec::new();
         for bus in &self.buses {
-            let name = &bus.name;
+            let name = bus.name;
             let [mut strangers, mut elsewhere] = [Vec::new(), Vec::new()];
-            for StrangerShown { node, serial, belongs_to } in &bus.strangers {
-                match belongs_to {
+            for Stranger { number: node, serial, belongs } in bus.strangers {
+                match belongs {
                     None => strangers.push(format!("{node} (serial number {serial})")),
                     Some(other) => elsewhere.push(format!(
                         "cell {node} on {name} (serial number {serial}) belongs to {other} by {file}; left alone"
@@ -171,7 +130,7 @@ impl Whole {
                 let copy = if has_copy { "" } else { "; --numbers FILE writes a copy with theirs" };
                 notes.push(format!("{moved} cells have other numbers on {name} than in {file}{copy}"));
             } else {
-                notes.extend(bus.moved().map(|(node, CellShown { serial, described, .. })| {
+                notes.extend(bus.moved().map(|(node, CellReport { serial, described, .. })| {
                     format!("the cell with serial number {serial} is {node} on {name}, {described} in {file}")
                 }));
             }
@@ -187,18 +146,18 @@ impl Whole {
             (false, true) => "dry run, nothing was written",
             (false, false) => "done",
         };
-        let mut rows = Rows::new(&self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
+        let mut rows = Rows::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
         self.buses.iter().for_each(|bus| bus.rows(&mut rows));
         rows.text()
     }
 
     /// How it ends, when all has been shown.
     pub(super) fn end(&self) -> Result<(), Failure> {
-        let sum = |part: fn(&BusShown) -> usize| self.buses.iter().map(part).sum::<usize>();
+        let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));
         let are = if failed == 1 { "is" } else { "are" };
         let what = format!("{failed} of {cells} cells {are} not commissioned");
-        if let Some(failure) = self.buses.iter().find_map(|bus| bus.failure.as_deref()) {
+        if let Some(failure) = self.buses.iter().find_map(|bus| bus.failure) {
             return Err(Failure::run(format!("{failure}; {what}")));
         }
         match (self.interrupted, failed) {

@@ -7,6 +7,7 @@ use protocol::message::VERSION;
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use protocol::schema::reason;
+use serde::{Serialize, Serializer};
 use thiserror::Error;
 
 use crate::decode::parameter::{Name, Words};
@@ -43,16 +44,19 @@ impl fmt::Display for Ask {
     }
 }
 
-/// What became of a cell.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// What became of a cell; as JSON in words, `outcome` and `why`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(tag = "outcome", content = "why", rename_all = "lowercase")]
 pub enum Outcome {
     /// It was written, read back and compared.
     Written,
     /// It had the skin's configuration already, by its hash.
+    #[serde(rename = "already so")]
     AlreadySo,
     /// It had it already, and every word was read and compared.
     Verified,
     /// It would be written, if this were no dry run.
+    #[serde(rename = "would be written")]
     WouldWrite,
     /// It could not be done; it computes with what it had before, or with all of the new.
     Failed(Reason),
@@ -125,6 +129,12 @@ pub enum Reason {
     /// It ended before its turn was over.
     #[error("was not reached before the end; what it has is whole, the old or the new")]
     Stopped,
+}
+
+impl Serialize for Reason {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
 }
 
 /// Why a whole bus is left alone from some moment on.

@@ -1,6 +1,7 @@
 //! How far a commissioning is, and what it came to.
 
 use protocol::id::CellId;
+use serde::Serialize;
 
 use super::task::{Stage, Task};
 use super::{Commission, Outcome, Phase, Reason, Trouble, is_failed};
@@ -21,26 +22,30 @@ pub struct Progress {
 }
 
 /// What became of one cell.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct CellReport {
     /// Its number in the description.
     pub described: CellId,
+    /// Its number on the bus, if it was heard.
+    #[serde(rename = "node")]
+    pub number: Option<CellId>,
     /// Its serial number.
     pub serial: u32,
-    /// Its number on the bus, if it was heard.
-    pub number: Option<CellId>,
     /// What became of it.
+    #[serde(flatten)]
     pub outcome: Outcome,
 }
 
 /// A cell that the description does not have on this bus.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Stranger {
     /// Its number on the bus.
+    #[serde(rename = "node")]
     pub number: CellId,
     /// Its serial number.
     pub serial: u32,
     /// The bus on which the description has it.
+    #[serde(rename = "belongs_to", skip_serializing_if = "Option::is_none")]
     pub belongs: Option<String>,
 }
 

@@ -3,6 +3,7 @@
 use protocol::can::Frame;
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
+use serde::Serialize;
 
 /// What an MCAP recording has beside frames and notes, as far as it has been read.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -64,9 +65,10 @@ pub struct InForce {
 }
 
 /// A topic that is neither frames nor notes.
-#[derive(Clone, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Topic {
     /// Its name.
+    #[serde(rename = "topic")]
     pub name: String,
     /// The type of its messages.
     pub schema: String,
