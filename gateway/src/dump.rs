@@ -123,8 +123,10 @@ impl Dump {
             let done = captured(&mut reader, &mut show, self.strict);
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
+            // Signals are caught before it says that it listens.
+            let stopped = stopped()?;
             let mut ear = Ear::open(&title, self.on.bus_kind, self.format, Options::default())?;
-            ("live", None, live(&mut ear, &mut show, self.to, &*stopped()?))
+            ("live", None, live(&mut ear, &mut show, self.to, &stopped))
         };
         written(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();

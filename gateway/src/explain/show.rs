@@ -1,5 +1,7 @@
 //! An explanation as tables.
 
+use std::collections::BTreeSet;
+
 use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
 
 use crate::print::{self, decimals, or};
@@ -136,54 +138,45 @@ fn sign(steps: i32) -> String {
     if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
 }
 
-/// The verdict that asks most of the reader.
-fn worst(rows: &[Row]) -> String {
-    let rank = |row: &&Row| match row.verdict {
-        Verdict::Unexplained => 4,
-        Verdict::Open => 3,
-        Verdict::Saturated => 2,
-        Verdict::Rounded { .. } => 1,
-        Verdict::Nearest => 0,
-    };
-    rows.iter().max_by_key(rank).map(|row| short(&row.verdict).to_owned()).unwrap_or_default()
+/// How much a verdict asks of the reader, the word for it, and what that means where it is not plain.
+fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
+    match verdict {
+        Verdict::Nearest => (0, "nearest", None),
+        Verdict::Rounded { .. } => {
+            let means = "a J so many steps of 2^-14 m from the exact one gives this very word";
+            (1, "16 bits", Some(means.to_owned()))
+        }
+        Verdict::Saturated => {
+            let means = "the product is beyond 8 Nm, and the word says so";
+            (2, "saturated", Some(means.to_owned()))
+        }
+        Verdict::Open => (3, "open", None),
+        Verdict::Unexplained => {
+            let means = format!("no J within {JACOBIAN_STEPS} steps of the exact one gives this word");
+            (4, "NOT EXPLAINED", Some(means))
+        }
+    }
 }
 
-const fn short(verdict: &Verdict) -> &'static str {
-    match verdict {
-        Verdict::Nearest => "nearest",
-        Verdict::Rounded { .. } => "16 bits",
-        Verdict::Saturated => "saturated",
-        Verdict::Unexplained => "NOT EXPLAINED",
-        Verdict::Open => "open",
-    }
+/// The verdict that asks most of the reader.
+fn worst(rows: &[Row]) -> String {
+    or(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
 /// The same with the J that a word comes of.
 fn long(verdict: &Verdict) -> String {
+    let (_, short, _) = about(verdict);
     match verdict {
-        Verdict::Rounded { jacobian_steps, .. } => format!("16 bits: J {jacobian_steps:+.2}"),
-        Verdict::Nearest | Verdict::Saturated | Verdict::Unexplained | Verdict::Open => {
-            short(verdict).to_owned()
-        }
+        Verdict::Rounded { jacobian_steps, .. } => format!("{short}: J {jacobian_steps:+.2}"),
+        Verdict::Nearest | Verdict::Saturated | Verdict::Unexplained | Verdict::Open => short.to_owned(),
     }
 }
 
 /// What the words of the last column mean, those that stand there.
 fn legend(cells: &[CellExplained]) -> String {
-    let rows = || cells.iter().flat_map(|cell| &cell.rows);
-    let mut text = String::new();
-    if rows().any(|row| matches!(row.verdict, Verdict::Rounded { .. })) {
-        text += "  16 bits: a J so many steps of 2^-14 m from the exact one gives this very word\n";
-    }
-    if rows().any(|row| row.verdict == Verdict::Saturated) {
-        text += "  saturated: the product is beyond 8 Nm, and the word says so\n";
-    }
-    if rows().any(|row| row.verdict == Verdict::Unexplained) {
-        text += &format!(
-            "  NOT EXPLAINED: no J within {JACOBIAN_STEPS} steps of the exact one gives this word\n"
-        );
-    }
-    text
+    let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| about(&row.verdict));
+    let said: BTreeSet<_> = said.collect();
+    said.iter().filter_map(|(_, short, means)| Some(format!("  {short}: {}\n", means.as_ref()?))).collect()
 }
 
 fn every_step(cell: &CellExplained, first: u64) -> String {
