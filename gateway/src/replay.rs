@@ -41,29 +41,8 @@ pub(crate) struct Replay {
     files: Vec<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Send the frames of one of the capture's buses on another bus
-    #[arg(long, value_name = "FROM=TO", value_parser = route)]
-    map: Vec<(String, String)>,
-    /// Only the frames of these buses of the capture
-    #[arg(long, value_name = "NAME", value_delimiter = ',')]
-    bus: Vec<String>,
-    /// Whose frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
-    /// else all are sent
-    #[arg(long, value_parser = one_of(ONLY))]
-    only: Option<Only>,
-    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, wire, and foreign
-    #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
-    kind: Vec<Wanted>,
-    /// Only packets from or to these: a cell's number, gateway, everyone
-    #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
-    node: Vec<Node>,
-    /// Begin so many seconds after the first frame; with inputs only, in the state that was in force there
-    #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
-    from: u64,
-    /// End before the frame so many seconds after the first one
-    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
-    to: Option<u64>,
+    #[command(flatten)]
+    frames: Frames,
     /// Do it N times; 0 is until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
@@ -112,6 +91,34 @@ pub(crate) struct Replay {
     quiet: bool,
 }
 
+/// Which frames of the capture, and where they go.
+#[derive(Args, Debug)]
+struct Frames {
+    /// Send the frames of one of the capture's buses on another bus
+    #[arg(long, value_name = "FROM=TO", value_parser = route)]
+    map: Vec<(String, String)>,
+    /// Only the frames of these buses of the capture
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    bus: Vec<String>,
+    /// Whose frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
+    /// else all are sent
+    #[arg(long, value_parser = one_of(ONLY))]
+    only: Option<Only>,
+    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
+    /// joints, sync, resume, report alone, wire, and foreign
+    #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
+    kind: Vec<Wanted>,
+    /// Only packets from or to these: a cell's number, gateway, everyone
+    #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
+    node: Vec<Node>,
+    /// Begin so many seconds after the first frame; with inputs only, in the state that was in force there
+    #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
+    from: u64,
+    /// End before the frame so many seconds after the first one
+    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    to: Option<u64>,
+}
+
 const ONLY: &[Word<Only>] = &[
     ("inputs", "Commands, configuration, stimuli", Only::Inputs),
     ("replies", "What cells said", Only::Replies),
@@ -152,7 +159,7 @@ impl Replay {
     fn options(&self) -> Result<Options, Failure> {
         let answered = [("--expect", self.expect), ("--lockstep", self.lockstep), ("--spawn", self.spawn)];
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
-        let only = match (self.only, needs) {
+        let only = match (self.frames.only, needs) {
             (Some(Only::Replies | Only::All), Some(name)) => {
                 return Err(Failure::usage(format!(
                     "{name} lets cells answer, and --only sends recorded answers in their place: leave out one of the \
@@ -166,10 +173,14 @@ impl Replay {
             files: self.files.clone(),
             kinds: self.kinds.of_any()?,
             only,
-            pick: Pick { kinds: self.kind.clone(), nodes: self.node.clone(), ..Pick::default() },
-            buses: self.bus.clone(),
-            map: self.map.clone(),
-            part: Part { from: self.from, to: self.to },
+            pick: Pick {
+                kinds: self.frames.kind.clone(),
+                nodes: self.frames.node.clone(),
+                ..Pick::default()
+            },
+            buses: self.frames.bus.clone(),
+            map: self.frames.map.clone(),
+            part: Part { from: self.frames.from, to: self.frames.to },
             passes: (self.passes > 0).then_some(self.passes),
             pace: if self.max { Pace::Max } else { Pace::Timed(self.speed) },
             spin: Duration::from_micros(self.spin.into()),
