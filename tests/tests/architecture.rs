@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Each crate of the workspace, and the others that it may use.
-const MAY_USE: [(&str, &[&str]); 11] = [
+const MAY_USE: [(&str, &[&str]); 12] = [
     ("protocol", &[]),
     ("cell-node", &["protocol"]),
     ("vcan-setup", &["protocol"]),
@@ -16,6 +16,7 @@ const MAY_USE: [(&str, &[&str]); 11] = [
     ("analysis", &["model", "protocol", "trace"]),
     ("bench", &["control", "model", "protocol", "trace", "vcan-setup"]),
     ("paper", &["analysis", "cell-node", "control", "model", "protocol", "trace"]),
+    ("reference", &["cell-node", "model", "protocol"]),
     ("gateway", &["analysis", "bench", "control", "model", "paper", "protocol", "trace", "vcan-setup"]),
     // Whole benches are made of everything.
     ("skinbus-tests", &["analysis", "bench", "cell-node", "control", "model", "paper", "protocol", "trace"]),
