@@ -11,7 +11,7 @@ use quote::ToTokens;
 use syn::{Attribute, Item};
 
 /// Each crate of the workspace, and the others that it may use.
-const MAY_USE: [(&str, &[&str]); 11] = [
+const MAY_USE: [(&str, &[&str]); 12] = [
     ("protocol", &[]),
     ("cell-node", &["protocol"]),
     ("vcan-setup", &["protocol"]),
@@ -21,6 +21,7 @@ const MAY_USE: [(&str, &[&str]); 11] = [
     ("analysis", &["model", "protocol", "trace"]),
     ("bench", &["control", "model", "protocol", "trace", "vcan-setup"]),
     ("paper", &["analysis", "cell-node", "control", "model", "protocol", "trace"]),
+    ("reference", &["cell-node", "model", "protocol"]),
     ("gateway", &["analysis", "bench", "control", "model", "paper", "protocol", "trace", "vcan-setup"]),
     // Whole benches are made of everything.
     ("skinbus-tests", &["analysis", "bench", "cell-node", "control", "model", "paper", "protocol", "trace"]),
