@@ -17,7 +17,7 @@ use super::judge::Judge;
 use super::live::Live;
 use super::player::{LaneTally, Pace, Played, Player};
 use super::reel::{Cut, Selection};
-use super::report::{BusSummary, Expect, First, Lockstep, Summary};
+use super::report::{BusSummary, Expect, Lockstep, Summary};
 use super::source::{AHEAD, Source};
 use super::start::{Buses, Wearing};
 use super::survey::Bus;
@@ -242,7 +242,7 @@ impl Session<'_> {
             joints_skipped: late.sum(),
             recording_dropped: self.checks.survey.dropped,
             unchecked_cells: self.checks.unchecked(),
-            first: judge.first().map(First::from),
+            first: judge.first().cloned(),
         }
     }
 }

@@ -34,6 +34,35 @@ use super::survey::Cell as Surveyed;
 /// A reply may come so many joints after those that it answers; far less than the 256 epochs.
 const WINDOW: u64 = 100;
 
+/// The first difference.
+#[derive(Debug)]
+struct First {
+    /// When the capture began, in ns since 1970.
+    nanos: u64,
+    difference: Option<Difference>,
+}
+
+impl First {
+    /// Takes in a difference, with the number, the epoch and the time of its joints.
+    fn note(
+        &mut self,
+        how: How,
+        bus: &str,
+        cell: CellId,
+        round: Option<(u64, Epoch, u64)>,
+        [recorded, now]: [Option<Said>; 2],
+    ) {
+        if self.difference.is_some() {
+            return;
+        }
+        let when = round.map(|(joints, epoch, nanos)| {
+            let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
+            When { joints, epoch: epoch.0, at_s }
+        });
+        self.difference = Some(Difference::new(how, bus, cell, when, recorded.as_ref(), now.as_ref()));
+    }
+}
+
 /// All buses.
 #[derive(Debug)]
 pub struct Judge {
@@ -41,10 +70,8 @@ pub struct Judge {
     expects: bool,
     /// While a state is restored, replies are not those of the capture.
     is_muted: bool,
-    /// When the capture began, in ns since 1970.
-    first_nanos: u64,
     tally: Tally,
-    first: Option<Difference>,
+    first: First,
     rival: Option<usize>,
 }
 
@@ -62,9 +89,8 @@ impl Judge {
             lanes,
             expects,
             is_muted: true,
-            first_nanos,
             tally: Tally::default(),
-            first: None,
+            first: First { nanos: first_nanos, difference: None },
             rival: None,
         }
     }
@@ -213,8 +239,8 @@ impl Judge {
             Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
-                let said = Said::Words { what, recorded: None, now: Some(words) };
-                self.note(index, How::Extra, cell, Some((number, epoch, nanos)), said);
+                let said = [None, Some(Said::Words(what, words))];
+                self.first.note(How::Extra, &lane.name, cell, Some((number, epoch, nanos)), said);
             }
         }
     }
@@ -314,8 +340,8 @@ impl Judge {
                 self.close_round(lane);
             }
         }
-        for lane in 0..self.lanes.len() {
-            self.close_answers(lane);
+        for lane in &mut self.lanes {
+            lane.close_answers(&mut self.tally, &mut self.first);
         }
     }
 
@@ -328,19 +354,7 @@ impl Judge {
     /// The first difference, missing or extra reply.
     #[must_use]
     pub const fn first(&self) -> Option<&Difference> {
-        self.first.as_ref()
-    }
-
-    fn note(&mut self, lane: usize, how: How, cell: CellId, round: Option<(u64, Epoch, u64)>, said: Said) {
-        if self.first.is_some() {
-            return;
-        }
-        let bus = self.lanes.get(lane).map_or_else(String::new, |lane| lane.name.clone());
-        let when = round.map(|(joints, epoch, nanos)| {
-            let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.first_nanos)).as_secs_f64();
-            When { joints, epoch: epoch.0, at_s }
-        });
-        self.first = Some(Difference { how, bus, cell, when, said });
+        self.first.difference.as_ref()
     }
 }
 
