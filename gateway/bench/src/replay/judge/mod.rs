@@ -321,12 +321,17 @@ impl Judge {
         self.lanes.get(lane).into_iter().flat_map(|lane| lane.roll.iter().map(|(cell, it)| (*cell, it)))
     }
 
+    /// Those of them that do not only claim their node id.
+    pub fn settled(&self, lane: usize) -> impl Iterator<Item = (CellId, &Present)> {
+        self.present(lane).filter(|(_, present)| present.claim.is_settled())
+    }
+
     /// Cells that have not said where their sums go, or have no way up.
     #[must_use]
     pub fn without_a_way(&self, lane: usize) -> Vec<CellId> {
+        let settled = self.settled(lane);
         let Some(lane) = self.lanes.get(lane) else { return Vec::new() };
-        let settled = lane.roll.iter().filter(|(_, present)| present.claim.is_settled());
-        settled.map(|(cell, _)| *cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
+        settled.map(|(cell, _)| cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
     }
 
     /// Judges all that has been sent, and hears no more; `is_whole` says whether that was all that the capture has.
