@@ -40,15 +40,6 @@ pub(super) struct Session {
     pub(super) measuring: Vec<Vec<CellId>>,
 }
 
-/// What was sent, and by whom.
-struct Sending {
-    played: Played,
-    cut: Cut,
-    seconds: f64,
-    live: Live,
-    granted: Granted,
-}
-
 impl Session {
     /// `idle` is how late the idle machine wakes a thread, `wearing` the skin of the cells that were started.
     pub(super) fn run(
@@ -65,18 +56,23 @@ impl Session {
                 receivers.push(spawn(&format!("rx {}", lane.bus.name()), hear)?);
             }
         }
-        let outcome = self.meet(wearing).and_then(|()| self.play());
+        let mut outcome = self.meet(wearing).and_then(|()| self.play(idle));
         if let Err(error) = self.leave() {
             self.progress.note(&error.to_string());
         }
         self.hall.deaf.store(true, Ordering::Relaxed);
-        let unheard: Vec<_> = receivers.into_iter().map(|thread| thread.join().unwrap_or(0)).collect();
+        for (lane, receiver) in receivers.into_iter().enumerate() {
+            let unheard = receiver.join().unwrap_or(0);
+            if let Some(bus) = outcome.as_mut().ok().and_then(|summary| summary.buses.get_mut(lane)) {
+                bus.unheard = unheard;
+            }
+        }
         self.progress.clear();
-        Ok(self.summary(outcome?, &unheard, idle))
+        outcome
     }
 
-    /// Sends everything.
-    fn play(&mut self) -> Result<Sending, ReplayError> {
+    /// Sends everything; the summary is yet without what the receivers have not heard.
+    fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
         let hall = Arc::clone(&self.hall);
         let reader = spawn("reader", move || source::read(&hall, queue))?;
@@ -114,7 +110,7 @@ impl Session {
         })?;
         let rival = self.watch(&said, || player.is_finished());
         let (mut played, mut live, granted) = player.join().map_err(|_| RunError::Panicked("player"))?;
-        let seconds = began.elapsed().as_secs_f64();
+        let duration_s = began.elapsed().as_secs_f64();
         let cut = reader.join().map_err(|_| RunError::Panicked("reader"))?;
         if let Some(rival) = rival {
             played.failure = Some(rival.to_string());
@@ -135,7 +131,7 @@ impl Session {
             played.failure.get_or_insert_with(|| error.to_string());
             Cut::default()
         });
-        Ok(Sending { played, cut, seconds, live, granted })
+        Ok(self.summary(played, cut, &live, duration_s, granted, idle))
     }
 
     /// Shows how it goes, until it is over; whether there is another gateway.
@@ -174,8 +170,15 @@ impl Session {
         options.passes.map(|passes| one * u64::from(passes))
     }
 
-    fn summary(&self, sending: Sending, unheard: &[u64], idle: Option<&Histogram<u64>>) -> Summary {
-        let Sending { played, cut, seconds, live, granted } = sending;
+    fn summary(
+        &self,
+        played: Played,
+        cut: Cut,
+        live: &Live,
+        duration_s: f64,
+        granted: Granted,
+        idle: Option<&Histogram<u64>>,
+    ) -> Summary {
         let checks = &self.hall.checks;
         let options = &checks.options;
         let total = |of: fn(&LaneTally) -> u64| played.lanes.iter().map(of).sum();
@@ -185,7 +188,7 @@ impl Session {
                 name: name.to_owned(),
                 kind: self.buses.lanes.get(index)?.bus.kind().to_string(),
                 frames: *played.lanes.get(index)?,
-                unheard: unheard.get(index).copied().unwrap_or(0),
+                unheard: 0,
             })
         };
         let silent = |(lane, cell): &(usize, CellId)| format!("{cell} on {}", checks.lane(*lane));
@@ -194,7 +197,7 @@ impl Session {
         let asked_again = live.asked_again;
         Summary {
             file: checks.name.clone(),
-            duration_s: seconds,
+            duration_s,
             interrupted: played.was_stopped && self.signalled.load(Ordering::Relaxed),
             sent: total(|lane| lane.sent),
             refused: total(|lane| lane.refused),

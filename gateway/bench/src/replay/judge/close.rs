@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use protocol::id::CellId;
 use protocol::packet::WORDS;
 
-use super::lane::{Excuse, Fate, Lane, Pair, Round, excuse_extra};
+use super::lane::{Both, Excuse, Lane, Round, excuse_extra};
 use super::sums::{Outcome, Side, Why, compare};
 use super::{First, Judge, Tally};
 use crate::replay::difference::{How, Said, What};
@@ -17,7 +17,7 @@ impl Judge {
         let Some(round) = lane.rounds.pop_front() else { return };
         let number = lane.base;
         lane.base += 1;
-        if !self.expects || round.fate == Fate::Waiting {
+        if !self.expects || round.asked == 0 {
             return;
         }
         if round.is_first {
@@ -26,7 +26,7 @@ impl Judge {
         let at = Some((number, round.epoch, round.nanos));
         for (&(cell, what), &pair) in &round.replies {
             if let Some(how) = lane.compare_reply(number, &round, (cell, what), pair, tally) {
-                tally.count(how, round.fate);
+                tally.count(how, round.is_unsent);
                 let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
                 first.note(how, &lane.name, cell, at, said);
             }
@@ -46,7 +46,7 @@ impl Lane {
         number: u64,
         round: &Round,
         (cell, what): (CellId, What),
-        Pair { recorded, now }: Pair,
+        Both { recorded, now }: Both<Option<[i16; WORDS]>>,
         tally: &mut Tally,
     ) -> Option<How> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
@@ -69,7 +69,7 @@ impl Lane {
                 tally.lacking.sensed_otherwise += 1;
                 None
             }
-            (Some(_), None) if round.fate == Fate::Unsent => Some(How::Missing),
+            (Some(_), None) if round.is_unsent => Some(How::Missing),
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded == [0; WORDS];
                 // What was over before, by what was sent, or began before the part: the cell had not taken the
@@ -124,7 +124,7 @@ impl Lane {
                 }
                 Outcome::LeftOut(why) => {
                     *match why {
-                        _ if round.fate == Fate::Unsent => &mut tally.not_asked,
+                        _ if round.is_unsent => &mut tally.not_asked,
                         Why::Changing => &mut lacking.parent_changing,
                         Why::Unknown => &mut lacking.tree_unknown,
                         Why::NotTaken => &mut lacking.sums_not_taken,
@@ -144,7 +144,7 @@ impl Lane {
                 }
                 Outcome::Extra => How::Extra,
             };
-            tally.count(how, round.fate);
+            tally.count(how, round.is_unsent);
             let said = [then.own(cell), now.own(cell)].map(|own| own.map(Said::Sum));
             first.note(how, &self.name, cell, Some((number, round.epoch, round.nanos)), said);
         }
@@ -181,7 +181,7 @@ impl Lane {
                     (Some(_), None) => How::Missing,
                     (None, Some(_)) => How::Extra,
                 };
-                tally.count(how, Fate::Sent);
+                tally.count(how, false);
                 let said = [recorded, now].map(|said| said.map(|(tag, answer)| Said::Answer(tag, answer)));
                 first.note(how, &self.name, cell, None, said);
             }

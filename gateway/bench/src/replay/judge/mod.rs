@@ -23,7 +23,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
 pub use lane::Present;
-use lane::{Asked, Both, Fate, Lane, Pair, take_first_joints};
+use lane::{Asked, Both, Lane, take_first_joints};
 pub use sums::Own;
 use sums::{Side, Sum};
 pub use tally::{Lacking, Tally};
@@ -169,7 +169,7 @@ impl Judge {
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
         if let Some(round) = it.round(number) {
-            round.fate = Fate::Sent;
+            round.is_unsent = false;
             // Asked again, all cells say their sums again.
             round.sums.now.clear();
             round.asked_as = epoch;
@@ -193,7 +193,7 @@ impl Judge {
     /// Takes in that a bus did not take the joints of a round.
     pub fn was_not_sent(&mut self, lane: usize, round: u64) {
         if let Some(round) = self.lanes.get_mut(lane).and_then(|lane| lane.round(round)) {
-            round.fate = Fate::Unsent;
+            round.is_unsent = true;
         }
     }
 
@@ -282,10 +282,9 @@ impl Judge {
         };
         let is_there =
             |cell: &CellId| lane.roll.get(cell).is_some_and(|present: &Present| !present.is_given_up);
-        let misses = |((cell, what), pair): &(&(CellId, What), &Pair)| {
-            is_there(cell) && *what == What::Torque && pair.recorded.is_some() && pair.now.is_none()
-        };
-        let torques = round.replies.iter().filter(misses).count();
+        let replies = round.replies.iter().filter(|((_, what), _)| *what == What::Torque);
+        let missed = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
+        let torques = missed.filter(|((cell, _), _)| is_there(cell)).count();
         let Both { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;

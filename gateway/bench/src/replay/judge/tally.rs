@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-use super::lane::Fate;
 use crate::replay::difference::How;
 
 /// How replies and recorded ones compare.
@@ -62,12 +61,12 @@ pub struct Lacking {
 
 impl Tally {
     /// Counts a reply that is not as it was recorded; one to joints that a bus did not take cannot come.
-    pub(super) const fn count(&mut self, how: How, fate: Fate) {
-        let count = match (how, fate) {
-            (How::Missing, Fate::Unsent) => &mut self.not_asked,
-            (How::Missing, Fate::Waiting | Fate::Sent) => &mut self.missing,
-            (How::Different, _) => &mut self.different,
-            (How::Extra, _) => &mut self.extra,
+    pub(super) const fn count(&mut self, how: How, is_unsent: bool) {
+        let count = match how {
+            How::Missing if is_unsent => &mut self.not_asked,
+            How::Missing => &mut self.missing,
+            How::Different => &mut self.different,
+            How::Extra => &mut self.extra,
         };
         *count += 1;
     }
