@@ -191,7 +191,7 @@ fn replayed(skin: &Skin, before: &[capture::InForce], part: &[Seen]) -> Judge {
     let selection =
         Selection { only: Only::Inputs, pick: Default::default(), lanes: vec![Some(0)], reads: true };
     let mut reel = Reel::new(&survey, &selection);
-    let (mut cells, mut steps) = (Cells::of(skin), Vec::new());
+    let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut judge);
     if !bus.state.is_fresh() {
         let Step::Restore(states) = reel.restoring() else { unreachable!() };
@@ -204,14 +204,14 @@ fn replayed(skin: &Skin, before: &[capture::InForce], part: &[Seen]) -> Judge {
     }
     judge.mute(false);
     for seen in part {
-        reel.take(&record(seen), &mut judge, |step| steps.push(step));
+        let _ = reel.take(&record(seen), &mut judge);
     }
-    reel.end_pass(&mut judge, |step| steps.push(step));
+    reel.end_pass(&mut judge);
     judge.record_end();
-    for step in steps {
+    while let Some(step) = reel.next_step() {
         let Step::Frame(due) = step else { unreachable!() };
-        if let Role::Joints { epoch, round, .. } = due.role {
-            judge.announce(0, round, epoch);
+        if let Role::Joints(open) = due.role {
+            judge.announce(0, open.round, open.epoch);
         }
         cells.take(&due.frame, &mut judge);
     }

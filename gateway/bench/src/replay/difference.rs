@@ -34,32 +34,15 @@ pub enum How {
     Extra,
 }
 
-/// What was said, as far as anything was.
+/// What a cell said.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
     /// The words of a reply to joints.
-    Words {
-        /// Which reply.
-        what: What,
-        /// In the recording.
-        recorded: Option<[i16; WORDS]>,
-        /// Now.
-        now: Option<[i16; WORDS]>,
-    },
-    /// Sums, and what is left of them without those of the children.
-    Sums {
-        /// In the recording.
-        recorded: Option<Own>,
-        /// Now.
-        now: Option<Own>,
-    },
-    /// Answers to `configure`, with their tags.
-    Answers {
-        /// In the recording.
-        recorded: Option<(u8, Answer)>,
-        /// Now.
-        now: Option<(u8, Answer)>,
-    },
+    Words(What, [i16; WORDS]),
+    /// A sum, and what is left of it without those of the children.
+    Sum(Own),
+    /// An answer to `configure`, with its tag.
+    Answer(u8, Answer),
 }
 
 /// Some joints of a recording.
@@ -73,98 +56,109 @@ pub struct When {
     pub at_s: f64,
 }
 
-/// A reply that is not as it was recorded. Displayed in several lines.
-#[derive(Clone, Debug, PartialEq)]
+/// A reply that is not as it was recorded.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
     /// How.
     pub how: How,
     /// The bus, as it is called now.
     pub bus: String,
     /// The cell.
-    pub cell: CellId,
+    pub cell: u8,
     /// The joints that it answers, if it answers joints.
+    #[serde(flatten)]
     pub when: Option<When>,
-    /// What was said.
-    pub said: Said,
+    /// In several lines, as it is shown.
+    pub text: String,
 }
 
 impl Difference {
-    /// The reply as a message would say it.
-    fn told(&self, words: [i16; WORDS], what: What) -> String {
-        let epoch = Epoch(self.when.map_or(0, |when| when.epoch));
-        let (kind, count) = match what {
-            What::Torque => (Kind::Torque, 1),
-            What::Skin => (Kind::Sensors, 0),
-            What::Acceleration => (Kind::Sensors, 1),
+    /// Between what a cell said in the recording, and now.
+    #[must_use]
+    pub fn new(
+        how: How,
+        bus: &str,
+        cell: CellId,
+        when: Option<When>,
+        recorded: Option<&Said>,
+        now: Option<&Said>,
+    ) -> Self {
+        let what = match how {
+            How::Different => "difference",
+            How::Missing => "missing reply",
+            How::Extra => "extra reply",
         };
-        let packet = Packet { id: Id::new(kind, Node::Cell(self.cell)), words, epoch, count };
-        Message::decode(&packet).map_or_else(|error| error.to_string(), meaning)
+        let joints = when.map_or_else(String::new, |When { joints, epoch, at_s }| {
+            format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
+        });
+        let epoch = Epoch(when.map_or(0, |when| when.epoch));
+        let told =
+            |said: Option<&Said>| said.map_or_else(|| "nothing".to_owned(), |said| said.told(cell, epoch));
+        let mut text = format!(
+            "the first {what}: cell {cell} on {bus}{joints}\n  recorded  {}\n  now       {}",
+            told(recorded),
+            told(now)
+        );
+        if let Some(((recorded, step), (now, _))) =
+            recorded.and_then(Said::steps).zip(now.and_then(Said::steps))
+        {
+            text += &format!("\n  {}", Steps(recorded, now, step));
+        }
+        Self { how, bus: bus.to_owned(), cell: cell.get(), when, text }
+    }
+}
+
+impl Said {
+    /// In the words of a message.
+    fn told(&self, cell: CellId, epoch: Epoch) -> String {
+        match self {
+            &Self::Words(what, words) => {
+                let (kind, count) = match what {
+                    What::Torque => (Kind::Torque, 1),
+                    What::Skin => (Kind::Sensors, 0),
+                    What::Acceleration => (Kind::Sensors, 1),
+                };
+                let packet = Packet { id: Id::new(kind, Node::Cell(cell)), words, epoch, count };
+                Message::decode(&packet).map_or_else(|error| error.to_string(), meaning)
+            }
+            Self::Sum(own) => summed(cell, epoch, own),
+            &Self::Answer(tag, answer) => meaning(Message::Configured { from: cell, tag, answer }),
+        }
     }
 
-    /// A sum, its children, and what the cell itself put into it.
-    fn summed(&self, own: &Own) -> String {
-        let epoch = Epoch(self.when.map_or(0, |when| when.epoch));
-        let sum = Message::Sum { from: self.cell, epoch, torque: own.sum, count: own.count };
-        let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
-        let less = match children.as_slice() {
-            [] => "no children".to_owned(),
-            [one] => format!("less its child {one}"),
-            several => format!("less its children {}", several.join(", ")),
-        };
-        let word = |step: &Option<i32>| match step {
-            Some(step) => format!(" {:.3}", f64::from(*step) * Q7_8::from_bits(1).to_f64()),
-            None => " saturated".to_owned(),
-        };
-        let words: String = own.steps.iter().map(word).collect();
-        format!("{}; {less}:{words} Nm", meaning(sum))
+    /// Its torques in steps, none where one is saturated, and a step in Nm.
+    fn steps(&self) -> Option<([Option<i32>; WORDS], f64)> {
+        match self {
+            Self::Words(What::Torque, words) => {
+                Some((words.map(|word| Some(word.into())), Q3_12::from_bits(1).to_f64()))
+            }
+            Self::Sum(own) => Some((own.steps, Q7_8::from_bits(1).to_f64())),
+            Self::Words(What::Skin | What::Acceleration, _) | Self::Answer(..) => None,
+        }
     }
+}
 
-    fn answered(&self, (tag, answer): (u8, Answer)) -> String {
-        meaning(Message::Configured { from: self.cell, tag, answer })
-    }
+/// A sum, its children, and what the cell itself put into it.
+fn summed(cell: CellId, epoch: Epoch, own: &Own) -> String {
+    let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
+    let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
+    let less = match children.as_slice() {
+        [] => "no children".to_owned(),
+        [one] => format!("less its child {one}"),
+        several => format!("less its children {}", several.join(", ")),
+    };
+    let word = |step: &Option<i32>| match step {
+        Some(step) => format!(" {:.3}", f64::from(*step) * Q7_8::from_bits(1).to_f64()),
+        None => " saturated".to_owned(),
+    };
+    let words: String = own.steps.iter().map(word).collect();
+    format!("{}; {less}:{words} Nm", meaning(sum))
 }
 
 /// A message in words, without the verdict.
 fn meaning(message: Message) -> String {
     let text = Decoded::Message(message).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
-}
-
-impl Display for Difference {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let (cell, bus) = (self.cell, &self.bus);
-        match self.how {
-            How::Different => write!(f, "the first difference: cell {cell} on {bus}")?,
-            How::Missing => write!(f, "the first missing reply: cell {cell} on {bus}")?,
-            How::Extra => write!(f, "the first extra reply: cell {cell} on {bus}")?,
-        }
-        if let Some(When { joints, epoch, at_s }) = self.when {
-            write!(f, ", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")?;
-        }
-        let (recorded, now) = match &self.said {
-            &Said::Words { what, recorded, now } => {
-                (recorded.map(|words| self.told(words, what)), now.map(|words| self.told(words, what)))
-            }
-            Said::Sums { recorded, now } => {
-                let told = |own: &Option<Own>| own.as_ref().map(|own| self.summed(own));
-                (told(recorded), told(now))
-            }
-            &Said::Answers { recorded, now } => {
-                (recorded.map(|answer| self.answered(answer)), now.map(|answer| self.answered(answer)))
-            }
-        };
-        let nothing = || "nothing".to_owned();
-        write!(f, "\n  recorded  {}", recorded.unwrap_or_else(nothing))?;
-        write!(f, "\n  now       {}", now.unwrap_or_else(nothing))?;
-        if let Said::Words { what: What::Torque, recorded: Some(recorded), now: Some(now) } = self.said {
-            let steps = |words: [i16; WORDS]| words.map(|word| Some(i32::from(word)));
-            write!(f, "\n  {}", Steps(steps(recorded), steps(now), Q3_12::from_bits(1).to_f64()))?;
-        }
-        if let Said::Sums { recorded: Some(recorded), now: Some(now) } = &self.said {
-            write!(f, "\n  {}", Steps(recorded.steps, now.steps, Q7_8::from_bits(1).to_f64()))?;
-        }
-        Ok(())
-    }
 }
 
 /// By how much torques differ: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
@@ -178,16 +172,14 @@ impl Display for Steps {
             if now.is_none() != recorded.is_none() {
                 let when = if now.is_none() { "now" } else { "then" };
                 write!(f, "{comma}joint {joint}: saturated {when}")?;
-                comma = ", ";
+            } else if steps != 0 {
+                let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
+                let unit = if count == 1 { "step" } else { "steps" };
+                let nm = f64::from(count) * self.2;
+                write!(f, "{comma}joint {joint}: {count} {unit} {way} ({nm:.4} Nm)")?;
+            } else {
                 continue;
             }
-            if steps == 0 {
-                continue;
-            }
-            let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
-            let unit = if count == 1 { "step" } else { "steps" };
-            let nm = f64::from(count) * self.2;
-            write!(f, "{comma}joint {joint}: {count} {unit} {way} ({nm:.4} Nm)")?;
             comma = ", ";
         }
         Ok(())
@@ -200,38 +192,24 @@ mod tests {
 
     #[test]
     fn a_different_torque_is_shown_word_by_word() {
-        let difference = Difference {
-            how: How::Different,
-            bus: "vcan0".to_owned(),
-            cell: CellId::new(12).unwrap(),
-            when: Some(When { joints: 37, epoch: 7, at_s: 2.3842 }),
-            said: Said::Words {
-                what: What::Torque,
-                recorded: Some([-1075, 3195, 0, 0, 0, 0]),
-                now: Some([-1074, 3193, 0, 0, 0, 0]),
-            },
-        };
+        let torque = |words| Said::Words(What::Torque, words);
+        let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
+        let when = Some(When { joints: 37, epoch: 7, at_s: 2.3842 });
+        let cell = CellId::new(12).unwrap();
+        let difference = Difference::new(How::Different, "vcan0", cell, when, Some(&recorded), Some(&now));
         let expected =
             "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
   recorded  torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm
   now       torque 12 epoch 7: -0.2622 0.7795 0.0000 0.0000 0.0000 0.0000 Nm
   joint 1: 1 step more (0.0002 Nm), joint 2: 2 steps less (0.0005 Nm)";
-        assert_eq!(difference.to_string(), expected);
+        assert_eq!(difference.text, expected);
     }
 
     #[test]
     fn what_was_not_said_is_nothing() {
-        let difference = Difference {
-            how: How::Missing,
-            bus: "can1".to_owned(),
-            cell: CellId::new(3).unwrap(),
-            when: None,
-            said: Said::Answers {
-                recorded: Some((9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH })),
-                now: None,
-            },
-        };
-        let text = difference.to_string();
+        let refused = Said::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
+        let cell = CellId::new(3).unwrap();
+        let text = Difference::new(How::Missing, "can1", cell, None, Some(&refused), None).text;
         let lines: Vec<_> = text.lines().collect();
         assert_eq!(lines.len(), 3, "{text}");
         assert_eq!(lines[0], "the first missing reply: cell 3 on can1");

@@ -8,6 +8,7 @@ use std::time::Duration;
 use protocol::bus::Inbox;
 use protocol::time::Micros;
 
+use super::checks::Checks;
 use super::judge::Judge;
 use super::start::Lane;
 use crate::run::realtime;
@@ -22,10 +23,13 @@ const DOWN: Duration = Duration::from_millis(20);
 /// What all threads of a replay look at.
 #[derive(Debug)]
 pub(super) struct Hall {
+    pub(super) checks: Checks,
     judge: Mutex<Judge>,
     heard: Condvar,
     /// Set once: sending ends.
     pub(super) over: AtomicBool,
+    /// Set when the queue of steps is full for the first time, or all has been read.
+    pub(super) ready: AtomicBool,
     /// Set once, at the end: hearing ends.
     pub(super) deaf: AtomicBool,
     /// Frames sent, for people.
@@ -35,11 +39,15 @@ pub(super) struct Hall {
 }
 
 impl Hall {
-    pub(super) const fn new(judge: Judge) -> Self {
+    pub(super) fn new(checks: Checks) -> Self {
+        let judged = checks.lanes().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
+        let judge = Judge::new(judged, checks.survey.first.unwrap_or(0), checks.options.expect);
         Self {
+            checks,
             judge: Mutex::new(judge),
             heard: Condvar::new(),
             over: AtomicBool::new(false),
+            ready: AtomicBool::new(false),
             deaf: AtomicBool::new(false),
             sent: AtomicU64::new(0),
             at: AtomicU64::new(0),

@@ -6,19 +6,18 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
-use protocol::bus::BusError;
+use protocol::bus::{BusError, SendError};
 use protocol::can::Frame;
-use protocol::id::{CellId, Node};
+use protocol::id::CellId;
 use protocol::message::{Message, State as Flags};
 use protocol::packet::Epoch;
 
-use super::ReplayError;
-use super::checks::Checks;
 use super::hall::Hall;
-use super::judge::Present;
 use super::meet::mode;
-use super::player::{Open, Sent, Stage};
+use super::player::{Pace, Stage};
+use super::reel::Open;
 use super::start::Lane;
+use super::{Options, ReplayError};
 use crate::run::realtime;
 use crate::setup::names;
 
@@ -46,12 +45,6 @@ pub(super) struct Live {
     pub(super) hall: Arc<Hall>,
     /// For people.
     pub(super) voice: Sender<String>,
-    /// How long before its time a frame is waited for by spinning, in ns.
-    pub(super) spin_ns: u64,
-    /// Whether nothing is lost by waiting for an interface that is down.
-    pub(super) may_wait: bool,
-    /// What has to hold before the first frame is sent.
-    pub(super) checks: Arc<Checks>,
     /// Cells that did not answer in lockstep, by bus.
     pub(super) silent: Vec<(usize, CellId)>,
     /// Joints that were asked again.
@@ -67,7 +60,8 @@ impl Stage for Live {
     }
 
     fn wait_until(&mut self, at: u64) {
-        let asleep = at.saturating_sub(self.spin_ns);
+        let asleep =
+            at.saturating_sub(u64::try_from(self.hall.checks.options.spin.as_nanos()).unwrap_or(u64::MAX));
         while !self.hall.is_over() {
             let now = realtime::now();
             if now >= asleep {
@@ -92,29 +86,26 @@ impl Stage for Live {
         self.hall.judge().announce(lane, round, epoch);
     }
 
-    fn send(&mut self, index: usize, frames: &[Frame]) -> Sent {
-        let Some(lane) = self.lanes.get(index) else { return Sent::All };
+    fn send(&mut self, index: usize, frames: &[Frame]) -> Result<(), SendError> {
+        let Some(lane) = self.lanes.get(index) else { return Ok(()) };
         let sent = lane.bus.send(frames);
         let taken = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
         self.hall.sent.fetch_add(taken as u64, Ordering::Relaxed);
         if taken > 0 && self.down.remove(&index) {
             self.say(format!("{} works again", lane.bus.name()));
         }
-        match sent.map_err(|error| error.cause) {
-            Ok(()) => Sent::All,
-            Err(BusError::Full { .. }) => Sent::Full(taken),
-            Err(error @ BusError::Down { .. }) => {
-                if self.down.insert(index) {
-                    self.hall.judge().is_down(index);
-                    self.say(format!("{error}; what is due meanwhile is lost, and counted"));
-                }
-                if self.may_wait {
-                    std::thread::sleep(DOWN);
-                }
-                Sent::Down(taken)
+        if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
+            if self.down.insert(index) {
+                self.hall.judge().is_down(index);
+                self.say(format!("{error}; what is due meanwhile is lost, and counted"));
             }
-            Err(error) => Sent::Ended(taken, error.to_string()),
+            // With a clock something is lost by waiting.
+            let Options { pace, lockstep, .. } = self.hall.checks.options;
+            if pace == Pace::Max || lockstep {
+                std::thread::sleep(DOWN);
+            }
         }
+        sent
     }
 
     fn was_not_sent(&mut self, lane: usize, round: u64) {
@@ -123,7 +114,7 @@ impl Stage for Live {
 
     fn wait_for_answers(&mut self, lane: usize, open: &Open) {
         self.wait_until_done(lane);
-        let Some(round) = open.round.filter(|_| self.checks.expects) else { return };
+        let Some(round) = open.round.filter(|_| self.hall.checks.options.expect) else { return };
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
         // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
         // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
@@ -177,7 +168,7 @@ impl Stage for Live {
             self.finish(*lane, &[Message::Sync])?;
             self.hall.judge().mute(false);
         }
-        Ok(self.checks.hashes(&self.hall.judge())?)
+        Ok(self.hall.checks.hashes(&self.hall.judge())?)
     }
 
     fn show(&mut self, at: u64) {
@@ -189,10 +180,8 @@ impl Live {
     /// What makes the cells of a bus that are there forget what they felt, and obey what comes.
     fn forgetting(&self, lane: usize) -> Vec<Message> {
         let judge = self.hall.judge();
-        let obeys = |cell: &Present| cell.claim.is_settled() && cell.claim.says(Flags::TEST_MODE);
-        let obeying: Vec<_> =
-            judge.present(lane).filter(|(_, cell)| obeys(cell)).map(|(cell, _)| cell).collect();
-        obeying.into_iter().map(|cell| mode(Node::Cell(cell), true)).collect()
+        let obeying = judge.settled(lane).filter(|(_, cell)| cell.claim.says(Flags::TEST_MODE));
+        obeying.map(|(cell, _)| mode(cell, true)).collect()
     }
 
     fn tell(&self, lane: usize, messages: &[Message]) -> Result<(), BusError> {
@@ -233,11 +222,11 @@ impl Live {
             if progress.elapsed() > PATIENCE {
                 let late = judge.give_up(lane);
                 self.silent.extend(late.iter().map(|cell| (lane, *cell)));
-                let name = self.checks.lane(lane);
-                let (cells, plural) = (names(&late, ""), if late.len() == 1 { "" } else { "s" });
-                let verb = if late.len() == 1 { "does" } else { "do" };
+                let name = self.hall.checks.lane(lane);
+                let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
                 self.say(format!(
-                    "cell{plural} {cells} on {name} {verb} not answer within {} s: the replay goes on without",
+                    "cell{plural} {} on {name} {verb} not answer within {} s: the replay goes on without",
+                    names(&late, ""),
                     PATIENCE.as_secs()
                 ));
                 return;

@@ -1,6 +1,7 @@
 //! Before anything is sent: the cells are there, organised, and as they have to be.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -24,10 +25,11 @@ const ORGANISING: Duration = Duration::from_secs(2);
 /// How often it is looked.
 const LOOK: Duration = Duration::from_millis(5);
 
-impl Session<'_> {
+impl Session {
     /// Calls the cells, and sees that they are as they have to be.
     pub(super) fn meet(&mut self, wearing: Option<&Wearing>) -> Result<(), ReplayError> {
-        let options = self.options;
+        let hall = Arc::clone(&self.hall);
+        let (checks, options) = (&hall.checks, &hall.checks.options);
         if !options.hears() {
             return Ok(());
         }
@@ -36,22 +38,21 @@ impl Session<'_> {
             bus.into_iter().flat_map(|bus| skin.cells_of(bus)).map(|cell| cell.node).collect()
         };
         let wanted = match wearing {
-            None => self.checks.recorded(),
-            Some(wearing) => self.checks.lanes().map(|(name, _)| worn(&wearing.skin, name)).collect(),
+            None => checks.recorded(),
+            Some(wearing) => checks.lanes().map(|(name, _)| worn(&wearing.skin, name)).collect(),
         };
         self.call_the_roll(&wanted)?;
         self.let_them_organise()?;
-        let judge = self.hall.judge();
-        let settled = |lane| judge.present(lane).filter(|(_, cell)| cell.claim.is_settled()).count();
-        let there: usize = (0..self.buses.lanes.len()).map(settled).sum();
-        if there == 0 && (options.expect || options.lockstep || wearing.is_some()) {
-            let names: Vec<_> = self.checks.lanes().map(|(name, _)| name).collect();
+        let judge = hall.judge();
+        let nobody = (0..self.buses.lanes.len()).all(|lane| judge.settled(lane).next().is_none());
+        if nobody && (options.expect || options.lockstep || wearing.is_some()) {
+            let names: Vec<_> = checks.lanes().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
         }
-        if !self.checks.configures() {
-            self.checks.hashes(&judge)?;
+        if !checks.configures() {
+            checks.hashes(&judge)?;
         }
-        let measuring = self.checks.measuring(&judge);
+        let measuring = checks.measuring(&judge);
         drop(judge);
         let all = measuring.concat();
         if all.is_empty() {
@@ -75,7 +76,7 @@ impl Session<'_> {
         &mut self,
         mut is_last: impl FnMut(&mut Self, &Judge) -> Result<bool, ReplayError>,
     ) -> Result<(), ReplayError> {
-        let hall = std::sync::Arc::clone(&self.hall);
+        let hall = Arc::clone(&self.hall);
         while !is_last(self, &hall.judge())? {
             thread::sleep(LOOK);
         }
@@ -102,11 +103,10 @@ impl Session<'_> {
                 return Err(ReplayError::Ended { cells: ended.to_string(), status: ended.status });
             }
             if let Some(lane) = judge.rival() {
-                return Err(ReplayError::Rival(session.checks.lane(lane).to_owned()));
+                return Err(ReplayError::Rival(session.hall.checks.lane(lane).to_owned()));
             }
             let there = |(lane, cells): (usize, &BTreeSet<CellId>)| {
-                let present = judge.present(lane);
-                present.filter(|(cell, present)| cells.contains(cell) && present.claim.is_settled()).count()
+                judge.settled(lane).filter(|(cell, _)| cells.contains(cell)).count()
             };
             let there = wanted.iter().enumerate().map(there).sum();
             Ok(there == all || patience.is_over(there))
@@ -137,17 +137,12 @@ impl Session<'_> {
 
     /// Puts cells that measure into test mode.
     fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
-        for (lane, cells) in self.buses.lanes.iter().zip(measuring).filter(|(_, cells)| !cells.is_empty()) {
-            let told = cells.iter().map(|cell| mode(Node::Cell(*cell), true));
-            lane.send(&told.chain([Message::Sync]).collect::<Vec<_>>())?;
-        }
+        self.tell_mode(measuring, true)?;
         let give_up = Instant::now() + SHOWING;
         self.wait(|_, judge| {
             let obeys = |(lane, cells): (usize, &Vec<CellId>)| {
-                cells.iter().all(|cell| {
-                    let mut present = judge.present(lane).filter(|(it, _)| it == cell);
-                    present.any(|(_, it)| it.claim.says(State::TEST_MODE))
-                })
+                let obeying = judge.present(lane).filter(|(_, it)| it.claim.says(State::TEST_MODE));
+                obeying.filter(|(cell, _)| cells.contains(cell)).count() == cells.len()
             };
             let all_obey = measuring.iter().enumerate().all(obeys);
             if !all_obey && Instant::now() > give_up {
@@ -159,17 +154,22 @@ impl Session<'_> {
 
     /// Leaves cells as they were met.
     pub(super) fn leave(&self) -> Result<(), ReplayError> {
-        for (lane, cells) in
-            self.buses.lanes.iter().zip(&self.measuring).filter(|(_, cells)| !cells.is_empty())
-        {
-            lane.send(&cells.iter().map(|cell| mode(Node::Cell(*cell), false)).collect::<Vec<_>>())?;
+        self.tell_mode(&self.measuring, false)
+    }
+
+    /// Lets cells obey stimuli and say so at once, or measure.
+    fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
+        for (lane, cells) in self.buses.lanes.iter().zip(cells).filter(|(_, cells)| !cells.is_empty()) {
+            let told = cells.iter().map(|cell| mode(*cell, obey));
+            lane.send(&told.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
         }
         Ok(())
     }
 }
 
-/// The message that makes cells obey stimuli, or measure; either way they forget all stimuli.
-pub(super) fn mode(to: Node, obeys: bool) -> Message {
+/// The message that makes a cell obey stimuli, or measure; either way it forgets all stimuli.
+pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
     let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
-    Message::Configure { to, tag: 0, request: Request::Write { number: Parameter::Mode.number(), words } }
+    let request = Request::Write { number: Parameter::Mode.number(), words };
+    Message::Configure { to: Node::Cell(cell), tag: 0, request }
 }

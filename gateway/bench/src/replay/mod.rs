@@ -43,7 +43,6 @@ use self::checks::Checks;
 pub use self::checks::Mismatch;
 pub use self::error::ReplayError;
 use self::hall::Hall;
-use self::judge::Judge;
 use self::player::Pace;
 use self::reel::Only;
 use self::report::Summary;
@@ -139,18 +138,14 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     }
     let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let heard = if speaks { buses.listen()? } else { Vec::new() };
-    let (expects, spawned) = (options.expect, options.spawn.is_some());
-    let checks = Arc::new(Checks { survey, routes, expects, spawned, name });
+    let checks = Checks { options: options.clone(), survey, routes, name };
     if let (Some(spawn), Some(wearing)) = (&options.spawn, &wearing) {
         buses.start_cells(spawn, wearing, &heard)?;
     } else if options.only == Only::All {
         warn_of_doubles(&checks, &heard, &progress);
     }
-    let judged = checks.lanes().filter_map(|(name, bus)| Some((name.to_owned(), bus?.cells.clone())));
-    let judge = Judge::new(judged, checks.survey.first.unwrap_or(0), expects);
-    let hall = Arc::new(Hall::new(judge));
-    let session = Session { options, checks, hall, buses, signalled, progress, measuring: Vec::new() };
-    session.run(idle.as_ref(), wearing.as_ref())
+    let hall = Arc::new(Hall::new(checks));
+    Session { hall, buses, signalled, progress, measuring: Vec::new() }.run(idle.as_ref(), wearing.as_ref())
 }
 
 /// Reads the capture once, from end to end; also what it is called.
@@ -165,7 +160,8 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let mut reader = Reader::open_all(&options.files).map_err(ReplayError::Open)?;
     let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    let few = |buses: usize| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
+    let few = |buses| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
+    let note = |text: String| progress.note(&format!("{name}: {text}"));
     // What was in force stands before the first frame, and is known when it is open.
     let in_force = &reader.extras().in_force;
     let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
@@ -199,18 +195,18 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     }
     survey.finish();
     if unreadable > 0 {
-        progress.note(&format!("{name}: lines that could not be read and are left out: {unreadable}"));
+        note(format!("lines that could not be read and are left out: {unreadable}"));
     }
     if survey.dropped > 0 {
-        progress.note(&format!("{name}: {} frames are missing: whoever took it lost them", survey.dropped));
+        note(format!("{} frames are missing: whoever took it lost them", survey.dropped));
     }
     if let Some(what) = &reader.extras().unfinished {
-        progress.note(&format!("{name}: {what}"));
+        note(what.to_string());
     }
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
-        progress.note(&format!(
-            "{name}: times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \
+        note(format!(
+            "times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \
              before it is sent at once"
         ));
     }
@@ -228,7 +224,6 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
 /// Cells that speak already are about to hear themselves.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
     for ((name, bus), heard) in checks.lanes().zip(heard) {
-        let Some(bus) = bus else { continue };
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.note(&format!(

@@ -8,41 +8,18 @@
 
 use hdrhistogram::Histogram;
 use protocol::bus::batch::BATCH;
+use protocol::bus::{BusError, SendError};
 use protocol::can::Frame;
-use protocol::message::{Joints, Message};
+use protocol::message::Message;
 use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::ReplayError;
-use super::reel::{Due, Role, Step};
+use super::reel::{Due, Open, Role, Step};
 use model::quantiles::histogram;
 
 /// From the decision to begin to the first frame, in ns.
 const LEAD_NS: u64 = 1_000_000;
-
-/// What became of frames that were to be sent.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Sent {
-    /// The bus has taken all.
-    All,
-    /// It took so many and stayed full.
-    Full(usize),
-    /// It took so many and is down.
-    Down(usize),
-    /// It took so many and has ended, as the text says.
-    Ended(usize, String),
-}
-
-/// Joints that were sent and that cells answer.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Open {
-    /// Their epoch.
-    pub epoch: Epoch,
-    /// Their positions.
-    pub joints: Joints,
-    /// Which ones they are.
-    pub round: Option<u64>,
-}
 
 /// The clock, the buses, and whoever listens.
 pub trait Stage {
@@ -57,7 +34,10 @@ pub trait Stage {
     /// Joints are about to be sent.
     fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch);
     /// Sends frames, waiting for room for a while.
-    fn send(&mut self, lane: usize, frames: &[Frame]) -> Sent;
+    ///
+    /// # Errors
+    /// When the bus stays full, is down or has ended.
+    fn send(&mut self, lane: usize, frames: &[Frame]) -> Result<(), SendError>;
     /// A bus did not take the joints of a round.
     fn was_not_sent(&mut self, lane: usize, round: u64);
     /// Waits until the cells of a bus have answered.
@@ -69,28 +49,6 @@ pub trait Stage {
     fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
     /// The replay is there, in ns after its first frame.
     fn show(&mut self, at: u64);
-}
-
-/// The next step.
-#[derive(Debug)]
-enum Next<'a> {
-    /// This.
-    Step(&'a Step),
-    /// It is not there yet.
-    Later,
-    /// There is none.
-    End,
-}
-
-/// Looks at the next step, which stays there.
-fn next(steps: &rtrb::Consumer<Step>) -> Next<'_> {
-    // Looked at before the queue, or what is pushed between the two would be missed.
-    let is_last = steps.is_abandoned();
-    match steps.peek() {
-        Ok(step) => Next::Step(step),
-        Err(_) if is_last => Next::End,
-        Err(_) => Next::Later,
-    }
 }
 
 /// How fast.
@@ -173,20 +131,19 @@ impl Player {
                 self.played.was_stopped = true;
                 break;
             }
-            match next(steps) {
-                Next::End => break,
-                Next::Later => stage.pause(),
-                Next::Step(Step::Restore(_)) => {
+            // Looked at before the queue, or what is pushed between the two would be missed.
+            let is_last = steps.is_abandoned();
+            match steps.peek() {
+                Err(_) if is_last => break,
+                Err(_) => stage.pause(),
+                Ok(Step::Restore(_)) => {
                     self.wait_for_all(stage);
                     if let Ok(Step::Restore(states)) = steps.pop() {
                         self.played.failure = stage.restore(&states).err().map(|error| error.to_string());
                         self.origin = None;
                     }
                 }
-                Next::Step(Step::Frame(due)) => {
-                    let due = *due;
-                    self.frames_from(&due, steps, stage);
-                }
+                Ok(&Step::Frame(due)) => self.frames_from(&due, steps, stage),
             }
         }
         if self.played.failure.is_none() && !self.played.was_stopped {
@@ -243,7 +200,7 @@ impl Player {
         stage.show(first.at);
         // In lockstep joints end a batch: what comes next has to wait, or belongs to the next ones.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
-            let Next::Step(&Step::Frame(next)) = next(steps) else { break };
+            let Ok(&Step::Frame(next)) = steps.peek() else { break };
             let waits =
                 self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
             let deadline = self.deadline(&next, now);
@@ -267,10 +224,10 @@ impl Player {
 
     fn push(&mut self, due: &Due, stage: &mut impl Stage) -> Option<Open> {
         self.batch.push(due.frame);
-        let Role::Joints { epoch, joints, round } = due.role else { return None };
-        stage.announce(due.lane, round, epoch);
-        self.rounds.extend(round.map(|round| (self.batch.len(), round)));
-        Some(Open { epoch, joints, round })
+        let Role::Joints(open) = due.role else { return None };
+        stage.announce(due.lane, open.round, open.epoch);
+        self.rounds.extend(open.round.map(|round| (self.batch.len(), round)));
+        Some(open)
     }
 
     fn was_late(&mut self, deadline: Option<u64>, now: u64) {
@@ -280,20 +237,16 @@ impl Player {
         }
     }
 
-    fn account(&mut self, lane: usize, frames: usize, sent: Sent, stage: &mut impl Stage) {
+    fn account(&mut self, lane: usize, frames: usize, sent: Result<(), SendError>, stage: &mut impl Stage) {
         let (Some(tally), Some(down)) = (self.played.lanes.get_mut(lane), self.down.get_mut(lane)) else {
             return;
         };
-        let (taken, is_down, failure) = match sent {
-            Sent::All => (frames, false, None),
-            Sent::Full(taken) => (taken, false, None),
-            Sent::Down(taken) => (taken, true, None),
-            Sent::Ended(taken, why) => (taken, true, Some(why)),
-        };
         // A sync may be behind them.
-        let taken = taken.min(frames);
+        let taken = sent.as_ref().map_or_else(|error| error.sent.min(frames), |()| frames);
         let rest = (frames - taken) as u64;
         tally.sent += taken as u64;
+        let cause = sent.err().map(|error| error.cause);
+        let is_down = cause.as_ref().is_some_and(|cause| !matches!(cause, BusError::Full { .. }));
         if is_down {
             tally.lost += rest;
             tally.outages += u64::from(!*down);
@@ -306,12 +259,12 @@ impl Player {
                 stage.was_not_sent(lane, *round);
             }
         }
-        self.played.failure = failure;
+        self.played.failure = cause.filter(|cause| !cause.may_pass()).map(|cause| cause.to_string());
     }
 }
 
 const fn is_joints(due: &Due) -> bool {
-    matches!(due.role, Role::Joints { .. } | Role::HalfOfJoints)
+    matches!(due.role, Role::Joints(_) | Role::HalfOfJoints)
 }
 
 #[cfg(test)]

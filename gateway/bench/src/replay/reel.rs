@@ -5,7 +5,8 @@
 //!                                └── joints, replies ──> judge
 //! ```
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::ControlFlow;
 
 use protocol::can::Frame;
 use protocol::candump::Record;
@@ -85,15 +86,19 @@ pub enum Role {
     Plain,
     /// The first half of joints.
     HalfOfJoints,
-    /// Joints, and the number of their round.
-    Joints {
-        /// Their epoch.
-        epoch: Epoch,
-        /// Their positions.
-        joints: Joints,
-        /// Which ones they are on their bus.
-        round: Option<u64>,
-    },
+    /// Joints.
+    Joints(Open),
+}
+
+/// Joints that cells answer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Open {
+    /// Their epoch.
+    pub epoch: Epoch,
+    /// Their positions.
+    pub joints: Joints,
+    /// Which ones they are on their bus, if they are compared.
+    pub round: Option<u64>,
 }
 
 /// What a reel came to.
@@ -105,29 +110,15 @@ pub struct Cut {
     pub late: u64,
 }
 
-/// Whether there is more to come.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Flow {
-    /// Yes.
-    More,
-    /// What follows is of no interest.
-    Enough,
-}
-
-/// One frame that waits for its place.
-#[derive(Debug)]
-struct Waiting {
-    bus: usize,
-    frame: Frame,
-}
-
 /// One pass over a capture, or several.
 #[derive(Debug)]
 pub struct Reel<'a> {
     survey: &'a Survey,
     selection: &'a Selection,
-    order: Order<Waiting>,
-    settler: Settler<Ordered<Waiting>>,
+    /// Frames that wait for their place, with their buses.
+    order: Order<(usize, Frame)>,
+    settler: Settler<Ordered<(usize, Frame)>>,
+    steps: VecDeque<Step>,
     cut: Cut,
     /// When this pass begins, in ns after the first one.
     offset: u64,
@@ -146,6 +137,7 @@ impl<'a> Reel<'a> {
             selection,
             order: Order::default(),
             settler: Settler::new(None),
+            steps: VecDeque::new(),
             cut: Cut::default(),
             offset: 0,
             sent: None,
@@ -153,46 +145,47 @@ impl<'a> Reel<'a> {
         }
     }
 
-    /// Takes the capture's next frame.
-    pub fn take(&mut self, record: &Record<'_>, judge: &mut Judge, mut out: impl FnMut(Step)) -> Flow {
+    /// Takes the capture's next frame; breaks off when what follows is of no interest.
+    pub fn take(&mut self, record: &Record<'_>, judge: &mut Judge) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
-            return Flow::More;
+            return ControlFlow::Continue(());
         };
-        self.order.push(bus, record.time.nanos, Waiting { bus, frame: record.frame });
+        self.order.push(bus, record.time.nanos, (bus, record.frame));
         while let Some(next) = self.order.pop() {
             self.settle(next);
-            if self.place_settled(judge, &mut out) == Flow::Enough {
-                return Flow::Enough;
-            }
+            self.place_settled(judge)?;
         }
-        Flow::More
+        ControlFlow::Continue(())
+    }
+
+    /// What is to be done next, as far as that is known.
+    pub fn next_step(&mut self) -> Option<Step> {
+        self.steps.pop_front()
     }
 
     /// Finds out what a frame is.
-    fn settle(&mut self, next: Ordered<Waiting>) {
-        let name = self.survey.buses.get(next.item.bus).map_or("", |bus| bus.name.as_str());
-        let frame = next.item.frame;
+    fn settle(&mut self, next: Ordered<(usize, Frame)>) {
+        let (bus, frame) = next.item;
+        let name = self.survey.buses.get(bus).map_or("", |bus| bus.name.as_str());
         self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
     }
 
     /// Frames whose turn has come, as far as it is known what they are.
-    fn place_settled(&mut self, judge: &mut Judge, out: &mut impl FnMut(Step)) -> Flow {
+    fn place_settled(&mut self, judge: &mut Judge) -> ControlFlow<()> {
         while let Some((next, decoded)) = self.settler.pop() {
-            if self.place(&next, &decoded, judge, out) == Flow::Enough {
-                return Flow::Enough;
-            }
+            self.place(&next, &decoded, judge)?;
         }
-        Flow::More
+        ControlFlow::Continue(())
     }
 
     /// Takes in that the capture, or what is of interest of it, is at its end; another pass may follow.
-    pub fn end_pass(&mut self, judge: &mut Judge, mut out: impl FnMut(Step)) {
+    pub fn end_pass(&mut self, judge: &mut Judge) {
         while let Some(next) = self.order.pop_last() {
             self.settle(next);
         }
         self.settler.finish();
-        self.place_settled(judge, &mut out);
+        let _ = self.place_settled(judge);
         self.order = Order::default();
         self.settler = Settler::new(None);
         if let Some((first, last)) = self.sent.take() {
@@ -229,17 +222,15 @@ impl<'a> Reel<'a> {
     /// A frame's turn has come.
     fn place(
         &mut self,
-        next: &Ordered<Waiting>,
+        next: &Ordered<(usize, Frame)>,
         decoded: &Decoded,
         judge: &mut Judge,
-        out: &mut impl FnMut(Step),
-    ) -> Flow {
+    ) -> ControlFlow<()> {
         let (from, to) = self.survey.bounds();
         if next.at >= to.saturating_add(LATE_REPLIES_NS) {
-            return Flow::Enough;
+            return ControlFlow::Break(());
         }
-        let Waiting { bus, frame } = next.item;
-        let is_in_part = (from..to).contains(&next.nanos);
+        let (bus, frame) = next.item;
         let unwanted = if next.nanos < from {
             Some(reason::BEFORE)
         } else if next.nanos >= to {
@@ -247,26 +238,34 @@ impl<'a> Reel<'a> {
         } else {
             self.unwanted(bus, &frame, decoded)
         };
-        let role = self.read_on(bus, next.nanos, decoded, unwanted.is_none(), is_in_part, judge);
+        let lane = self.lane(bus);
+        let role = lane.filter(|_| self.selection.reads).map_or(Role::Plain, |lane| {
+            let is_in_part = (from..to).contains(&next.nanos);
+            read(lane, next.nanos, decoded, unwanted.is_none(), is_in_part, judge)
+        });
         if let Some(reason) = unwanted {
             self.skip(reason);
-            return Flow::More;
+            return ControlFlow::Continue(());
         }
-        let Some(lane) = self.selection.lanes.get(bus).copied().flatten() else { return Flow::More };
+        let Some(lane) = lane else { return ControlFlow::Continue(()) };
         self.cut.late += u64::from(next.is_late);
         let (first, last) = self.sent.get_or_insert((next.at, next.at));
         *last = next.at;
         let at = self.offset + (next.at - *first);
         self.counts.0 += 1;
-        self.counts.1 += u64::from(matches!(role, Role::Joints { .. }) && lane == 0);
-        out(Step::Frame(Due { at, lane, frame, role, is_late: next.is_late }));
-        Flow::More
+        self.counts.1 += u64::from(matches!(role, Role::Joints(_)) && lane == 0);
+        self.steps.push_back(Step::Frame(Due { at, lane, frame, role, is_late: next.is_late }));
+        ControlFlow::Continue(())
+    }
+
+    /// Where a bus' frames go.
+    fn lane(&self, bus: usize) -> Option<usize> {
+        self.selection.lanes.get(bus).copied().flatten()
     }
 
     /// Why a frame of the part is not sent.
     fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
-        let picked = self.selection.lanes.get(bus).is_some_and(Option::is_some)
-            && self.selection.pick.takes(0, 0, frame, decoded);
+        let picked = self.lane(bus).is_some() && self.selection.pick.takes(0, 0, frame, decoded);
         if frame.is_error() {
             return Some(reason::ERROR);
         }
@@ -282,39 +281,33 @@ impl<'a> Reel<'a> {
             Only::All | Only::Inputs | Only::Replies => None,
         }
     }
+}
 
-    /// Reads what a frame says, as far as that is of interest.
-    fn read_on(
-        &self,
-        bus: usize,
-        nanos: u64,
-        decoded: &Decoded,
-        is_sent: bool,
-        is_in_part: bool,
-        judge: &mut Judge,
-    ) -> Role {
-        let lane = self.selection.lanes.get(bus).copied().flatten();
-        let Some(lane) = lane.filter(|_| self.selection.reads) else { return Role::Plain };
-        match *decoded {
-            Decoded::Message(Message::Joints { epoch, joints }) => {
-                let round = judge.record_joints(lane, nanos, epoch, is_sent);
-                Role::Joints { epoch, joints, round }
-            }
-            Decoded::Message(message) => {
-                judge.record(lane, &message, is_in_part);
-                Role::Plain
-            }
-            Decoded::Half { id } | Decoded::Damaged { id, fault: PacketError::Incomplete }
-                if is_joints(id) =>
-            {
-                Role::HalfOfJoints
-            }
-            Decoded::Half { .. }
-            | Decoded::Foreign(_)
-            | Decoded::Wire(..)
-            | Decoded::Damaged { .. }
-            | Decoded::Meaningless { .. } => Role::Plain,
+/// Reads what a frame says, as far as that is of interest.
+fn read(
+    lane: usize,
+    nanos: u64,
+    decoded: &Decoded,
+    is_sent: bool,
+    is_in_part: bool,
+    judge: &mut Judge,
+) -> Role {
+    if let Decoded::Message(Message::Joints { epoch, joints }) = *decoded {
+        return Role::Joints(Open { epoch, joints, round: judge.record_joints(lane, nanos, epoch, is_sent) });
+    }
+    if let Decoded::Message(message) = decoded {
+        judge.record(lane, message, is_in_part);
+    }
+    match *decoded {
+        Decoded::Half { id } | Decoded::Damaged { id, fault: PacketError::Incomplete } if is_joints(id) => {
+            Role::HalfOfJoints
         }
+        Decoded::Half { .. }
+        | Decoded::Message(_)
+        | Decoded::Foreign(_)
+        | Decoded::Wire(..)
+        | Decoded::Damaged { .. }
+        | Decoded::Meaningless { .. } => Role::Plain,
     }
 }
 

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::difference::{Difference, How, When};
+use super::difference::Difference;
 use super::judge::{Lacking, Tally};
 use super::player::LaneTally;
 use model::quantiles::Quantiles;
@@ -88,72 +88,36 @@ pub struct Expect {
     /// Cells whose configuration in the recording is not known, and was not compared.
     pub unchecked_cells: u64,
     /// The first reply that is not as it was recorded.
-    pub first: Option<First>,
-}
-
-/// A reply that is not as it was recorded.
-#[derive(Clone, Debug, Serialize)]
-pub struct First {
-    /// How.
-    pub how: How,
-    /// The bus, as it is called now.
-    pub bus: String,
-    /// The cell.
-    pub cell: u8,
-    /// The joints that it answers, if it answers joints.
-    #[serde(flatten)]
-    pub when: Option<When>,
-    /// In words, as it is shown.
-    pub text: String,
-}
-
-impl From<&Difference> for First {
-    fn from(difference: &Difference) -> Self {
-        let Difference { how, bus, cell, when, .. } = difference;
-        Self { how: *how, bus: bus.clone(), cell: cell.get(), when: *when, text: difference.to_string() }
-    }
+    pub first: Option<Difference>,
 }
 
 impl Lacking {
     /// The reasons that there were, with their counts, for people.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
-        let Self {
-            silent,
-            untaken,
-            unrecorded,
-            ended,
-            said_later,
-            uncounted,
-            joints_unrecorded,
-            joints_earlier,
-            asked_earlier,
-            measured,
-            sensed_otherwise,
-            slot_missed,
-            parent_changing,
-            tree_unknown,
-            sums_not_taken,
-        } = *self;
-        let all = [
-            ("the cell was silent", silent),
-            ("the cell had not taken the joints", untaken),
-            ("the reply was not recorded", unrecorded),
-            ("the recording ended", ended),
-            ("the end of a contact was said later", said_later),
-            ("no counters tell whether the cell took the joints", uncounted),
-            ("the joints were not recorded", joints_unrecorded),
-            ("the joints are in the part before", joints_earlier),
-            ("the configure is in the part before", asked_earlier),
-            ("the cell measured", measured),
-            ("what a cell felt was said at other joints", sensed_otherwise),
-            ("the cell did not come to its slot", slot_missed),
-            ("a cell was changing its parent", parent_changing),
-            ("a cell had not said where its sums go", tree_unknown),
-            ("a sum lacked one of its children's", sums_not_taken),
-        ];
-        all.into_iter().filter(|(_, count)| *count > 0).collect()
+        nonzero([
+            ("the cell was silent", self.silent),
+            ("the cell had not taken the joints", self.untaken),
+            ("the reply was not recorded", self.unrecorded),
+            ("the recording ended", self.ended),
+            ("the end of a contact was said later", self.said_later),
+            ("no counters tell whether the cell took the joints", self.uncounted),
+            ("the joints were not recorded", self.joints_unrecorded),
+            ("the joints are in the part before", self.joints_earlier),
+            ("the configure is in the part before", self.asked_earlier),
+            ("the cell measured", self.measured),
+            ("what a cell felt was said at other joints", self.sensed_otherwise),
+            ("the cell did not come to its slot", self.slot_missed),
+            ("a cell was changing its parent", self.parent_changing),
+            ("a cell had not said where its sums go", self.tree_unknown),
+            ("a sum lacked one of its children's", self.sums_not_taken),
+        ])
     }
+}
+
+/// The counts that are not 0, with what they count.
+fn nonzero<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static str, u64)> {
+    counts.into_iter().filter(|(_, count)| *count > 0).collect()
 }
 
 impl Summary {
@@ -166,14 +130,13 @@ impl Summary {
         let mut wrong = Vec::new();
         if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.is_good()) {
             let Tally { different, missing, extra, not_asked, .. } = expect.tally;
-            let counts = [
+            let counts = nonzero([
                 ("different", different),
                 ("missing", missing),
                 ("extra", extra),
                 ("not asked for", not_asked),
-            ];
-            let counts = counts.into_iter().filter(|(_, count)| *count > 0);
-            let counts: Vec<_> = counts.map(|(what, count)| format!("{count} {what}")).collect();
+            ]);
+            let counts: Vec<_> = counts.iter().map(|(what, count)| format!("{count} {what}")).collect();
             if !counts.is_empty() {
                 wrong.push(format!("replies are not as they were recorded: {}", counts.join(", ")));
             }
@@ -200,5 +163,32 @@ impl Summary {
             wrong.push(format!("{} frames were refused: a bus stayed full", self.refused));
         }
         (!wrong.is_empty()).then(|| wrong.join("; "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_is_told_to_people_too() {
+        let all = Lacking {
+            silent: 1,
+            untaken: 1,
+            unrecorded: 1,
+            ended: 1,
+            said_later: 1,
+            uncounted: 1,
+            joints_unrecorded: 1,
+            joints_earlier: 1,
+            asked_earlier: 1,
+            measured: 1,
+            sensed_otherwise: 1,
+            slot_missed: 1,
+            parent_changing: 1,
+            tree_unknown: 1,
+            sums_not_taken: 1,
+        };
+        assert_eq!(all.reasons().len(), size_of::<Lacking>() / size_of::<u64>());
     }
 }

@@ -11,17 +11,16 @@ use hdrhistogram::Histogram;
 use protocol::id::CellId;
 use protocol::message::Message;
 
+use super::ReplayError;
 use super::checks::Checks;
 use super::hall::Hall;
-use super::judge::Judge;
 use super::live::Live;
-use super::player::{LaneTally, Pace, Played, Player};
-use super::reel::{Cut, Selection};
-use super::report::{BusSummary, Expect, First, Lockstep, Summary};
-use super::source::{AHEAD, Source};
+use super::player::{LaneTally, Played, Player};
+use super::reel::Cut;
+use super::report::{BusSummary, Expect, Lockstep, Summary};
+use super::source::{self, AHEAD};
 use super::start::{Buses, Wearing};
 use super::survey::Bus;
-use super::{Options, ReplayError};
 use crate::run::RunError;
 use crate::run::progress::Progress;
 use crate::run::realtime::{self, Granted};
@@ -32,9 +31,7 @@ use model::quantiles::Quantiles;
 const LOOK: Duration = Duration::from_millis(20);
 
 /// A replay that is ready.
-pub(super) struct Session<'a> {
-    pub(super) options: &'a Options,
-    pub(super) checks: Arc<Checks>,
+pub(super) struct Session {
     pub(super) hall: Arc<Hall>,
     pub(super) buses: Buses,
     pub(super) signalled: Arc<AtomicBool>,
@@ -43,16 +40,7 @@ pub(super) struct Session<'a> {
     pub(super) measuring: Vec<Vec<CellId>>,
 }
 
-/// What was sent, and by whom.
-struct Sending {
-    played: Played,
-    cut: Cut,
-    seconds: f64,
-    live: Live,
-    granted: Granted,
-}
-
-impl Session<'_> {
+impl Session {
     /// `idle` is how late the idle machine wakes a thread, `wearing` the skin of the cells that were started.
     pub(super) fn run(
         mut self,
@@ -60,7 +48,7 @@ impl Session<'_> {
         wearing: Option<&Wearing>,
     ) -> Result<Summary, ReplayError> {
         let mut receivers = Vec::new();
-        if self.options.hears() {
+        if self.hall.checks.options.hears() {
             let roots = std::mem::take(&mut self.buses.roots);
             for ((index, lane), roots) in self.buses.lanes.iter().enumerate().zip(roots) {
                 let (lanes, hall) = (Arc::clone(&self.buses.lanes), Arc::clone(&self.hall));
@@ -68,50 +56,39 @@ impl Session<'_> {
                 receivers.push(spawn(&format!("rx {}", lane.bus.name()), hear)?);
             }
         }
-        let outcome = self.meet(wearing).and_then(|()| self.play());
+        let mut outcome = self.meet(wearing).and_then(|()| self.play(idle));
         if let Err(error) = self.leave() {
             self.progress.note(&error.to_string());
         }
         self.hall.deaf.store(true, Ordering::Relaxed);
-        let unheard: Vec<_> = receivers.into_iter().map(|thread| thread.join().unwrap_or(0)).collect();
+        for (lane, receiver) in receivers.into_iter().enumerate() {
+            let unheard = receiver.join().unwrap_or(0);
+            if let Some(bus) = outcome.as_mut().ok().and_then(|summary| summary.buses.get_mut(lane)) {
+                bus.unheard = unheard;
+            }
+        }
         self.progress.clear();
-        Ok(self.summary(outcome?, &unheard, idle))
+        outcome
     }
 
-    /// Sends everything.
-    fn play(&mut self) -> Result<Sending, ReplayError> {
+    /// Sends everything; the summary is yet without what the receivers have not heard.
+    fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
-        let ready = Arc::new(AtomicBool::new(false));
-        let hears = self.options.hears();
-        let source = Source {
-            checks: Arc::clone(&self.checks),
-            selection: Selection {
-                only: self.options.only,
-                pick: self.options.pick.clone(),
-                lanes: self.checks.routes.lanes.clone(),
-                reads: hears,
-            },
-            passes: self.options.passes,
-            restores: (hears && !self.checks.are_fresh(), hears),
-            hall: Arc::clone(&self.hall),
-            ready: Arc::clone(&ready),
-        };
-        let files = self.options.files.clone();
-        let reader = spawn("reader", move || source.run(&files, queue))?;
-        while !ready.load(Ordering::Relaxed) && !reader.is_finished() {
+        let hall = Arc::clone(&self.hall);
+        let reader = spawn("reader", move || source::read(&hall, queue))?;
+        while !self.hall.ready.load(Ordering::Relaxed) && !reader.is_finished() {
             thread::sleep(Duration::from_millis(1));
         }
 
+        let options = &self.hall.checks.options;
+        let hears = options.hears();
         let (voice, said) = mpsc::channel();
         let lanes = Arc::clone(&self.buses.lanes);
         let sync = || lanes.iter().map(|lane| lane.frames(&Message::Sync).collect()).collect();
-        let player = Player::new(lanes.len(), self.options.pace, self.options.lockstep.then(sync));
+        let player = Player::new(lanes.len(), options.pace, options.lockstep.then(sync));
         let mut live = Live {
             hall: Arc::clone(&self.hall),
             voice,
-            spin_ns: u64::try_from(self.options.spin.as_nanos()).unwrap_or(u64::MAX),
-            may_wait: self.options.pace == Pace::Max || self.options.lockstep,
-            checks: Arc::clone(&self.checks),
             silent: Vec::new(),
             asked_again: 0,
             in_vain: BTreeSet::new(),
@@ -133,15 +110,15 @@ impl Session<'_> {
         })?;
         let rival = self.watch(&said, || player.is_finished());
         let (mut played, mut live, granted) = player.join().map_err(|_| RunError::Panicked("player"))?;
-        let seconds = began.elapsed().as_secs_f64();
+        let duration_s = began.elapsed().as_secs_f64();
         let cut = reader.join().map_err(|_| RunError::Panicked("reader"))?;
         if let Some(rival) = rival {
             played.failure = Some(rival.to_string());
         }
         // What a signal has ended is judged as far as it went.
         self.hall.over.store(false, Ordering::Relaxed);
-        for (lane, (name, _)) in self.checks.lanes().enumerate().filter(|_| hears && played.failure.is_none())
-        {
+        let lanes = self.hall.checks.lanes().enumerate();
+        for (lane, (name, _)) in lanes.filter(|_| hears && played.failure.is_none()) {
             if let Err(why) = live.report(lane) {
                 self.progress.note(&format!("{name}: no last words of its cells: {why}"));
             }
@@ -154,7 +131,7 @@ impl Session<'_> {
             played.failure.get_or_insert_with(|| error.to_string());
             Cut::default()
         });
-        Ok(Sending { played, cut, seconds, live, granted })
+        Ok(self.summary(played, cut, &live, duration_s, granted, idle))
     }
 
     /// Shows how it goes, until it is over; whether there is another gateway.
@@ -171,9 +148,9 @@ impl Session<'_> {
             for ended in self.buses.processes.ended() {
                 self.progress.note(&format!("the process of {ended} ended ({})", ended.status));
             }
-            if self.options.hears() && rival.is_none() {
+            if self.hall.checks.options.hears() && rival.is_none() {
                 let lane = self.hall.judge().rival();
-                rival = lane.map(|lane| ReplayError::Rival(self.checks.lane(lane).to_owned()));
+                rival = lane.map(|lane| ReplayError::Rival(self.hall.checks.lane(lane).to_owned()));
             }
             if rival.is_some() || self.signalled.load(Ordering::Relaxed) {
                 self.hall.over.store(true, Ordering::Relaxed);
@@ -186,52 +163,61 @@ impl Session<'_> {
 
     /// How long it is, in ms of the capture; none when it has no end.
     fn length(&self) -> Option<u64> {
-        let survey = &self.checks.survey;
+        let Checks { survey, options, .. } = &self.hall.checks;
         let (from, to) = survey.bounds();
         let from = from.max(survey.first.unwrap_or(0));
         let one = to.min(survey.last).saturating_sub(from) / 1_000_000;
-        self.options.passes.map(|passes| one * u64::from(passes))
+        options.passes.map(|passes| one * u64::from(passes))
     }
 
-    fn summary(&self, sending: Sending, unheard: &[u64], idle: Option<&Histogram<u64>>) -> Summary {
-        let Sending { played, cut, seconds, live, granted } = sending;
-        let judge = self.hall.judge();
+    fn summary(
+        &self,
+        played: Played,
+        cut: Cut,
+        live: &Live,
+        duration_s: f64,
+        granted: Granted,
+        idle: Option<&Histogram<u64>>,
+    ) -> Summary {
+        let checks = &self.hall.checks;
+        let options = &checks.options;
         let total = |of: fn(&LaneTally) -> u64| played.lanes.iter().map(of).sum();
-        let bus = |(index, (name, bus)): (usize, (&str, Option<&Bus>))| {
+        let bus = |(index, (name, bus)): (usize, (&str, &Bus))| {
             Some(BusSummary {
-                capture: bus?.name.clone(),
+                capture: bus.name.clone(),
                 name: name.to_owned(),
                 kind: self.buses.lanes.get(index)?.bus.kind().to_string(),
                 frames: *played.lanes.get(index)?,
-                unheard: unheard.get(index).copied().unwrap_or(0),
+                unheard: 0,
             })
         };
-        let silent = |(lane, cell): &(usize, CellId)| format!("{cell} on {}", self.checks.lane(*lane));
+        let silent = |(lane, cell): &(usize, CellId)| format!("{cell} on {}", checks.lane(*lane));
         let mut silent_cells: Vec<_> = live.silent.iter().map(silent).collect();
         silent_cells.dedup();
         let asked_again = live.asked_again;
         Summary {
-            file: self.checks.name.clone(),
-            duration_s: seconds,
+            file: checks.name.clone(),
+            duration_s,
             interrupted: played.was_stopped && self.signalled.load(Ordering::Relaxed),
             sent: total(|lane| lane.sent),
             refused: total(|lane| lane.refused),
             lost: total(|lane| lane.lost),
             skipped: cut.skipped,
             sent_at_once: cut.late,
-            buses: self.checks.lanes().enumerate().filter_map(bus).collect(),
+            buses: checks.lanes().enumerate().filter_map(bus).collect(),
             late_us: idle.map(|_| Quantiles::of(&played.late, 1e-3)),
             idle_late_us: idle.map(|idle| Quantiles::of(idle, 1e-3)),
-            spin_us: self.options.spin.as_secs_f64() * 1e6,
+            spin_us: options.spin.as_secs_f64() * 1e6,
             fifo: granted.fifo,
             memory_locked: granted.locked,
-            lockstep: self.options.lockstep.then_some(Lockstep { silent_cells, asked_again }),
-            expect: self.options.expect.then(|| self.expectation(&judge)),
+            lockstep: options.lockstep.then_some(Lockstep { silent_cells, asked_again }),
+            expect: options.expect.then(|| self.expectation()),
             failure: played.failure,
         }
     }
 
-    fn expectation(&self, judge: &Judge) -> Expect {
+    fn expectation(&self) -> Expect {
+        let (judge, checks) = (self.hall.judge(), &self.hall.checks);
         let present = (0..self.buses.lanes.len()).flat_map(|lane| judge.present(lane));
         let late = present.filter_map(|(_, cell)| {
             let (first, last) = cell.heard?;
@@ -240,9 +226,9 @@ impl Session<'_> {
         Expect {
             tally: *judge.tally(),
             joints_skipped: late.sum(),
-            recording_dropped: self.checks.survey.dropped,
-            unchecked_cells: self.checks.unchecked(),
-            first: judge.first().map(First::from),
+            recording_dropped: checks.survey.dropped,
+            unchecked_cells: checks.unchecked(),
+            first: judge.first().cloned(),
         }
     }
 }

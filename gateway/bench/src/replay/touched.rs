@@ -2,38 +2,28 @@
 
 use protocol::id::CellId;
 
-type Set = [u64; CellId::COUNT.div_ceil(64)];
+/// Of each cell whether something touches it; none when nobody knows.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Touched([Option<bool>; CellId::COUNT]);
 
-/// Which cells something touches.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Touched {
-    touched: Set,
-    known: Set,
+impl Default for Touched {
+    fn default() -> Self {
+        Self([None; CellId::COUNT])
+    }
 }
 
 impl Touched {
     /// Whether a cell is touched; none when nobody knows.
     #[must_use]
     pub fn is(&self, cell: CellId) -> Option<bool> {
-        has(&self.known, cell).then(|| has(&self.touched, cell))
+        self.0.get(cell.index()).copied().flatten()
     }
 
     /// Takes in of a cell whether it is touched.
     pub fn insert(&mut self, cell: CellId, is_touched: bool) {
-        insert(&mut self.known, cell);
-        if is_touched {
-            insert(&mut self.touched, cell);
+        if let Some(place) = self.0.get_mut(cell.index()) {
+            *place = Some(is_touched);
         }
-    }
-}
-
-fn has(set: &Set, cell: CellId) -> bool {
-    set.get(cell.index() / 64).is_some_and(|word| word >> (cell.index() % 64) & 1 == 1)
-}
-
-fn insert(set: &mut Set, cell: CellId) {
-    if let Some(word) = set.get_mut(cell.index() / 64) {
-        *word |= 1 << (cell.index() % 64);
     }
 }
 

@@ -2,109 +2,106 @@
 
 use std::collections::BTreeSet;
 
+use protocol::id::CellId;
 use protocol::packet::WORDS;
 
-use super::lane::{Excuse, Fate, Pair, Round, excuse_extra};
+use super::lane::{Both, Excuse, Lane, Round, excuse_extra};
 use super::sums::{Outcome, Side, Why, compare};
-use super::{Judge, Tally};
+use super::{First, Judge, Tally};
 use crate::replay::difference::{How, Said, What};
 
 impl Judge {
     pub(super) fn close_round(&mut self, index: usize) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
+        let Self { lanes, tally, first, .. } = self;
+        let Some(lane) = lanes.get_mut(index) else { return };
         let Some(round) = lane.rounds.pop_front() else { return };
         let number = lane.base;
         lane.base += 1;
-        if !self.expects || round.fate == Fate::Waiting {
+        if !self.expects || round.asked == 0 {
             return;
         }
-        let (is_last, begins_later) = (lane.last_round == Some(number), lane.begins_later());
-        let at = Some((number, round.epoch, round.nanos));
         if round.is_first {
             lane.excuses.values_mut().for_each(|excuse| excuse.speaks = None);
         }
-        for ((cell, what), &Pair { recorded, now }) in &round.replies {
-            let (cell, what) = (*cell, *what);
-            let Some(lane) = self.lanes.get_mut(index) else { return };
-            let mut excuse = lane.excuses.get_mut(&cell);
-            let spoke = excuse.as_ref().and_then(|excuse| excuse.speaks);
-            if let (Some(excuse), Some(recorded), What::Torque) = (&mut excuse, recorded, what) {
-                excuse.speaks = Some(recorded != [0; WORDS]);
+        let at = Some((number, round.epoch, round.nanos));
+        for (&(cell, what), &pair) in &round.replies {
+            if let Some(how) = lane.compare_reply(number, &round, (cell, what), pair, tally) {
+                tally.count(how, round.is_unsent);
+                let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
+                first.note(how, &lane.name, cell, at, said);
             }
-            let said = Said::Words { what, recorded, now };
-            let how = match (recorded, now) {
-                (None, None) => continue,
-                (Some(recorded), Some(now)) => {
-                    if let (Some(excuse), What::Torque) = (excuse, what) {
-                        excuse.ended_earlier = false;
-                    }
-                    if recorded == now {
-                        self.tally.equal += 1;
-                        continue;
-                    }
-                    self.tally.different += 1;
-                    How::Different
-                }
-                (Some(_), None) if what != What::Torque && lane.senses => {
-                    self.tally.lacking.sensed_otherwise += 1;
-                    continue;
-                }
-                (Some(_), None) if round.fate == Fate::Unsent => {
-                    self.tally.not_asked += 1;
-                    How::Missing
-                }
-                (Some(recorded), None) => {
-                    let is_end = what == What::Torque && recorded == [0; WORDS];
-                    // What was over before, by what was sent, or began before the part: the cell had not taken the
-                    // joints at which it ended.
-                    let was_over = match spoke {
-                        Some(spoke) => spoke && !round.may_answer(cell),
-                        None => begins_later,
-                    };
-                    let is_later = |excuse: &&mut Excuse| {
-                        let was_over = was_over && !excuse.cell.is_counted_at(round.nanos);
-                        is_end && (excuse.ended_earlier || was_over)
-                    };
-                    if let Some(excuse) = excuse.filter(is_later) {
-                        excuse.ended_earlier = false;
-                        self.tally.lacking.said_later += 1;
-                        continue;
-                    }
-                    self.tally.missing += 1;
-                    How::Missing
-                }
-                // Reports may be asked for by this replay.
-                (None, Some(_)) if what != What::Torque => continue,
-                (None, Some(now)) => {
-                    if excuse_extra(&mut self.tally.lacking, excuse, (cell, &round), is_last, now) {
-                        continue;
-                    }
-                    self.tally.extra += 1;
-                    How::Extra
-                }
-            };
-            self.note(index, how, cell, at, said);
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
-            self.close_sums(index, number, &round);
+            lane.close_sums(number, &round, tally, first);
         }
-        if let Some(lane) = self.lanes.get_mut(index) {
-            lane.trees.recorded.forget_before(number);
-            lane.trees.now.forget_before(number);
+        lane.trees.recorded.forget_before(number);
+        lane.trees.now.forget_before(number);
+    }
+}
+
+impl Lane {
+    /// Compares a reply to joints with the recorded one; how it is another, unless the recording says why.
+    fn compare_reply(
+        &mut self,
+        number: u64,
+        round: &Round,
+        (cell, what): (CellId, What),
+        Both { recorded, now }: Both<Option<[i16; WORDS]>>,
+        tally: &mut Tally,
+    ) -> Option<How> {
+        let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
+        let is_torque = what == What::Torque;
+        let mut excuse = self.excuses.get_mut(&cell);
+        let spoke = excuse.as_ref().and_then(|excuse| excuse.speaks);
+        if let (Some(excuse), Some(recorded), true) = (&mut excuse, recorded, is_torque) {
+            excuse.speaks = Some(recorded != [0; WORDS]);
+        }
+        match (recorded, now) {
+            (None, None) => None,
+            (Some(recorded), Some(now)) => {
+                if let Some(excuse) = excuse.filter(|_| is_torque) {
+                    excuse.ended_earlier = false;
+                }
+                tally.equal += u64::from(recorded == now);
+                (recorded != now).then_some(How::Different)
+            }
+            (Some(_), None) if !is_torque && self.senses => {
+                tally.lacking.sensed_otherwise += 1;
+                None
+            }
+            (Some(_), None) if round.is_unsent => Some(How::Missing),
+            (Some(recorded), None) => {
+                let is_end = is_torque && recorded == [0; WORDS];
+                // What was over before, by what was sent, or began before the part: the cell had not taken the
+                // joints at which it ended.
+                let was_over = spoke.map_or(begins_later, |spoke| spoke && !round.may_answer(cell));
+                let is_later = |excuse: &&mut Excuse| {
+                    let was_over = was_over && !excuse.cell.is_counted_at(round.nanos);
+                    is_end && (excuse.ended_earlier || was_over)
+                };
+                let Some(excuse) = excuse.filter(is_later) else { return Some(How::Missing) };
+                excuse.ended_earlier = false;
+                tally.lacking.said_later += 1;
+                None
+            }
+            // Reports may be asked for by this replay.
+            (None, Some(now)) => {
+                let counts =
+                    is_torque && !excuse_extra(&mut tally.lacking, excuse, (cell, round), is_last, now);
+                counts.then_some(How::Extra)
+            }
         }
     }
 
     /// Compares what each cell itself put into its sums of a round.
-    fn close_sums(&mut self, index: usize, number: u64, round: &Round) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        let then = Side::new(&round.sums.recorded, &lane.trees.recorded, number);
-        let now = Side::new(&round.sums.now, &lane.trees.now, number);
+    fn close_sums(&mut self, number: u64, round: &Round, tally: &mut Tally, first: &mut First) {
+        let then = Side::new(&round.sums.recorded, &self.trees.recorded, number);
+        let now = Side::new(&round.sums.now, &self.trees.now, number);
         let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
-        let is_last = lane.last_round == Some(number);
-        let mut notes = Vec::new();
+        let is_last = self.last_round == Some(number);
         for cell in cells {
-            let excuse = lane.excuses.get_mut(&cell);
-            let Tally { different, missing, extra, not_asked, lacking, .. } = &mut self.tally;
+            let excuse = self.excuses.get_mut(&cell);
+            let lacking = &mut tally.lacking;
             if excuse.as_ref().is_some_and(|excuse| excuse.cell.measured) {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
@@ -118,30 +115,26 @@ impl Judge {
             if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
                 outcome = Outcome::LeftOut(Why::NotTaken);
             }
-            let (count, how) = match outcome {
+            let how = match outcome {
                 Outcome::Nothing => continue,
                 Outcome::Equal => {
-                    self.tally.equal += 1;
-                    self.tally.sums += 1;
-                    continue;
-                }
-                Outcome::Missing if round.fate == Fate::Unsent => (not_asked, How::Missing),
-                Outcome::LeftOut(_) if round.fate == Fate::Unsent => {
-                    *not_asked += 1;
+                    tally.equal += 1;
+                    tally.sums += 1;
                     continue;
                 }
                 Outcome::LeftOut(why) => {
                     *match why {
+                        _ if round.is_unsent => &mut tally.not_asked,
                         Why::Changing => &mut lacking.parent_changing,
                         Why::Unknown => &mut lacking.tree_unknown,
                         Why::NotTaken => &mut lacking.sums_not_taken,
                     } += 1;
                     continue;
                 }
-                Outcome::Different => (different, How::Different),
-                Outcome::Missing => (missing, How::Missing),
+                Outcome::Different => How::Different,
+                Outcome::Missing => How::Missing,
                 // It had to go on then, or to say the end: it did not come to its slot in time.
-                Outcome::Extra if lane.speaking.contains(&cell) => {
+                Outcome::Extra if self.speaking.contains(&cell) => {
                     lacking.slot_missed += 1;
                     continue;
                 }
@@ -149,55 +142,49 @@ impl Judge {
                 Outcome::Extra if excuse_extra(lacking, excuse, (cell, round), is_last, [1; WORDS]) => {
                     continue;
                 }
-                Outcome::Extra => (extra, How::Extra),
+                Outcome::Extra => How::Extra,
             };
-            *count += 1;
-            notes.push((how, cell, Said::Sums { recorded: then.own(cell), now: now.own(cell) }));
+            tally.count(how, round.is_unsent);
+            let said = [then.own(cell), now.own(cell)].map(|own| own.map(Said::Sum));
+            first.note(how, &self.name, cell, Some((number, round.epoch, round.nanos)), said);
         }
         for (cell, count) in round.sums.recorded.counts() {
             if count > 0 {
-                lane.speaking.insert(cell);
+                self.speaking.insert(cell);
             } else {
-                lane.speaking.remove(&cell);
+                self.speaking.remove(&cell);
             }
-        }
-        for (how, cell, said) in notes {
-            self.note(index, how, cell, Some((number, round.epoch, round.nanos)), said);
         }
     }
 
     /// Compares the answers to `configure`, in their order.
-    pub(super) fn close_answers(&mut self, index: usize) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        let (rounds, mut differences) = (lane.base, Vec::new());
-        for (cell, mut answers) in std::mem::take(&mut lane.answers) {
+    pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut First) {
+        for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
-                let excuse = lane.excuses.get_mut(&cell);
+                let excuse = self.excuses.get_mut(&cell);
                 let next = answers.recorded.front().map(|(_, tag, _)| *tag);
                 if let Some((tag, _)) = answers.now.front().copied().filter(|(tag, _)| Some(*tag) != next)
-                    && answers.excuse_extra(&mut self.tally.lacking, excuse, tag, rounds)
+                    && answers.excuse_extra(&mut tally.lacking, excuse, tag, self.base)
                 {
                     answers.now.pop_front();
                     continue;
                 }
                 let recorded = answers.recorded.pop_front().map(|(_, tag, answer)| (tag, answer));
                 let now = answers.now.pop_front();
-                let (count, how) = match (recorded, now) {
+                let how = match (recorded, now) {
                     (None, None) => break,
                     (Some(recorded), Some(now)) if recorded == now => {
-                        self.tally.equal += 1;
+                        tally.equal += 1;
                         continue;
                     }
-                    (Some(_), Some(_)) => (&mut self.tally.different, How::Different),
-                    (Some(_), None) => (&mut self.tally.missing, How::Missing),
-                    (None, Some(_)) => (&mut self.tally.extra, How::Extra),
+                    (Some(_), Some(_)) => How::Different,
+                    (Some(_), None) => How::Missing,
+                    (None, Some(_)) => How::Extra,
                 };
-                *count += 1;
-                differences.push((how, cell, Said::Answers { recorded, now }));
+                tally.count(how, false);
+                let said = [recorded, now].map(|said| said.map(|(tag, answer)| Said::Answer(tag, answer)));
+                first.note(how, &self.name, cell, None, said);
             }
-        }
-        for (how, cell, said) in differences {
-            self.note(index, how, cell, None, said);
         }
     }
 }

@@ -36,7 +36,7 @@ pub struct Present {
 }
 
 /// Something of the capture, and the same of now.
-#[derive(Debug, Default)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Both<T> {
     pub(super) recorded: T,
     pub(super) now: T,
@@ -50,37 +50,21 @@ pub(super) struct Asked {
     pub(super) round: Option<u64>,
 }
 
-/// What has become of recorded joints.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) enum Fate {
-    /// Not sent yet.
-    #[default]
-    Waiting,
-    Sent,
-    /// A bus did not take them.
-    Unsent,
-}
-
-/// The words of one reply, recorded and now.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Pair {
-    pub(super) recorded: Option<[i16; WORDS]>,
-    pub(super) now: Option<[i16; WORDS]>,
-}
-
 /// Joints of the capture and their replies.
 #[derive(Debug, Default)]
 pub(super) struct Round {
     pub(super) epoch: Epoch,
     /// When they were recorded, in ns since 1970.
     pub(super) nanos: u64,
-    pub(super) fate: Fate,
-    pub(super) replies: BTreeMap<(CellId, What), Pair>,
+    /// Whether a bus did not take them.
+    pub(super) is_unsent: bool,
+    /// The words of each reply, recorded and now.
+    pub(super) replies: BTreeMap<(CellId, What), Both<Option<[i16; WORDS]>>>,
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were asked last.
     pub(super) asked_as: Epoch,
-    /// How often they were.
+    /// How often they were; 0 before they are sent.
     pub(super) asked: u32,
     /// Who is touched at these joints and at the ones before, by what the recording says that was sent.
     pub(super) touched: [Touched; 2],

@@ -23,7 +23,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
 pub use lane::Present;
-use lane::{Asked, Both, Fate, Lane, Pair, take_first_joints};
+use lane::{Asked, Both, Lane, take_first_joints};
 pub use sums::Own;
 use sums::{Side, Sum};
 pub use tally::{Lacking, Tally};
@@ -34,6 +34,35 @@ use super::survey::Cell as Surveyed;
 /// A reply may come so many joints after those that it answers; far less than the 256 epochs.
 const WINDOW: u64 = 100;
 
+/// The first difference.
+#[derive(Debug)]
+struct First {
+    /// When the capture began, in ns since 1970.
+    nanos: u64,
+    difference: Option<Difference>,
+}
+
+impl First {
+    /// Takes in a difference, with the number, the epoch and the time of its joints.
+    fn note(
+        &mut self,
+        how: How,
+        bus: &str,
+        cell: CellId,
+        round: Option<(u64, Epoch, u64)>,
+        [recorded, now]: [Option<Said>; 2],
+    ) {
+        if self.difference.is_some() {
+            return;
+        }
+        let when = round.map(|(joints, epoch, nanos)| {
+            let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
+            When { joints, epoch: epoch.0, at_s }
+        });
+        self.difference = Some(Difference::new(how, bus, cell, when, recorded.as_ref(), now.as_ref()));
+    }
+}
+
 /// All buses.
 #[derive(Debug)]
 pub struct Judge {
@@ -41,10 +70,8 @@ pub struct Judge {
     expects: bool,
     /// While a state is restored, replies are not those of the capture.
     is_muted: bool,
-    /// When the capture began, in ns since 1970.
-    first_nanos: u64,
     tally: Tally,
-    first: Option<Difference>,
+    first: First,
     rival: Option<usize>,
 }
 
@@ -62,9 +89,8 @@ impl Judge {
             lanes,
             expects,
             is_muted: true,
-            first_nanos,
             tally: Tally::default(),
-            first: None,
+            first: First { nanos: first_nanos, difference: None },
             rival: None,
         }
     }
@@ -143,7 +169,7 @@ impl Judge {
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
         if let Some(round) = it.round(number) {
-            round.fate = Fate::Sent;
+            round.is_unsent = false;
             // Asked again, all cells say their sums again.
             round.sums.now.clear();
             round.asked_as = epoch;
@@ -167,7 +193,7 @@ impl Judge {
     /// Takes in that a bus did not take the joints of a round.
     pub fn was_not_sent(&mut self, lane: usize, round: u64) {
         if let Some(round) = self.lanes.get_mut(lane).and_then(|lane| lane.round(round)) {
-            round.fate = Fate::Unsent;
+            round.is_unsent = true;
         }
     }
 
@@ -213,8 +239,8 @@ impl Judge {
             Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
-                let said = Said::Words { what, recorded: None, now: Some(words) };
-                self.note(index, How::Extra, cell, Some((number, epoch, nanos)), said);
+                let said = [None, Some(Said::Words(what, words))];
+                self.first.note(How::Extra, &lane.name, cell, Some((number, epoch, nanos)), said);
             }
         }
     }
@@ -256,10 +282,9 @@ impl Judge {
         };
         let is_there =
             |cell: &CellId| lane.roll.get(cell).is_some_and(|present: &Present| !present.is_given_up);
-        let misses = |((cell, what), pair): &(&(CellId, What), &Pair)| {
-            is_there(cell) && *what == What::Torque && pair.recorded.is_some() && pair.now.is_none()
-        };
-        let torques = round.replies.iter().filter(misses).count();
+        let replies = round.replies.iter().filter(|((_, what), _)| *what == What::Torque);
+        let missed = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
+        let torques = missed.filter(|((cell, _), _)| is_there(cell)).count();
         let Both { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;
@@ -295,12 +320,17 @@ impl Judge {
         self.lanes.get(lane).into_iter().flat_map(|lane| lane.roll.iter().map(|(cell, it)| (*cell, it)))
     }
 
+    /// Those of them that do not only claim their node id.
+    pub fn settled(&self, lane: usize) -> impl Iterator<Item = (CellId, &Present)> {
+        self.present(lane).filter(|(_, present)| present.claim.is_settled())
+    }
+
     /// Cells that have not said where their sums go, or have no way up.
     #[must_use]
     pub fn without_a_way(&self, lane: usize) -> Vec<CellId> {
+        let settled = self.settled(lane);
         let Some(lane) = self.lanes.get(lane) else { return Vec::new() };
-        let settled = lane.roll.iter().filter(|(_, present)| present.claim.is_settled());
-        settled.map(|(cell, _)| *cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
+        settled.map(|(cell, _)| cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
     }
 
     /// Judges all that has been sent, and hears no more; `is_whole` says whether that was all that the capture has.
@@ -314,8 +344,8 @@ impl Judge {
                 self.close_round(lane);
             }
         }
-        for lane in 0..self.lanes.len() {
-            self.close_answers(lane);
+        for lane in &mut self.lanes {
+            lane.close_answers(&mut self.tally, &mut self.first);
         }
     }
 
@@ -328,19 +358,7 @@ impl Judge {
     /// The first difference, missing or extra reply.
     #[must_use]
     pub const fn first(&self) -> Option<&Difference> {
-        self.first.as_ref()
-    }
-
-    fn note(&mut self, lane: usize, how: How, cell: CellId, round: Option<(u64, Epoch, u64)>, said: Said) {
-        if self.first.is_some() {
-            return;
-        }
-        let bus = self.lanes.get(lane).map_or_else(String::new, |lane| lane.name.clone());
-        let when = round.map(|(joints, epoch, nanos)| {
-            let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.first_nanos)).as_secs_f64();
-            When { joints, epoch: epoch.0, at_s }
-        });
-        self.first = Some(Difference { how, bus, cell, when, said });
+        self.first.difference.as_ref()
     }
 }
 

@@ -2,6 +2,8 @@
 
 use serde::Serialize;
 
+use crate::replay::difference::How;
+
 /// How replies and recorded ones compare.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Tally {
@@ -58,6 +60,17 @@ pub struct Lacking {
 }
 
 impl Tally {
+    /// Counts a reply that is not as it was recorded; one to joints that a bus did not take cannot come.
+    pub(super) const fn count(&mut self, how: How, is_unsent: bool) {
+        let count = match how {
+            How::Missing if is_unsent => &mut self.not_asked,
+            How::Missing => &mut self.missing,
+            How::Different => &mut self.different,
+            How::Extra => &mut self.extra,
+        };
+        *count += 1;
+    }
+
     /// Whether there are sums, and not one of them could be compared, because nothing tells whose children they hold.
     #[must_use]
     pub const fn lacks_the_tree(&self) -> bool {

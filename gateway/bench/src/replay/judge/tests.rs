@@ -122,7 +122,7 @@ fn one_step_is_a_difference() {
     assert_eq!(counts(&judge), [2, 1, 0, 0]);
     let first = judge.first().unwrap();
     assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (How::Different, Some((2, 2))));
-    assert!(first.to_string().ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first}");
+    assert!(first.text.ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first:?}");
 }
 
 #[test]
@@ -295,7 +295,7 @@ fn answers_to_configure_are_compared_in_their_order() {
     let now = [joints(0), says(value(P::Identity, 9)), says(value(P::Pose, 1)), says(value(P::Pose, 3))];
     let judge = judged(&recording, &now);
     assert_eq!(counts(&judge), [1, 1, 0, 0], "who a cell is, is not compared");
-    let text = judge.first().unwrap().to_string();
+    let text = judge.first().unwrap().text.clone();
     assert!(text.contains("recorded  configured 1 tag 3: wrote pose"), "{text}");
 }
 
@@ -362,7 +362,7 @@ fn sums_less_their_children_are_equal_in_another_tree() {
 fn a_sum_that_differs_is_shown_with_its_children() {
     let judge = judged(&row(), &beside([16, 30]));
     assert_eq!(counts(&judge), [6, 6, 0, 0]);
-    let text = judge.first().unwrap().to_string();
+    let text = judge.first().unwrap().text.clone();
     let expected = "the first difference: cell 1 on vcan0, joints 0 (epoch 0, 0.007 s into the recording)
   recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; less its child 2: 0.039 0.000 0.000 \
                     0.000 0.000 0.000 Nm

@@ -1,5 +1,8 @@
+use std::time::Duration;
+
 use super::*;
 use proptest::prelude::*;
+use protocol::message::Joints;
 
 /// A clock and buses that are variables.
 #[derive(Debug, Default)]
@@ -8,7 +11,7 @@ struct Fake {
     /// How long a send takes.
     takes: u64,
     /// What the next sends come to; then all is taken.
-    outcomes: Vec<Sent>,
+    outcomes: Vec<Result<(), SendError>>,
     /// What was sent, when and where.
     sent: Vec<(u64, usize, Vec<Frame>)>,
     announced: Vec<(usize, Option<u64>)>,
@@ -35,10 +38,10 @@ impl Stage for Fake {
     fn announce(&mut self, lane: usize, round: Option<u64>, _: Epoch) {
         self.announced.push((lane, round));
     }
-    fn send(&mut self, lane: usize, frames: &[Frame]) -> Sent {
+    fn send(&mut self, lane: usize, frames: &[Frame]) -> Result<(), SendError> {
         self.sent.push((self.clock, lane, frames.to_vec()));
         self.clock += self.takes;
-        if self.outcomes.is_empty() { Sent::All } else { self.outcomes.remove(0) }
+        if self.outcomes.is_empty() { Ok(()) } else { self.outcomes.remove(0) }
     }
     fn was_not_sent(&mut self, lane: usize, round: u64) {
         self.unsent.push((lane, round));
@@ -54,6 +57,17 @@ impl Stage for Fake {
     fn show(&mut self, _: u64) {}
 }
 
+/// A bus has taken so many and stayed full.
+fn full(sent: usize) -> Result<(), SendError> {
+    let cause = BusError::Full { name: "vcan0".to_owned(), waited: Duration::from_millis(100) };
+    Err(SendError { sent, wanted: sent, cause })
+}
+
+/// A bus has taken so many and is down.
+fn down(sent: usize) -> Result<(), SendError> {
+    Err(SendError { sent, wanted: sent, cause: BusError::Down("vcan0".to_owned()) })
+}
+
 fn frame(id: u32) -> Frame {
     Frame::classic(id, &[]).unwrap()
 }
@@ -63,7 +77,7 @@ fn plain(at_us: u64, lane: usize, id: u32) -> Step {
 }
 
 fn joints(at_us: u64, lane: usize, round: u64) -> Step {
-    let role = Role::Joints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) };
+    let role = Role::Joints(Open { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
     Step::Frame(Due { at: at_us * 1_000, lane, frame: frame(1), role, is_late: false })
 }
 
@@ -147,8 +161,8 @@ fn the_first_half_of_joints_waits_too() {
 
 #[test]
 fn what_a_bus_does_not_take_is_counted_by_its_reason() {
-    let outcomes =
-        vec![Sent::Full(1), Sent::Down(0), Sent::Down(0), Sent::All, Sent::Ended(0, "gone".to_owned())];
+    let gone = Err(SendError { sent: 0, wanted: 1, cause: BusError::Gone("vcan0".to_owned()) });
+    let outcomes = vec![full(1), down(0), down(0), Ok(()), gone];
     let mut stage = Fake { outcomes, ..Fake::default() };
     let steps = [
         plain(0, 0, 1),
@@ -162,7 +176,10 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
     let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
     assert_eq!(played.lanes, [LaneTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
-    assert_eq!(played.failure.as_deref(), Some("gone"));
+    assert_eq!(
+        played.failure.as_deref(),
+        Some("vcan0 was removed while it was in use: make it again and open it again")
+    );
     assert_eq!(stage.sent.len(), 5, "nothing is sent after the end");
 }
 
@@ -203,8 +220,7 @@ proptest! {
     fn every_frame_is_sent_once_in_order_never_early_and_the_counts_add_up(
         steps in proptest::collection::vec((0_u64..3_000, 0_usize..3, any::<bool>()), 0..150),
         takes in 0_u64..2_000_000,
-        outcomes in proptest::collection::vec(prop_oneof![
-            Just(Sent::All), (0_usize..70).prop_map(Sent::Full), (0_usize..70).prop_map(Sent::Down)], 0..20),
+        outcomes in proptest::collection::vec((0_usize..70, 0_u8..3), 0..20),
         lockstep: bool,
     ) {
         let mut at = 0;
@@ -219,7 +235,12 @@ proptest! {
             due
         }).collect();
         let syncs = lockstep.then(|| vec![vec![frame(0x7FF)]; 3]);
-        let mut stage = Fake { takes, outcomes, ..Fake::default() };
+        let outcomes = outcomes.into_iter().map(|(sent, outcome)| match outcome {
+            0 => Ok(()),
+            1 => full(sent),
+            _ => down(sent),
+        });
+        let mut stage = Fake { takes, outcomes: outcomes.collect(), ..Fake::default() };
         let played = play(Player::new(3, Pace::Timed(1.0), syncs), &mut stage, steps.clone());
         let tried: Vec<_> = stage.sent.iter()
             .flat_map(|(at, lane, frames)| frames.iter().map(move |frame| (*at, *lane, *frame)))

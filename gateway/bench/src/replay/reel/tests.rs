@@ -79,11 +79,12 @@ fn cut_of(
     let mut steps = Vec::new();
     for _ in 0..passes {
         for it in capture {
-            if reel.take(&record(it), &mut judge, |step| steps.push(step)) == Flow::Enough {
+            if reel.take(&record(it), &mut judge).is_break() {
                 break;
             }
         }
-        reel.end_pass(&mut judge, |step| steps.push(step));
+        reel.end_pass(&mut judge);
+        steps.extend(std::iter::from_fn(|| reel.next_step()));
     }
     let due = |step| match step {
         Step::Frame(due) => due,
@@ -104,7 +105,7 @@ fn all_is_sent_but_what_never_was_on_a_bus() {
     assert_eq!(cut.skipped, BTreeMap::from([(reason::ERROR, 1)]));
     // Joints are numbered, each bus by itself.
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints { round, .. } => Some((due.lane, round)),
+        Role::Joints(Open { round, .. }) => Some((due.lane, round)),
         Role::Plain | Role::HalfOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [(0, Some(0)), (1, Some(0)), (0, Some(1))]);
@@ -174,8 +175,8 @@ fn passes_follow_each_other_as_joints_do() {
     // A pass lasts 6 ms, and from the first joints to the second it is all of that.
     assert_eq!(starts, [0, 12, 24]);
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints { round, .. } if due.lane == 0 => round,
-        Role::Joints { .. } | Role::Plain | Role::HalfOfJoints => None,
+        Role::Joints(Open { round, .. }) if due.lane == 0 => round,
+        Role::Joints(_) | Role::Plain | Role::HalfOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);
 }
