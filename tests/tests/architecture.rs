@@ -108,12 +108,13 @@ fn no_file_is_longer_than_500_lines() {
 fn no_struct_has_more_than_20_fields_but_what_is_serialised() {
     fn wide(items: &[Item], found: &mut Vec<(String, usize)>) {
         for item in items {
-            match item {
-                Item::Mod(module) => wide(module.content.as_ref().map_or(&[], |(_, items)| items), found),
-                Item::Struct(one) if one.fields.len() > 20 && !is_serialised(&one.attrs) => {
-                    found.push((one.ident.to_string(), one.fields.len()));
-                }
-                _ => {}
+            if let Item::Mod(module) = item {
+                wide(module.content.as_ref().map_or(&[], |(_, items)| items), found);
+            } else if let Item::Struct(one) = item
+                && one.fields.len() > 20
+                && !is_serialised(&one.attrs)
+            {
+                found.push((one.ident.to_string(), one.fields.len()));
             }
         }
     }
