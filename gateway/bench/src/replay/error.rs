@@ -3,13 +3,11 @@
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
-use protocol::bus::{BusError, KindsError};
-use protocol::document::DocumentError;
+use protocol::bus::KindsError;
 use thiserror::Error;
 
 use super::checks::Mismatch;
 use crate::run::RunError;
-use crate::run::launch::LaunchError;
 use model::decode::BUSES;
 use trace::capture::CaptureError;
 
@@ -17,18 +15,9 @@ use trace::capture::CaptureError;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReplayError {
-    /// As of a run.
+    /// As of a run: a skin, a bus, a program, a thread.
     #[error(transparent)]
-    Run(#[from] RunError),
-    /// A skin says something that cannot be.
-    #[error(transparent)]
-    Document(#[from] DocumentError),
-    /// A bus does not open.
-    #[error(transparent)]
-    Bus(#[from] BusError),
-    /// A program does not start.
-    #[error(transparent)]
-    Launch(#[from] LaunchError),
+    Run(RunError),
     /// Another kind is named for a bus than it can have.
     #[error(transparent)]
     Kinds(#[from] KindsError),
@@ -136,16 +125,23 @@ pub enum ReplayError {
     Measuring(String),
 }
 
+/// What stops a run stops a replay.
+impl<E> From<E> for ReplayError
+where
+    RunError: From<E>,
+{
+    fn from(error: E) -> Self {
+        Self::Run(error.into())
+    }
+}
+
 impl ReplayError {
     /// 2 for wrong use or configuration, 1 for a replay that failed.
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {
             Self::Run(error) => error.exit_code(),
-            Self::Document(_)
-            | Self::Bus(_)
-            | Self::Launch(_)
-            | Self::Kinds(_)
+            Self::Kinds(_)
             | Self::StandardInput
             | Self::Pipe(_)
             | Self::Open(_)

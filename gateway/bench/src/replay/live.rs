@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::{BusError, SendError};
 use protocol::can::Frame;
-use protocol::id::CellId;
 use protocol::message::{Message, State as Flags};
 use protocol::packet::Epoch;
 
@@ -16,6 +15,7 @@ use super::hall::Hall;
 use super::meet::mode;
 use super::player::{Pace, Stage};
 use super::reel::Open;
+use super::report::Lockstep;
 use super::start::Lane;
 use super::{Options, ReplayError};
 use crate::run::realtime;
@@ -45,11 +45,9 @@ pub(super) struct Live {
     pub(super) hall: Arc<Hall>,
     /// For people.
     pub(super) voice: Sender<String>,
-    /// Cells that did not answer in lockstep, by bus.
-    pub(super) silent: Vec<(usize, CellId)>,
-    /// Joints that were asked again.
-    pub(super) asked_again: u64,
-    /// The buses on which that was in vain the last time.
+    /// Cells that did not answer, and joints that were asked again.
+    pub(super) lockstep: Lockstep,
+    /// The buses on which to ask again was in vain the last time.
     pub(super) in_vain: BTreeSet<usize>,
     pub(super) down: BTreeSet<usize>,
 }
@@ -134,7 +132,7 @@ impl Stage for Live {
                 return;
             }
             let epoch = if again % 2 == 0 { open.epoch.plus(u8::MAX) } else { open.epoch };
-            self.asked_again += 1;
+            self.lockstep.asked_again += 1;
             self.hall.judge().announce(lane, Some(round), epoch);
             let joints = Message::Joints { epoch, joints: open.joints };
             if self.tell(lane, &[joints]).is_err() {
@@ -221,8 +219,8 @@ impl Live {
             }
             if progress.elapsed() > PATIENCE {
                 let late = judge.give_up(lane);
-                self.silent.extend(late.iter().map(|cell| (lane, *cell)));
                 let name = self.hall.checks.lane(lane);
+                self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
                 self.say(format!(
                     "cell{plural} {} on {name} {verb} not answer within {} s: the replay goes on without",

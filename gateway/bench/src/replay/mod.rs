@@ -49,7 +49,6 @@ use self::report::Summary;
 use self::session::Session;
 use self::start::Routes;
 use self::survey::{Part, Survey};
-use crate::run::RunError;
 use crate::run::progress::Progress;
 use crate::run::realtime::idle_lateness;
 use crate::setup::names;
@@ -129,7 +128,7 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
     let wearing = wearing.transpose()?;
     // Until now there was nothing that had to be put in order at an end.
-    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM]).map_err(RunError::from)?;
+    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;

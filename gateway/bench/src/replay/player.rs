@@ -83,7 +83,7 @@ pub struct Played {
     /// Whether somebody said stop before the end.
     pub was_stopped: bool,
     /// Why it could not go on.
-    pub failure: Option<String>,
+    pub failure: Option<ReplayError>,
 }
 
 /// Sends steps.
@@ -139,7 +139,7 @@ impl Player {
                 Ok(Step::Restore(_)) => {
                     self.wait_for_all(stage);
                     if let Ok(Step::Restore(states)) = steps.pop() {
-                        self.played.failure = stage.restore(&states).err().map(|error| error.to_string());
+                        self.played.failure = stage.restore(&states).err();
                         self.origin = None;
                     }
                 }
@@ -259,7 +259,7 @@ impl Player {
                 stage.was_not_sent(lane, *round);
             }
         }
-        self.played.failure = cause.filter(|cause| !cause.may_pass()).map(|cause| cause.to_string());
+        self.played.failure = cause.filter(|cause| !cause.may_pass()).map(ReplayError::from);
     }
 }
 

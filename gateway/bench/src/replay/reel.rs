@@ -52,9 +52,6 @@ pub struct Selection {
     pub reads: bool,
 }
 
-/// Frames that are not sent, by reason.
-pub type Skipped = BTreeMap<&'static str, u64>;
-
 /// What is to be done next.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
@@ -104,8 +101,8 @@ pub struct Open {
 /// What a reel came to.
 #[derive(Clone, Debug, Default)]
 pub struct Cut {
-    /// Frames that were not sent.
-    pub skipped: Skipped,
+    /// Frames that were not sent, by reason.
+    pub skipped: BTreeMap<&'static str, u64>,
     /// Frames that were older than one sent before them.
     pub late: u64,
 }

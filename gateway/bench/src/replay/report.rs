@@ -67,7 +67,7 @@ pub struct BusSummary {
 }
 
 /// How cells kept step.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Lockstep {
     /// Cells that did not answer in time, as people read it.
     pub silent_cells: Vec<String>,

@@ -89,8 +89,7 @@ impl Session {
         let mut live = Live {
             hall: Arc::clone(&self.hall),
             voice,
-            silent: Vec::new(),
-            asked_again: 0,
+            lockstep: Lockstep::default(),
             in_vain: BTreeSet::new(),
             down: BTreeSet::new(),
             lanes,
@@ -112,9 +111,7 @@ impl Session {
         let (mut played, mut live, granted) = player.join().map_err(|_| RunError::Panicked("player"))?;
         let duration_s = began.elapsed().as_secs_f64();
         let cut = reader.join().map_err(|_| RunError::Panicked("reader"))?;
-        if let Some(rival) = rival {
-            played.failure = Some(rival.to_string());
-        }
+        played.failure = rival.or(played.failure);
         // What a signal has ended is judged as far as it went.
         self.hall.over.store(false, Ordering::Relaxed);
         let lanes = self.hall.checks.lanes().enumerate();
@@ -128,10 +125,10 @@ impl Session {
             self.progress.note(&line);
         }
         let cut = cut.unwrap_or_else(|error| {
-            played.failure.get_or_insert_with(|| error.to_string());
+            played.failure.get_or_insert(ReplayError::Read(error));
             Cut::default()
         });
-        Ok(self.summary(played, cut, &live, duration_s, granted, idle))
+        Ok(self.summary(played, cut, live, duration_s, granted, idle))
     }
 
     /// Shows how it goes, until it is over; whether there is another gateway.
@@ -174,7 +171,7 @@ impl Session {
         &self,
         played: Played,
         cut: Cut,
-        live: &Live,
+        live: Live,
         duration_s: f64,
         granted: Granted,
         idle: Option<&Histogram<u64>>,
@@ -191,10 +188,8 @@ impl Session {
                 unheard: 0,
             })
         };
-        let silent = |(lane, cell): &(usize, CellId)| format!("{cell} on {}", checks.lane(*lane));
-        let mut silent_cells: Vec<_> = live.silent.iter().map(silent).collect();
-        silent_cells.dedup();
-        let asked_again = live.asked_again;
+        let mut lockstep = live.lockstep;
+        lockstep.silent_cells.dedup();
         Summary {
             file: checks.name.clone(),
             duration_s,
@@ -210,9 +205,9 @@ impl Session {
             spin_us: options.spin.as_secs_f64() * 1e6,
             fifo: granted.fifo,
             memory_locked: granted.locked,
-            lockstep: options.lockstep.then_some(Lockstep { silent_cells, asked_again }),
+            lockstep: options.lockstep.then_some(lockstep),
             expect: options.expect.then(|| self.expectation()),
-            failure: played.failure,
+            failure: played.failure.map(|failure| failure.to_string()),
         }
     }
 

@@ -219,12 +219,7 @@ impl Judge {
         {
             round.sums.now.take(from, Sum { torque, count });
         }
-        self.hear_reply(index, message);
-    }
-
-    fn hear_reply(&mut self, index: usize, message: &Message) {
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        let Some(lane) = self.lanes.get_mut(index) else { return };
         if what != What::Torque && lane.untouched.now.get(&cell) == Some(&epoch) {
             return;
         }

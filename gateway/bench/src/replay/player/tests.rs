@@ -177,7 +177,7 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
     assert_eq!(played.lanes, [LaneTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
     assert_eq!(
-        played.failure.as_deref(),
+        played.failure.map(|why| why.to_string()).as_deref(),
         Some("vcan0 was removed while it was in use: make it again and open it again")
     );
     assert_eq!(stage.sent.len(), 5, "nothing is sent after the end");
