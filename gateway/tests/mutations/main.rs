@@ -9,6 +9,7 @@ use std::fs::{self, File};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Command, ExitStatus, Stdio};
+use std::sync::Mutex;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -85,22 +86,35 @@ fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
     }
 }
 
+/// Commands that replay wait most of their time.
+const AT_ONCE: usize = 8;
+
 #[test]
 fn whatever_a_recording_is_every_command_ends_and_says_why() {
-    let folder = tempfile::tempdir().unwrap();
     let skin = seeds::skin();
-    fs::write(folder.path().join("skin.toml"), &skin).unwrap();
     let seeds = seeds::all(&skin);
     let count = std::env::var("SKINBUS_MUTATIONS").map_or(QUICK, |count| count.parse().unwrap());
-    for (name, seed) in &seeds {
-        passes(folder.path(), name, seed, COMMANDS);
-    }
-    for number in 0..count {
+    let whole = seeds.iter().map(|(name, seed)| ((*name).to_owned(), seed.clone()));
+    let damaged = (0..count).map(|number| {
         let mut chance = Pcg64Mcg::new(u128::from(number).wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
         let (name, seed) = &seeds[usize::try_from(number).unwrap() % seeds.len()];
         let (how, file) = mutate::mutated(seed, &mut chance);
-        passes(folder.path(), &format!("{number}, {name}, {how}"), &file, COMMANDS);
-    }
+        (format!("{number}, {name}, {how}"), file)
+    });
+    let files = Mutex::new(whole.chain(damaged));
+    thread::scope(|scope| {
+        for _ in 0..AT_ONCE {
+            scope.spawn(|| {
+                let folder = tempfile::tempdir().unwrap();
+                fs::write(folder.path().join("skin.toml"), &skin).unwrap();
+                // The lock is held while a file is made, and by nobody who panicked.
+                let next = || files.lock().unwrap().next();
+                while let Some((what, file)) = next() {
+                    passes(folder.path(), &what, &file, COMMANDS);
+                }
+            });
+        }
+    });
 }
 
 #[test]
