@@ -64,9 +64,54 @@ struct Schema {
 pub struct Part {
     /// It is there while a number lies within these bounds, which are inclusive.
     pub when: [u16; 2],
-    /// `{name}` stands for a field, `{name:3}` for one with so many decimals, `{name?no|yes}` for one of two words, `{}`
-    /// for the text of the page.
-    pub text: String,
+    /// What it is made of.
+    pub pieces: Vec<Piece>,
+}
+
+/// What a part of a text is made of.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Piece {
+    /// Words as they are.
+    Words(String),
+    /// `{name}`: a field; `{name:3}`: with so many decimals; `{}`: the text of the page.
+    Field {
+        /// Its name.
+        name: String,
+        /// Digits after the point.
+        decimals: usize,
+    },
+    /// `{name?no|yes}`: one of two words, by a field.
+    Either {
+        /// Its name.
+        name: String,
+        /// The word where it is not 1, and the one where it is.
+        words: [String; 2],
+    },
+}
+
+impl Piece {
+    /// What stands between braces.
+    fn inside(text: &str) -> Self {
+        if let Some((name, (no, yes))) =
+            text.split_once('?').and_then(|(name, words)| Some((name, words.split_once('|')?)))
+        {
+            return Self::Either { name: name.to_owned(), words: [no.to_owned(), yes.to_owned()] };
+        }
+        let (name, decimals) = text.split_once(':').unwrap_or((text, ""));
+        Self::Field { name: name.to_owned(), decimals: decimals.parse().unwrap_or_default() }
+    }
+
+    fn all(mut text: &str) -> Vec<Self> {
+        let mut pieces = Vec::new();
+        while let Some((before, (inside, after))) =
+            text.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
+        {
+            pieces.extend([Self::Words(before.to_owned()), Self::inside(inside)]);
+            text = after;
+        }
+        pieces.push(Self::Words(text.to_owned()));
+        pieces
+    }
 }
 
 impl<'de> Deserialize<'de> for Part {
@@ -77,10 +122,11 @@ impl<'de> Deserialize<'de> for Part {
             Always(String),
             Within(u16, u16, String),
         }
-        Ok(match Either::deserialize(deserializer)? {
-            Either::Always(text) => Self { when: ALWAYS, text },
-            Either::Within(least, greatest, text) => Self { when: [least, greatest], text },
-        })
+        let (when, text) = match Either::deserialize(deserializer)? {
+            Either::Always(text) => (ALWAYS, text),
+            Either::Within(least, greatest, text) => ([least, greatest], text),
+        };
+        Ok(Self { when, pieces: Piece::all(&text) })
     }
 }
 

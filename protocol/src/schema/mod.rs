@@ -11,7 +11,7 @@ mod field;
 mod file;
 
 pub use field::{Absent, Field, Format, Range};
-pub use file::{Layout, PacketSchema, Part, packets, parameters, reasons, wires};
+pub use file::{Layout, PacketSchema, Part, Piece, packets, parameters, reasons, wires};
 
 use crate::id::{Id, Kind};
 use crate::message::{FROM_THE_NEXT, Message, REFUSED, Request, WRITE};

@@ -31,8 +31,11 @@ fn fields_stand_side_by_side_within_the_packet() {
 #[test]
 fn texts_name_fields_that_are_there() {
     let names = |text: &'static [Part]| {
-        let parts = text.iter().flat_map(|part| part.text.split('{').skip(1));
-        parts.map(|part| part.split(['}', ':', '?']).next().unwrap()).collect::<Vec<_>>()
+        let name = |piece: &'static Piece| match piece {
+            Piece::Words(_) => None,
+            Piece::Field { name, .. } | Piece::Either { name, .. } => Some(name.as_str()),
+        };
+        text.iter().flat_map(|part| &part.pieces).filter_map(name).collect::<Vec<_>>()
     };
     for (_, layout) in all() {
         for name in names(&layout.text) {

@@ -5,7 +5,7 @@ use core::fmt::{self, Display, Formatter};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::{Message, State};
 use protocol::packet::WORDS;
-use protocol::schema::{self, Field, Format, Layout, PacketSchema, Part};
+use protocol::schema::{self, Field, Format, Layout, PacketSchema, Part, Piece};
 
 use super::Decoded;
 use super::wires::{self, Port, Said};
@@ -54,11 +54,10 @@ impl Display for Meaning<'_> {
         };
         let (layout, bytes) = (schema::layout(self.0, &packet), packet.encode());
         f.write_str(" ")?;
-        fill(f, &schema.text, u16::from(packet.count), &|f, part| match (part, field(&schema.end, part)) {
-            ("", _) => say(f, layout, &bytes),
-            ("page", _) => f.write_str(&layout.name),
-            (_, Some(field)) => show(f, field, &bytes, part),
-            (_, None) => field(&layout.fields, part).map_or(Ok(()), |field| show(f, field, &bytes, part)),
+        fill(f, &schema.text, u16::from(packet.count), &bytes, &|f, name| match name {
+            "" => say(f, layout, &bytes).map(|()| None),
+            "page" => f.write_str(&layout.name).map(|()| None),
+            _ => Ok(field(&schema.end, name).or_else(|| field(&layout.fields, name))),
         })
     }
 }
@@ -97,45 +96,42 @@ impl Display for Name {
 /// What a layout's fields say in these bytes.
 pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw(bytes, 0));
-    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), &|f, part| {
-        field(&layout.fields, part).map_or(Ok(()), |field| show(f, field, bytes, part))
+    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), bytes, &|_, name| {
+        Ok(field(&layout.fields, name))
     })
 }
 
-/// The field that a part of a text names.
-fn field<'a>(fields: &'a [Field], part: &str) -> Option<&'a Field> {
-    let name = part.split([':', '?']).next()?;
+/// The field of this name.
+fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
     fields.iter().find(|field| field.name == name)
 }
 
-/// Writes the parts of a text that belong to a number; `show` writes what stands between braces.
-fn fill(
-    f: &mut Formatter<'_>,
-    text: &[Part],
-    number: u16,
-    show: &dyn Fn(&mut Formatter<'_>, &str) -> fmt::Result,
-) -> fmt::Result {
-    for part in text.iter().filter(|part| (part.when[0]..=part.when[1]).contains(&number)) {
-        let mut rest = part.text.as_str();
-        while let Some((before, (inside, after))) =
-            rest.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
-        {
-            f.write_str(before)?;
-            show(f, inside)?;
-            rest = after;
+/// Gives the field of a name, or writes what is none.
+type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
+
+/// Writes the parts of a text that belong to a number.
+fn fill<'a>(f: &mut Formatter<'_>, text: &[Part], number: u16, bytes: &[u8], find: &Find<'a>) -> fmt::Result {
+    let parts = text.iter().filter(|part| (part.when[0]..=part.when[1]).contains(&number));
+    for piece in parts.flat_map(|part| &part.pieces) {
+        match piece {
+            Piece::Words(words) => f.write_str(words)?,
+            Piece::Field { name, decimals } => {
+                if let Some(field) = find(f, name)? {
+                    show(f, field, bytes, *decimals)?;
+                }
+            }
+            Piece::Either { name, words: [no, yes] } => {
+                let is = find(f, name)?.is_some_and(|field| field.raw(bytes, 0) == 1);
+                f.write_str(if is { yes } else { no })?;
+            }
         }
-        f.write_str(rest)?;
     }
     Ok(())
 }
 
 /// Writes a field as a part of a text asks for it.
-fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], part: &str) -> fmt::Result {
+fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], decimals: usize) -> fmt::Result {
     let first = field.raw(bytes, 0);
-    if let Some((no, yes)) = part.split_once('?').and_then(|(_, words)| words.split_once('|')) {
-        return f.write_str(if first == 1 { yes } else { no });
-    }
-    let decimals = part.split_once(':').and_then(|(_, decimals)| decimals.parse().ok()).unwrap_or(0);
     match &field.format {
         Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
         Format::Hex => write!(f, "{first:04X}"),
