@@ -415,8 +415,8 @@ impl Cell {
         match self.claim.hear(heartbeat) {
             Word::Claimant | Word::Overtaken => return false,
             Word::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
-            Word::First | Word::Known if !obeys => self.contact.reset(),
-            Word::First | Word::Known => {}
+            Word::First | Word::Known | Word::Shared if !obeys => self.contact.reset(),
+            Word::First | Word::Known | Word::Shared => {}
         }
         self.contact.set_obeys(obeys);
         self.hash = Some(heartbeat.configuration);

@@ -93,6 +93,8 @@ impl Session {
         for lane in self.buses.lanes.iter() {
             lane.send(&[Message::Sync])?;
         }
+        // Whoever is there answers: also where nobody has to be there, who is there is known at the first look.
+        thread::sleep(LOOK);
         let all = wanted.iter().map(BTreeSet::len).sum::<usize>();
         let mut patience = Patience::new(if spawned { STARTING } else { SHOWING });
         self.wait(|session, judge| {

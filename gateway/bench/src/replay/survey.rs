@@ -339,7 +339,7 @@ impl Cell {
                 Some(Word::Claimant | Word::Overtaken) | None => return,
                 // After a start its counters begin anew.
                 Some(Word::Started { .. }) => self.report = Some((Heard::default(), joints.0, joints.1)),
-                Some(Word::First | Word::Known) => {}
+                Some(Word::First | Word::Known | Word::Shared) => {}
             }
             self.heartbeat(heartbeat, nanos, place);
         } else if let Message::Network { page: NetworkPage::Heard(heard), .. } = *message {

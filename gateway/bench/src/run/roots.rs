@@ -72,8 +72,8 @@ impl Roots {
     #[must_use]
     pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
         let roots: Vec<_> = roots(skin, bus).into_iter().map(|(root, lane)| (root, lane, false)).collect();
-        // Whoever was there before counted its walks too, and nobody knows how far.
-        let walk = std::process::id().to_le_bytes()[0];
+        // Whoever was there before counted its walks too, and nobody knows how far; process ids are often neighbours.
+        let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
         (!roots.is_empty()).then(|| Self {
             uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
             roots,

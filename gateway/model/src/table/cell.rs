@@ -178,7 +178,7 @@ impl Cell {
     pub(super) fn take_heartbeat(&mut self, news: &News, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
         // Of a claimant: it is not this number's cell, and may never be.
         let Some(word) = news.word.filter(|word| *word != Word::Claimant) else { return Change::default() };
-        let started = matches!(word, Word::Started { .. });
+        let started = matches!(word, Word::Started { .. } | Word::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != Word::Overtaken {
             // The first one after a halt or a resume may have been said before it.
@@ -189,6 +189,10 @@ impl Cell {
         }
         if news.returned {
             self.contact.reset();
+        }
+        if word == Word::First && self.tracked.claim().previous().is_some() {
+            // Who claimed the number before that counted something else.
+            self.sent = Sent::default();
         }
         if started {
             self.contact.reset();

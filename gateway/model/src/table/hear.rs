@@ -105,7 +105,7 @@ impl Table {
             self.counters.count(Event::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
         }
-        if news.word == Some(Word::Started { again: true }) {
+        if matches!(news.word, Some(Word::Started { again: true } | Word::Shared)) {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
         if news.returned {

@@ -16,6 +16,8 @@ pub enum Word {
         /// Whether the cell, or another one that had the id before, was heard before that.
         again: bool,
     },
+    /// Of the cell that had the id before, which did not claim it again: two cells speak under it in turn.
+    Shared,
     /// Another cell claims the id, and will give way.
     Claimant,
 }
@@ -31,6 +33,8 @@ const OVERTAKES: u16 = 128;
 pub struct Claim {
     owner: Option<Heartbeat>,
     previous: Option<u32>,
+    /// The one before that had it, and did not only claim it.
+    settled: Option<u32>,
 }
 
 impl Claim {
@@ -38,8 +42,11 @@ impl Claim {
     pub fn hear(&mut self, heartbeat: &Heartbeat) -> Word {
         let word = self.word(heartbeat);
         if !matches!(word, Word::Overtaken | Word::Claimant) {
+            let was_settled = self.is_settled();
             let before = self.owner.replace(*heartbeat).map(|owner| owner.serial);
-            self.previous = before.filter(|&serial| serial != heartbeat.serial).or(self.previous);
+            let before = before.filter(|&serial| serial != heartbeat.serial);
+            self.previous = before.or(self.previous);
+            self.settled = before.filter(|_| was_settled).or(self.settled);
         }
         word
     }
@@ -53,6 +60,7 @@ impl Claim {
         if owner.serial != heartbeat.serial {
             return match (self.is_settled(), claims) {
                 (_, true) => Word::Claimant,
+                (true, false) if self.settled == Some(heartbeat.serial) => Word::Shared,
                 (true, false) => Word::Started { again: true },
                 // Who claimed the id did not get it.
                 (false, false) => Word::First,
@@ -136,6 +144,13 @@ mod tests {
         assert_eq!(words(&said), [Word::First, Word::Claimant, Word::Known, AGAIN, Word::Known]);
         let said = [(8, 0, claims), (7, 10, settled), (7, 11, settled)];
         assert_eq!(words(&said), [Word::Started { again: false }, Word::First, Word::Known], "it gave way");
+    }
+
+    #[test]
+    fn two_cells_that_speak_under_one_id_in_turn_do_not_restart_each_time() {
+        let settled = State::default();
+        let said = [(7, 90, settled), (9, 40, settled), (7, 91, settled), (9, 41, settled), (9, 42, settled)];
+        assert_eq!(words(&said), [Word::First, AGAIN, Word::Shared, Word::Shared, Word::Known]);
     }
 
     #[test]

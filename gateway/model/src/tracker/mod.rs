@@ -100,7 +100,7 @@ impl Tracked {
         }
         match word {
             Word::Known => self.account.settle(heartbeat.sent),
-            Word::First => self.account.begin(heartbeat.sent, false),
+            Word::First | Word::Shared => self.account.begin(heartbeat.sent, false),
             Word::Started { again } => {
                 self.account.begin(heartbeat.sent, again);
                 self.pages = Pages::default();
@@ -109,7 +109,7 @@ impl Tracked {
             Word::Claimant => self.account.intrude(),
         }
         self.account.heartbeat_at(joints);
-        let returned = away && matches!(word, Word::First | Word::Known);
+        let returned = away && matches!(word, Word::First | Word::Known | Word::Started { again: false });
         News { word: Some(word), revived, returned }
     }
 
