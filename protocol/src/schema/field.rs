@@ -47,7 +47,7 @@ pub enum Format {
     Parameter(u8),
     /// The page's number, in so many bits: it says which layout the words have.
     Page(u8),
-    /// Why something was refused, [`super::REASONS`].
+    /// Why something was refused, [`super::reasons`].
     Reason,
     /// Fields within a word.
     Group(Vec<Field>),
@@ -68,7 +68,7 @@ pub enum Range {
     Within(u16, u16),
 }
 
-/// What becomes of a field when [`Field::when`] does not hold.
+/// What becomes of a field when `when` does not hold.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Absent {

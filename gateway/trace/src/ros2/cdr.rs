@@ -87,7 +87,7 @@ impl<'a> Decode<'a> for &'a str {
     }
 }
 
-/// At most [`LONGEST`] elements.
+/// At most `LONGEST` elements.
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
         let count = from.get::<u32>()?;
