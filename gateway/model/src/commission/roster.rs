@@ -17,9 +17,9 @@ impl Roster {
     pub(super) fn hear(&mut self, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;
-        let again = claim.hear(heartbeat) == Word::Started { again: true };
+        let took = matches!(claim.hear(heartbeat), Word::Started { again: true } | Word::Shared);
         let [holder, earlier] = [before.serial()?, before.previous()?];
-        (again && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
+        (took && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
     }
 
     /// Who has a number.
@@ -30,5 +30,32 @@ impl Roster {
     /// All that were heard, with their serial numbers.
     pub(super) fn all(&self) -> impl Iterator<Item = (CellId, u32)> {
         self.0.iter().filter_map(|(number, claim)| Some((number, claim.serial()?)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::message::State;
+
+    fn heard(said: &[(u32, State)]) -> Vec<Option<[u32; 2]>> {
+        let (mut roster, number) = (Roster::default(), CellId::new(5).unwrap());
+        let beat = |(at, &(serial, state)): (u16, &(u32, State))| {
+            roster.hear(number, &Heartbeat { serial, state, sent: 40 + at, ..Heartbeat::default() })
+        };
+        (0..).zip(said).map(beat).collect()
+    }
+
+    #[test]
+    fn the_way_back_shows_that_two_cells_have_one_number() {
+        let (claims, settled) = (State::CLAIMING, State::default());
+        let both = [(7, settled), (9, settled), (7, settled), (9, settled)];
+        assert_eq!(heard(&both), [None, None, Some([7, 9]), Some([9, 7])]);
+        assert_eq!(heard(&[(7, settled), (9, claims), (7, settled), (9, claims)]), [None; 4]);
+        assert_eq!(
+            heard(&[(7, settled), (9, settled), (9, settled)]),
+            [None; 3],
+            "it took the other's place"
+        );
     }
 }

@@ -32,9 +32,8 @@ const OVERTAKES: u16 = 128;
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Claim {
     owner: Option<Heartbeat>,
-    previous: Option<u32>,
-    /// The one before that had it, and did not only claim it.
-    settled: Option<u32>,
+    /// Of the last one before it that was another cell.
+    previous: Option<Heartbeat>,
 }
 
 impl Claim {
@@ -42,11 +41,8 @@ impl Claim {
     pub fn hear(&mut self, heartbeat: &Heartbeat) -> Word {
         let word = self.word(heartbeat);
         if !matches!(word, Word::Overtaken | Word::Claimant) {
-            let was_settled = self.is_settled();
-            let before = self.owner.replace(*heartbeat).map(|owner| owner.serial);
-            let before = before.filter(|&serial| serial != heartbeat.serial);
-            self.previous = before.or(self.previous);
-            self.settled = before.filter(|_| was_settled).or(self.settled);
+            let before = self.owner.replace(*heartbeat);
+            self.previous = before.filter(|owner| owner.serial != heartbeat.serial).or(self.previous);
         }
         word
     }
@@ -60,7 +56,7 @@ impl Claim {
         if owner.serial != heartbeat.serial {
             return match (self.is_settled(), claims) {
                 (_, true) => Word::Claimant,
-                (true, false) if self.settled == Some(heartbeat.serial) => Word::Shared,
+                (true, false) if self.had_it_before(heartbeat.serial) => Word::Shared,
                 (true, false) => Word::Started { again: true },
                 // Who claimed the id did not get it.
                 (false, false) => Word::First,
@@ -89,10 +85,15 @@ impl Claim {
         self.owner.map(|owner| owner.serial)
     }
 
-    /// The serial number of the cell that had the id before that one.
+    /// The serial number of the cell that had the id before that one, or claimed it.
     #[must_use]
-    pub const fn previous(&self) -> Option<u32> {
-        self.previous
+    pub fn previous(&self) -> Option<u32> {
+        self.previous.map(|owner| owner.serial)
+    }
+
+    /// Whether this cell had the id before the one that has it, and did not only claim it.
+    fn had_it_before(&self, serial: u32) -> bool {
+        self.previous.is_some_and(|owner| owner.serial == serial && !owner.state.has(State::CLAIMING))
     }
 
     /// Whether that cell says that something is so.
