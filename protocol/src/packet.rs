@@ -139,14 +139,23 @@ impl Packet {
     /// The sixteen bytes.
     #[must_use]
     pub fn encode(&self) -> [u8; BYTES] {
+        let mut bytes = self.without_crc();
+        if let ([words @ .., end, crc], _) = bytes.as_chunks_mut::<2>() {
+            *crc = checksum(self.id, words, *end).to_le_bytes();
+        }
+        bytes
+    }
+
+    /// The sixteen bytes with zeros for the CRC: for whoever reads its fields and sends nothing.
+    #[must_use]
+    pub fn without_crc(&self) -> [u8; BYTES] {
         let mut bytes = [0; BYTES];
         let (words, tail) = bytes.as_chunks_mut::<2>().0.split_at_mut(WORDS);
         for (bytes, word) in words.iter_mut().zip(self.words) {
             *bytes = word.to_le_bytes();
         }
-        if let [end, crc] = tail {
+        if let [end, _] = tail {
             *end = [self.epoch.0, self.count];
-            *crc = checksum(self.id, words, *end).to_le_bytes();
         }
         bytes
     }

@@ -343,7 +343,7 @@ impl Lane {
     }
 
     fn message(&mut self, nanos: u64, message: &Message) {
-        let id = message.encode().id;
+        let id = message.id();
         if let Some(count) =
             NAMES.iter().position(|it| *it == id.name()).and_then(|at| self.kinds.get_mut(at))
         {

@@ -72,7 +72,7 @@ impl Listing {
 
     /// Takes a message, which came in frames of this format.
     pub fn hear(&mut self, now: Micros, format: Format, message: &Message) {
-        let Some(from) = message.encode().id.sender() else {
+        let Some(from) = message.sender() else {
             self.gateway |= matches!(message, Message::Joints { .. } | Message::Network { .. });
             return;
         };

@@ -304,42 +304,30 @@ impl Message {
     /// The packet that says this.
     #[must_use]
     pub fn encode(&self) -> Packet {
-        let cell = |kind, from: CellId| Id::new(kind, Node::Cell(from));
-        let bare =
-            |command| Packet { id: Id::command(command), words: [0; WORDS], epoch: Epoch(0), count: 0 };
+        let packet = |words, epoch, count| Packet { id: self.id(), words, epoch, count };
         match *self {
-            Self::Halt => bare(Command::Halt),
-            Self::Sync => bare(Command::Sync),
-            Self::Resume => bare(Command::Resume),
-            Self::Report => bare(Command::Report),
-            Self::Joints { epoch, joints } => Packet {
-                words: joints.positions.map(Q1_14::to_bits),
-                epoch,
-                count: joints.in_use,
-                ..bare(Command::Joints)
-            },
-            Self::Sum { from, epoch, torque, count } => {
-                Packet { id: cell(Kind::Sum, from), words: torque.map(Q7_8::to_bits), epoch, count }
+            Self::Halt | Self::Sync | Self::Resume | Self::Report => packet([0; WORDS], Epoch(0), 0),
+            Self::Joints { epoch, joints } => {
+                packet(joints.positions.map(Q1_14::to_bits), epoch, joints.in_use)
             }
-            Self::Torque { from, epoch, torque } => {
-                Packet { id: cell(Kind::Torque, from), words: torque.map(Q3_12::to_bits), epoch, count: 1 }
-            }
-            Self::Sensors { from, epoch, page } => {
+            Self::Sum { epoch, torque, count, .. } => packet(torque.map(Q7_8::to_bits), epoch, count),
+            Self::Torque { epoch, torque, .. } => packet(torque.map(Q3_12::to_bits), epoch, 1),
+            Self::Sensors { epoch, page, .. } => {
                 let (count, words) = page.encode();
-                Packet { id: cell(Kind::Sensors, from), words, epoch, count }
+                packet(words, epoch, count)
             }
-            Self::Network { from, epoch, page } => {
+            Self::Network { epoch, page, .. } => {
                 let (count, words) = page.encode();
-                Packet { id: Id::new(Kind::Network, from), words, epoch, count }
+                packet(words, epoch, count)
             }
-            Self::Configure { to, tag, request } => {
+            Self::Configure { tag, request, .. } => {
                 let (count, words) = match request {
                     Request::Read { number } => (number & !WRITE, [0; WORDS]),
                     Request::Write { number, words } => (number | WRITE, words),
                 };
-                Packet { id: Id::new(Kind::Configure, to), words, epoch: Epoch(tag), count }
+                packet(words, Epoch(tag), count)
             }
-            Self::Configured { from, tag, answer } => {
+            Self::Configured { tag, answer, .. } => {
                 let (count, words) = match answer {
                     Answer::Value { number, written, words } => {
                         (number | if written { WRITE } else { 0 }, words)
@@ -348,15 +336,15 @@ impl Message {
                         (REFUSED, packet::words([i16::from(number), reason]))
                     }
                 };
-                Packet { id: cell(Kind::Configured, from), words, epoch: Epoch(tag), count }
+                packet(words, Epoch(tag), count)
             }
-            Self::Stimulus { to, from, page } => {
+            Self::Stimulus { from, page, .. } => {
                 let (page, words) = page.encode();
                 let (epoch, flag) = match from {
                     From::Epoch(epoch) => (epoch, 0),
                     From::Next => (Epoch(0), FROM_THE_NEXT),
                 };
-                Packet { id: Id::new(Kind::Stimulus, to), words, epoch, count: page | flag }
+                packet(words, epoch, page | flag)
             }
         }
     }
@@ -366,7 +354,21 @@ impl Message {
     /// The identifier under which it is sent.
     #[must_use]
     pub fn id(&self) -> Id {
-        self.encode().id
+        let cell = |kind, from| Id::new(kind, Node::Cell(from));
+        match *self {
+            Self::Halt => Id::command(Command::Halt),
+            Self::Joints { .. } => Id::command(Command::Joints),
+            Self::Sync => Id::command(Command::Sync),
+            Self::Resume => Id::command(Command::Resume),
+            Self::Report => Id::command(Command::Report),
+            Self::Sum { from, .. } => cell(Kind::Sum, from),
+            Self::Torque { from, .. } => cell(Kind::Torque, from),
+            Self::Sensors { from, .. } => cell(Kind::Sensors, from),
+            Self::Network { from, .. } => Id::new(Kind::Network, from),
+            Self::Configure { to, .. } => Id::new(Kind::Configure, to),
+            Self::Configured { from, .. } => cell(Kind::Configured, from),
+            Self::Stimulus { to, .. } => Id::new(Kind::Stimulus, to),
+        }
     }
 
     /// The cell that sends it; `None` when the gateway's side does.
@@ -429,8 +431,13 @@ impl Message {
 
     /// The words of a torque or a sum.
     fn torque_words(&self) -> Option<[i16; WORDS]> {
-        let Packet { id, words, .. } = self.encode();
-        matches!(id.kind, Kind::Torque | Kind::Sum).then_some(words)
+        if let Self::Torque { torque, .. } = self {
+            Some(torque.map(Q3_12::to_bits))
+        } else if let Self::Sum { torque, .. } = self {
+            Some(torque.map(Q7_8::to_bits))
+        } else {
+            None
+        }
     }
 }
 

@@ -253,7 +253,7 @@ impl Line<'_> {
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
-        self.values = (!is_bare).then(|| Values { lane: None, end, layout, bytes: packet.encode() });
+        self.values = (!is_bare).then(|| Values { lane: None, end, layout, bytes: packet.without_crc() });
     }
 }
 

@@ -52,7 +52,7 @@ impl Display for Meaning<'_> {
         let Some(schema) = PacketSchema::of(packet.id).filter(|schema| !schema.text.is_empty()) else {
             return Ok(());
         };
-        let (layout, bytes) = (schema::layout(self.0, &packet), packet.encode());
+        let (layout, bytes) = (schema::layout(self.0, &packet), packet.without_crc());
         f.write_str(" ")?;
         fill(f, &schema.text, u16::from(packet.count), &bytes, &|f, name| match name {
             "" => say(f, layout, &bytes).map(|()| None),
