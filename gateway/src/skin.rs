@@ -125,10 +125,7 @@ fn describe(skin: &Description) -> String {
         or(every, ""),
     );
     for (index, bus) in buses.iter().enumerate() {
-        let format = match bus.format {
-            Format::Fd => "fd",
-            Format::Classic => "classic",
-        };
+        let format = bus.format.name();
         let reply = match bus.reply {
             Reply::Torque => "torque".to_owned(),
             Reply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),

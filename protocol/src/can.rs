@@ -57,6 +57,15 @@ pub enum Format {
 }
 
 impl Format {
+    /// What descriptions and options call it: `classic` or `fd`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Classic => "classic",
+            Self::Fd => "fd",
+        }
+    }
+
     /// How many data bytes a frame has at most: 8 or 64.
     #[must_use]
     pub const fn max_len(self) -> usize {

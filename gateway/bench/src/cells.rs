@@ -12,6 +12,7 @@ use protocol::message::Message;
 use protocol::time::Micros;
 
 use crate::listen::{self, Listener, passing, send};
+use crate::setup::since;
 
 /// Cells say a heartbeat four times a second, from which their frames' format is seen.
 const FORMAT: Duration = Duration::from_millis(300);
@@ -76,7 +77,7 @@ impl Watch {
     /// The same as the time on the listing's clock.
     #[must_use]
     pub fn now(&self) -> Micros {
-        Micros(u64::try_from(self.elapsed().as_micros()).unwrap_or(u64::MAX))
+        since(self.began)
     }
 
     /// Asks for everything, once it is known in which frames; again and again if wanted.

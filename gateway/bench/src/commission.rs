@@ -15,6 +15,7 @@ use protocol::time::Micros;
 
 use crate::listen::{self, Listener, passing, send};
 use crate::run::roots::Roots;
+use crate::setup::since;
 
 /// How long a signal to end may wait, when nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
@@ -115,7 +116,7 @@ impl Bench {
         };
         let room = self.listener.bus().receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
         let began = Instant::now();
-        let clock = || Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX));
+        let clock = || since(began);
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
         let lost = self.converse(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {

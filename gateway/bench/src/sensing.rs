@@ -10,10 +10,11 @@ use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::parameters::{Parameter, Sensing};
-use protocol::time::{Micros, Span};
+use protocol::time::Span;
 use thiserror::Error;
 
 use crate::listen::{self, Listener, send};
+use crate::setup::since;
 
 /// So long cells show that they are there: two heartbeats and some.
 const LISTEN: Duration = Duration::from_millis(600);
@@ -85,9 +86,8 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     };
     tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
-    let clock = || Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX));
     let mut told = Repeats::new(AGAIN);
-    told.said_to_all(clock());
+    told.said_to_all(since(began));
     while began.elapsed() < PATIENCE && !answers.are_complete(began.elapsed() >= LISTEN) {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
@@ -95,7 +95,7 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
                 answers.take(&message);
             }
         }
-        for cell in told.due(clock(), answers.missing()) {
+        for cell in told.due(since(began), answers.missing()) {
             tell(listener.bus(), Node::Cell(cell))?;
         }
     }
@@ -151,10 +151,10 @@ impl Answers {
         if self.confirmed.is_empty() && self.refused.is_empty() {
             let who = self.only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
             let other = match format {
-                Format::Fd => "classic",
-                Format::Classic => "fd",
+                Format::Fd => Format::Classic,
+                Format::Classic => Format::Fd,
             };
-            return Err(SensingError::Nobody { who, bus, other });
+            return Err(SensingError::Nobody { who, bus, other: other.name() });
         }
         if let Some((_, &reason)) = self.refused.iter().next() {
             return Err(SensingError::Refused { cells: names(self.refused.keys()), bus, reason });

@@ -20,7 +20,7 @@ use crate::run::launch::{LISTEN, Plan, Processes, ServedBus, in_memory, open_or_
 use crate::run::roots::{Ears, Roots};
 use crate::setup::names;
 use model::decode::Decoded;
-use trace::capture::Extras;
+use trace::capture::{Extras, SKIN};
 
 /// How often it is looked.
 const LOOK: Duration = Duration::from_millis(5);
@@ -128,7 +128,7 @@ pub(super) fn wearing(
     let mut wearing = if let Some(path) = &spawn.skin {
         Wearing { skin: Skin::read(path)?, file: path.clone(), _memory: None }
     } else {
-        let attached = extras.attachments.iter().find(|(name, _)| name == "skin.toml");
+        let attached = extras.attachments.iter().find(|(name, _)| name == SKIN);
         let Some((_, bytes)) = attached else {
             return Err(ReplayError::NoSkin(file.to_owned()));
         };
@@ -154,8 +154,7 @@ pub(super) fn wearing(
 
 /// The skin that a recording has, if it has one that can be read.
 pub(super) fn recorded_skin(extras: &Extras) -> Option<Skin> {
-    let (_, bytes) = extras.attachments.iter().find(|(name, _)| name == "skin.toml")?;
-    Skin::parse("skin.toml", &String::from_utf8_lossy(bytes)).ok()
+    extras.skin()?.ok()
 }
 
 /// Opens all buses. What is `recorded` is the skin of the cells that are there already, if it is known.

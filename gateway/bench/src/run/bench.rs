@@ -20,7 +20,7 @@ use super::link::{Link, Slot, may_return};
 use super::network::Network;
 use super::receiver::{Left, News};
 use crate::record::Recorder;
-use crate::setup::names;
+use crate::setup::{names, since};
 use crate::view::{CellView, View};
 use control::cycle::Cycle;
 use control::cycle::turn::{Line, Shared, Timed};
@@ -91,7 +91,7 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// The time since it began.
     pub(super) fn now(&self) -> Micros {
-        Micros(u64::try_from(self.began.elapsed().as_micros()).unwrap_or(u64::MAX))
+        since(self.began)
     }
 
     /// The name of a bus of the skin.

@@ -65,15 +65,16 @@ impl Bench<'_> {
     /// Lets late replies come in, and asks all cells for their counters and a last heartbeat.
     pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
         thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
-        self.wait_until(|bench| bench.has_caught_up())?;
+        self.wait_until(Self::has_caught_up);
         self.say(&Message::Report)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters))?;
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters));
         if interrupted {
             self.say(&Message::Halt)?;
         }
         // Last of all, so that each cell's own count covers everything else that it has sent.
         self.say(&Message::Sync)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat))
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
+        Ok(())
     }
 
     /// Whether the receivers have read everything that was sent; what came before it they have read too. Of a bus
@@ -94,12 +95,11 @@ impl Bench<'_> {
     }
 
     /// Waits for something, but not for ever; what is missing then shows in the accounts.
-    fn wait_until(&self, done: impl Fn(&Self) -> bool) -> Result<(), RunError> {
+    fn wait_until(&self, done: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + LAST_WORDS;
         while !done(self) && Instant::now() < give_up {
             thread::sleep(LOOK);
         }
-        Ok(())
     }
 
     /// Lets the receivers end and takes what they leave.

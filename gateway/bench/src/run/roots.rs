@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use crate::setup::since;
 use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
@@ -102,7 +103,7 @@ impl Roots {
     }
 
     fn now(&self) -> Micros {
-        Micros(u64::try_from(self.began.elapsed().as_micros()).unwrap_or(u64::MAX))
+        since(self.began)
     }
 
     /// Takes a frame that came from the bus; whether it was one of a wire, which nobody else is to see.

@@ -170,10 +170,7 @@ fn head(options: &Options, mcap: &Mcap, lanes: &[Lane], idle: &Histogram<u64>) -
         ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
     ];
     run.extend(lanes.iter().map(|Lane { link, format, .. }| {
-        let format = match format {
-            Format::Fd => "fd",
-            Format::Classic => "classic",
-        };
+        let format = format.name();
         let how = format!("{}, {format}, receive buffer {} bytes", link.kind, link.receive_buffer);
         (format!("bus/{}", link.name), how)
     }));

@@ -26,10 +26,7 @@ pub(super) fn toml(wanted: &Wanted, arm: &Covered) -> String {
     let joints = arm.joints.map(|DenavitHartenberg { a, alpha, d, theta_offset }| {
         format!("  {{ a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {theta_offset:?} }},\n")
     });
-    let format = match format {
-        Format::Fd => "fd",
-        Format::Classic => "classic",
-    };
+    let format = format.name();
     let places = || arm.buses.iter().enumerate();
     let buses = places().map(|(bus, places)| {
         let reply = match reply {
