@@ -47,7 +47,8 @@ pub(crate) fn spawn<T: Send + 'static>(
     name: &str,
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<JoinHandle<T>, RunError> {
-    thread::Builder::new().name(name.to_owned()).spawn(work).map_err(RunError::Thread)
+    let named = thread::Builder::new().name(name.to_owned());
+    named.spawn(work).map_err(|source| RunError::Thread { name: name.to_owned(), source })
 }
 
 /// The time since then.

@@ -61,8 +61,13 @@ pub enum RunError {
     #[error("interrupted while starting")]
     Interrupted,
     /// The system gives no thread.
-    #[error("cannot start a thread: {0}")]
-    Thread(#[source] std::io::Error),
+    #[error("cannot start the thread {name}: {source}")]
+    Thread {
+        /// What it is for.
+        name: String,
+        /// Why not.
+        source: std::io::Error,
+    },
     /// The system gives no file in memory.
     #[error("a file in memory: {0}")]
     Memory(#[source] std::io::Error),
@@ -150,7 +155,7 @@ impl RunError {
             | Self::RealWires(_) => 2,
             Self::Signal(_)
             | Self::Interrupted
-            | Self::Thread(_)
+            | Self::Thread { .. }
             | Self::Memory(_)
             | Self::Lost(_)
             | Self::Rival(_)
