@@ -47,7 +47,7 @@ fn campaign(skin: &Skin, seed: u64, breaks: impl Fn(&mut Bench, &mut Pcg64Mcg)) 
 }
 
 fn uplink(bench: &Bench) -> Uplink {
-    Uplink::total(bench.gateway.table.cells().iter().map(|cell| cell.uplink()))
+    bench.gateway.table.uplink()
 }
 
 fn some_fault(dice: &mut Pcg64Mcg) -> Fault {

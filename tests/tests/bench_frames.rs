@@ -32,7 +32,7 @@ fn replies(bench: &Bench) -> Replies {
 }
 
 fn uplink(bench: &Bench) -> Uplink {
-    Uplink::total(bench.gateway.table.cells().iter().map(|cell| cell.uplink()))
+    bench.gateway.table.uplink()
 }
 
 fn events(bench: &Bench, event: Event) -> u64 {

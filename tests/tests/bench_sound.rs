@@ -19,7 +19,7 @@ const PROMISED_NM: f64 = 1.2e-4;
 
 fn totals(bench: &Bench) -> (Uplink, Replies) {
     let cells = || bench.gateway.table.cells().iter();
-    (Uplink::total(cells().map(|cell| cell.uplink())), Replies::total(cells().map(|cell| cell.replies)))
+    (cells().map(|cell| cell.uplink()).sum(), Replies::total(cells().map(|cell| cell.replies)))
 }
 
 /// Nothing is lost, late, unknown, repeated, or odd in any way.

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 pub use self::outcome::{Halted, Outcome, TickBefore};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Contributions, Event, Replies, Status, SumCounts, Table, Uplink};
+use model::table::{Accuracy, Contributions, Event, Replies, Status, SumCounts, Table};
 pub use trace::recording::account::{Recording, Written};
 
 mod outcome;
@@ -399,7 +399,7 @@ fn sensors(table: &Table) -> SensorsSummary {
 }
 
 fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
-    let total = Uplink::total(table.cells().iter().map(|cell| cell.uplink()));
+    let total = table.uplink();
     let unexplained = total.lost - total.outage;
     let dropped = unexplained.min(dropped_by_bus);
     UplinkSummary {

@@ -207,6 +207,12 @@ impl Table {
         &self.snapshot
     }
 
+    /// Packets of all cells, sent and arrived.
+    #[must_use]
+    pub fn uplink(&self) -> Uplink {
+        self.cells.iter().map(Cell::uplink).sum()
+    }
+
     /// The bus' cells, in the skin's order.
     #[must_use]
     pub fn cells(&self) -> &[Cell] {

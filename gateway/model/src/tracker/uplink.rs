@@ -28,14 +28,6 @@ pub struct Uplink {
     pub unsettled: u64,
 }
 
-impl Uplink {
-    /// The account of several cells together.
-    #[must_use]
-    pub fn total(all: impl Iterator<Item = Self>) -> Self {
-        all.sum()
-    }
-}
-
 /// Works out a cell's [`Uplink`].
 ///
 /// A heartbeat says how many packets the cell sent before it. A bus keeps each sender's order, so what

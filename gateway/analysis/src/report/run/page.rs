@@ -127,9 +127,7 @@ impl Draft<'_> {
             findings.push(none(what, due - in_time));
         }
         findings.extend(self.fits());
-        let uplink = Uplink::total(
-            self.run.lanes.iter().flat_map(|lane| lane.table.cells()).map(|cell| cell.uplink()),
-        );
+        let uplink: Uplink = self.run.lanes.iter().map(|lane| lane.table.uplink()).sum();
         findings.push(none("packets of cells lost, by their own count".to_owned(), uplink.lost));
         Section::new("summary", "In numbers").findings(findings).text(
             "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \

@@ -8,7 +8,7 @@ use crate::report::svg::stairs;
 use crate::report::thin::{Binned, Thinned};
 use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
-use model::table::{Cell, Event, Uplink};
+use model::table::{Cell, Event};
 
 /// Cells in the table of the worst.
 const WORST: usize = 12;
@@ -210,7 +210,7 @@ impl Draft<'_> {
         row("ticks whose velocity was not finite".to_owned(), ticks.refused, false);
         for lane in &run.lanes {
             let name = &lane.name;
-            let uplink = Uplink::total(lane.table.cells().iter().map(|cell| cell.uplink()));
+            let uplink = lane.table.uplink();
             row(format!("{name}: frames recorded"), lane.frames, true);
             row(
                 format!("{name}: frames that are not in the recording, by its own notes"),
