@@ -1,6 +1,6 @@
 //! Instructions of one Jacobian and of the sines: `cargo bench -p cell-node --bench instructions`
 //!
-//! Counted by valgrind, so that they are the same on a busy machine. `docs/benchmarks.md` says what has to be installed.
+//! Counted by valgrind, so that they are the same on a busy machine. `docs/explanation/benchmarks.md` says what has to be installed.
 
 #![expect(missing_docs, unused_qualifications, reason = "gungraun's macros write them")]
 

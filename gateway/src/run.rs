@@ -41,7 +41,7 @@ struct Common {
     /// End after so many seconds; else after the scenario's duration
     #[arg(long, value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// Write the figures of the end as JSON, also when the run fails; docs/summary.md explains its keys
+    /// Write the figures of the end as JSON, also when the run fails; docs/reference/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
@@ -56,7 +56,7 @@ struct Common {
 /// What is recorded beside frames as text.
 #[derive(Args, Debug)]
 struct Recording {
-    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/recording.md has the topics
+    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/how-to/record.md has the topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
     /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice

@@ -32,7 +32,7 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 /// log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, through a model of a bus with bit rates:
 /// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the moment at
 /// which it was to be sent. What only a bench sends is left out, start-up stands apart, and where the skin is known (attached
-/// to a recording, or --skin) its worst case stands beside the run. docs/bus.md says what the figures mean and what the model
+/// to a recording, or --skin) its worst case stands beside the run. docs/how-to/size-a-bus.md says what the figures mean and what the model
 /// leaves out.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:

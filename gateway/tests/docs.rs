@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use model::scenario::Scenario;
 use protocol::skin::{ControllerKind, Skin};
 
-const SKIN_MD: &str = include_str!("../../docs/skin.md");
-const CONTROLLER_MD: &str = include_str!("../../docs/external-controller.md");
+const SKIN_MD: &str = include_str!("../../docs/reference/skin.md");
+const CONTROLLER_MD: &str = include_str!("../../docs/how-to/external-controller.md");
 
 /// The fenced block of TOML that has this text.
 fn block<'a>(document: &'a str, with: &str) -> &'a str {
@@ -142,13 +142,28 @@ fn anchor(heading: &str) -> String {
     kept.collect::<String>().to_lowercase().replace(' ', "-")
 }
 
+/// Every document of the project.
+fn pages(folder: &Path) -> Vec<PathBuf> {
+    let mut pages = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy();
+        if path.is_dir() && !name.starts_with('.') && name != "target" {
+            pages.extend(self::pages(&path));
+        } else if name.ends_with(".md") {
+            pages.push(path);
+        }
+    }
+    pages
+}
+
 #[test]
 fn links_between_documents_lead_somewhere() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    let mut pages: Vec<PathBuf> = ["README.md", "CHANGELOG.md"].map(|name| root.join(name)).into();
-    pages.extend(std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path()));
+    let pages = pages(root);
+    assert!(pages.len() > 15, "{pages:?}");
     let text = |path: &Path| std::fs::read_to_string(path).unwrap_or_default();
-    for page in pages.iter().filter(|page| page.extension().is_some_and(|end| end == "md")) {
+    for page in &pages {
         let content = text(page);
         for link in content.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
             if link.starts_with("https://") {

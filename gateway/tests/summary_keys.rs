@@ -1,4 +1,4 @@
-//! `docs/summary.md` names every key that a summary has, and no other, and its sums are right.
+//! `docs/reference/summary.md` names every key that a summary has, and no other, and its sums are right.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -18,13 +18,13 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde_json::Value;
 
-const SUMMARY_MD: &str = include_str!("../../docs/summary.md");
-const SKIN_MD: &str = include_str!("../../docs/skin.md");
+const SUMMARY_MD: &str = include_str!("../../docs/reference/summary.md");
+const SKIN_MD: &str = include_str!("../../docs/reference/skin.md");
 
-/// The two cells of `docs/skin.md`.
+/// The two cells of `docs/reference/skin.md`.
 fn skin() -> Skin {
     let text = SKIN_MD.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
-    Skin::parse("docs/skin.md", text).unwrap()
+    Skin::parse("docs/reference/skin.md", text).unwrap()
 }
 
 /// A run of which everything is known that may be unknown.

@@ -1,4 +1,4 @@
-//! The tables of `docs/protocol.md` that list fields come from the schema.
+//! The tables of `docs/reference/protocol.md` that list fields come from the schema.
 //!
 //! Each one stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test writes them
 //! instead of comparing.
@@ -12,7 +12,7 @@ use protocol::message::State;
 use protocol::parameters::Parameter;
 use protocol::schema::{Field, Format, Layout, PacketSchema, Range, packets, reasons, wires};
 
-const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/protocol.md");
+const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/protocol.md");
 
 /// Every table by its name.
 fn tables() -> [(&'static str, String); 4] {

@@ -292,7 +292,7 @@ fn the_documents_torque_comes_out() {
     assert!(lines(SESSION).iter().any(|golden| golden.text == wanted), "{wanted}");
 }
 
-const PROTOCOL_MD: &str = include_str!("../../docs/protocol.md");
+const PROTOCOL_MD: &str = include_str!("../../docs/reference/protocol.md");
 
 fn frames_of_the_document() -> Vec<Frame> {
     let tokens = PROTOCOL_MD.split(|c: char| c.is_whitespace() || c == '`');

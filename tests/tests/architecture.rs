@@ -1,4 +1,4 @@
-//! Which crate may use which: the arrows of `docs/architecture.md`.
+//! Which crate may use which: the arrows of `docs/explanation/architecture.md`.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 

@@ -52,7 +52,7 @@ pub enum SensingError {
         other: &'static str,
     },
     /// Some do not want to.
-    #[error("{cells} on {bus} refused with reason {reason}: docs/protocol.md says what it means")]
+    #[error("{cells} on {bus} refused with reason {reason}: docs/reference/protocol.md says what it means")]
     Refused {
         /// Those, in words.
         cells: String,
@@ -237,7 +237,7 @@ mod tests {
         let mut answers = Answers::default();
         let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
         answers.take(&Message::Configured { from: cell(9), tag: TAG, answer });
-        let why = "cell 9 on vcan0 refused with reason 18: docs/protocol.md says what it means";
+        let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md says what it means";
         assert_eq!(verdict(&answers), Err(why.to_owned()));
     }
 }

@@ -1,6 +1,6 @@
 //! What a run came to: the figures of the table at its end, and of `--summary`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/summary.md` says what they mean.
+//! The keys of the JSON are the names of the fields here; `docs/reference/summary.md` says what they mean.
 
 use std::collections::BTreeMap;
 

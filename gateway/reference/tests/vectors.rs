@@ -81,7 +81,7 @@ fn torques() -> Vec<Value> {
 
 /// The file: an array's elements are a line each.
 fn file() -> String {
-    let about = "Frames as candump and cansend write them; docs/protocol.md says what they mean. torques: all numbers are \
+    let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean. torques: all numbers are \
                  words as they stand in packets: parameters 1, 16 to 21, 2, 3, joints, sensors page 0, and what the cell \
                  answers; its jacobian may differ by a step or two of 2^-14, and its torque accordingly.";
     let parts = [

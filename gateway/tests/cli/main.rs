@@ -14,7 +14,7 @@ use protocol::packet::{Half, Packet, Paired, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
-const DOCUMENT: &str = include_str!("../../../docs/protocol.md");
+const DOCUMENT: &str = include_str!("../../../docs/reference/protocol.md");
 const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
 
 fn gateway(arguments: &str) -> Command {

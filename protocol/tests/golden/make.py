@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes the golden frames of this folder. Needs nothing but Python's standard library.
 
-This is a second implementation of docs/protocol.md, made from the document and not from the Rust
+This is a second implementation of docs/reference/protocol.md, made from the document and not from the Rust
 code, and it shares nothing with it: when the two disagree, one of them, or the document, is wrong.
 Never "fix" a line of a log by copying what the Rust code prints.
 
@@ -19,7 +19,7 @@ in the units of the document (quarter turns, Nm, N, g, degrees Celsius, m), as e
     session.log     a cell is configured, hears joints, is pressed and answers
     refusals.log    writes that a commit refuses, and the refusal
     wire.log        what cells say over the wires between them: bytes <-> meaning, and what is refused
-    document.log    the frames spelled out in docs/protocol.md
+    document.log    the frames spelled out in docs/reference/protocol.md
 """
 
 import math
@@ -1034,7 +1034,7 @@ def wire():
 
 
 def document():
-    log = Log("document.log", "The frames that docs/protocol.md spells out; it must hold each of them.")
+    log = Log("document.log", "The frames that docs/reference/protocol.md spells out; it must hold each of them.")
     value_of = configuration_hash(PARAMETERS)
     log.title("the worked example of the CRC, as one frame")
     log.put(torque(12, 7, [4096, -2048, 1, 0, 0, 0]))
