@@ -6,15 +6,15 @@
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "it prints, and stops where it cannot")]
 
-use cell_node::kernel::witness::Counted;
+use cell_node::kernel::oracle::Counted;
 use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Scalar, Word, Wrench};
 use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
 use protocol::fixed::{Q1_14, Q3_12};
 
-#[path = "../tests/witness/mod.rs"]
-mod witness;
+#[path = "../tests/oracle/mod.rs"]
+mod oracle;
 
-use witness::{Case, Errors};
+use oracle::{Case, Errors};
 
 fn main() {
     println!("Sine over all 65 536 angles (Q1.14; rounding alone: mean 1.52e-5)\n");
@@ -44,21 +44,21 @@ fn main() {
     torques("either, real numbers, from the same words", Errors::of(real));
     let rounded = Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64()));
     torques("the same, rounded to Q3.12", rounded);
-    let (poses, Errors { torques, left_out, .. }) = (Case::all().len(), wrench);
-    println!("\n{torques} torques in {poses} poses; {left_out} poses left out, beyond Q3.12");
+    let (poses, Errors { torques, omitted, .. }) = (Case::all().len(), wrench);
+    println!("\n{torques} torques in {poses} poses; {omitted} poses left out, beyond Q3.12");
 }
 
 fn of_kernel<W: Word + Scalar, K: Kernel<W>>() -> Errors {
     Errors::of_words(|parameters, joints| K::new(parameters).jacobian(joints).map(W::to_word))
 }
 
-fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, witness: impl Fn(f64) -> f64) {
+fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, oracle: impl Fn(f64) -> f64) {
     let errors = (i16::MIN..=i16::MAX).map(|bits| {
         let angle = Q1_14::from_bits(bits);
-        (function(angle).to_f64() - witness(angle.to_radians())).abs()
+        (function(angle).to_f64() - oracle(angle.to_radians())).abs()
     });
-    let (sum, greatest) = errors.fold((0.0, 0.0_f64), |(sum, most), error| (sum + error, most.max(error)));
-    println!("| {name} | {:.2e} | {greatest:.2e} |", sum / 65_536.0);
+    let (sum, max) = errors.fold((0.0, 0.0_f64), |(sum, most), error| (sum + error, most.max(error)));
+    println!("| {name} | {:.2e} | {max:.2e} |", sum / 65_536.0);
 }
 
 fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
@@ -73,6 +73,6 @@ fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
     );
 }
 
-fn torques(name: &str, Errors { mean, greatest, .. }: Errors) {
-    println!("| {name} | {mean:.2e} | {greatest:.2e} |");
+fn torques(name: &str, Errors { mean, max, .. }: Errors) {
+    println!("| {name} | {mean:.2e} | {max:.2e} |");
 }

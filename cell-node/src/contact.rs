@@ -189,11 +189,11 @@ mod tests {
             let touch = none_below(contact.map(Q5_10::to_f64).iter().sum(), rule.contact_threshold.to_f64());
             let near = none_below(proximity.to_f64(), rule.proximity_threshold.to_f64());
             let fused = rule.alpha_c.to_f64() * touch + rule.alpha_p.to_f64() * near; // exact in f64
-            let wanted = none_below(fused, rule.force_threshold.to_f64());
+            let target = none_below(fused, rule.force_threshold.to_f64());
 
             let force = Force::fuse(contact, proximity, &rule);
-            prop_assert!((force.to_f64() - wanted).abs() <= 1.0 / 131_072.0);
-            prop_assert!(force.is_active() == (wanted >= 1.0 / 131_072.0));
+            prop_assert!((force.to_f64() - target).abs() <= 1.0 / 131_072.0);
+            prop_assert!(force.is_active() == (target >= 1.0 / 131_072.0));
         }
 
         #[test]
@@ -208,9 +208,9 @@ mod tests {
                 proximity_threshold: Q1_14::from_bits(p),
                 force_threshold: Q5_10::from_bits(z),
             };
-            let felt = Force::fuse(contact.map(Q5_10::from_bits), Q1_14::from_bits(proximity), &rule);
+            let sensed = Force::fuse(contact.map(Q5_10::from_bits), Q1_14::from_bits(proximity), &rule);
             let jacobian = jacobian.map(Q1_14::from_bits);
-            for force in [felt, Force::from_steps(steps)] {
+            for force in [sensed, Force::from_steps(steps)] {
                 prop_assert!(force.steps() >= 0);
                 let torque = Torque::new(&jacobian, force);
                 for ((row, exact), word) in jacobian.iter().zip(torque.exact()).zip(torque.words()) {

@@ -1,10 +1,10 @@
 //! The shell around the cells of a process: clock, bus, flash files. It decides nothing.
 
 mod clock;
-mod ears;
 mod flash_file;
 mod line;
 mod sockets;
+mod subscriptions;
 
 use std::time::Duration;
 
@@ -13,14 +13,14 @@ use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Kind};
 use protocol::packet;
 use protocol::time::Micros;
-use protocol::wire::{Lane, PORTS};
+use protocol::wire::{LinkId, PORTS};
 
 use crate::flash::Flash;
 use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
-use ears::Ears;
 use sockets::Hearing;
+use subscriptions::Subscriptions;
 
 pub use flash_file::FlashFile;
 pub use line::Line;
@@ -32,15 +32,15 @@ const AGAIN: Duration = Duration::from_millis(100);
 const DOWN: Duration = Duration::from_millis(100);
 
 /// Lanes of a cell by port, those it sends on; the last one leads to the gateway's side.
-pub type Lanes = [Option<Lane>; PORTS + 1];
+pub type LinkIds = [Option<LinkId>; PORTS + 1];
 
 /// Some cells that share a process and a socket.
 #[derive(Debug)]
 pub struct Cells {
-    cells: Vec<Seat>,
+    cells: Vec<HostedCell>,
     format: Format,
     clock: Clock,
-    ears: Ears,
+    subscriptions: Subscriptions,
     /// What somebody hears may have changed since the filters were set.
     hears_changed: bool,
     /// What waits in the socket has been heard since a timer was due.
@@ -51,10 +51,10 @@ pub struct Cells {
 
 /// One cell and what is its own.
 #[derive(Debug)]
-struct Seat {
+struct HostedCell {
     node: Node,
     file: FlashFile,
-    lanes: Lanes,
+    link_ids: LinkIds,
 }
 
 /// Why cells stop.
@@ -95,7 +95,7 @@ impl Cells {
             cells: Vec::new(),
             format,
             clock: Clock::new(),
-            ears: Ears::default(),
+            subscriptions: Subscriptions::default(),
             hears_changed: false,
             heard_first: false,
             hearing: Hearing::default(),
@@ -105,14 +105,16 @@ impl Cells {
 
     /// Starts a cell with what flash holds and the wires it has; a simulated cell has no sensors, so it obeys
     /// stimuli.
-    pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile, lanes: Lanes) {
+    pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile, link_ids: LinkIds) {
         let mut wired = 0;
-        for (port, lane) in lanes.iter().enumerate().filter_map(|(port, lane)| Some((port, (*lane)?))) {
+        for (port, link_id) in
+            link_ids.iter().enumerate().filter_map(|(port, link_id)| Some((port, (*link_id)?)))
+        {
             wired |= 1 << port;
-            self.ears.wire(lane.reversed(), self.cells.len(), port);
+            self.subscriptions.wire(link_id.reversed(), self.cells.len(), port);
         }
         let node = Node::new(identity, self.format, flash, true, self.clock.now()).with_ports(wired);
-        self.cells.push(Seat { node, file, lanes });
+        self.cells.push(HostedCell { node, file, link_ids });
         self.hears_changed = true;
     }
 
@@ -125,14 +127,14 @@ impl Cells {
     /// When it cannot be used as it is asked for.
     pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         self.listen();
-        let wired = self.cells.iter().any(|seat| seat.lanes.iter().any(Option::is_some));
+        let wired = self.cells.iter().any(|hosted_cell| hosted_cell.link_ids.iter().any(Option::is_some));
         let options = Options {
             filters: self.hearing.at_once.clone(),
             fd: self.format == Format::Fd,
             own_frames: wired && self.cells.len() > 1,
             ..Options::default()
         };
-        Sockets::open(line, &options, wired.then_some(&self.hearing.aside))
+        Sockets::open(line, &options, wired.then_some(&self.hearing.deferred))
     }
 
     /// Opens it as soon as it is there.
@@ -155,10 +157,10 @@ impl Cells {
             return None;
         }
         let cells = self.cells.iter().enumerate();
-        self.ears.listen(cells.flat_map(|(place, seat)| {
-            seat.node.hears().map(move |id| (place, id, seat.node.hears_aside(id)))
+        self.subscriptions.listen(cells.flat_map(|(place, hosted_cell)| {
+            hosted_cell.node.hears().map(move |id| (place, id, hosted_cell.node.defers(id)))
         }));
-        let hearing = self.ears.hearing();
+        let hearing = self.subscriptions.hearing();
         (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))
     }
 
@@ -191,19 +193,19 @@ impl Cells {
 
     /// Lets time pass, sends, and waits for frames.
     fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
-        let due = self.cells.iter().any(|seat| seat.node.poll_timeout() <= now);
+        let due = self.cells.iter().any(|hosted_cell| hosted_cell.node.poll_timeout() <= now);
         // What came before a timer was due is heard first, once.
         if due && !core::mem::replace(&mut self.heard_first, true) && sockets.look()? {
             return Ok(());
         }
         self.heard_first = false;
         let mut next = Micros(u64::MAX);
-        for seat in &mut self.cells {
-            if seat.node.poll_timeout() <= now {
-                seat.node.handle_timeout(now);
-                self.hears_changed |= seat.collect(self.format, &mut self.outbox);
+        for hosted_cell in &mut self.cells {
+            if hosted_cell.node.poll_timeout() <= now {
+                hosted_cell.node.handle_timeout(now);
+                self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
             }
-            next = next.min(seat.node.poll_timeout());
+            next = next.min(hosted_cell.node.poll_timeout());
         }
         self.clock.keep(now);
         // Before what is said now is answered.
@@ -224,18 +226,18 @@ impl Cells {
     /// Gives a frame to the cells that hear it, and takes at once what they say to it.
     fn take(&mut self, received: &Received, bus: &str, now: Micros) -> Result<(), Stopped> {
         let (frame, age) = (&received.frame, self.clock.age(now, received.at_nanos));
-        if let Some(lane) = Lane::from_raw_id(frame.raw_id()) {
-            if let Some((place, port)) = self.ears.of_lane(lane)
-                && let (Some(seat), Some(message)) = (self.cells.get_mut(place), lane.read(frame))
+        if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
+            if let Some((place, port)) = self.subscriptions.of_link_id(link_id)
+                && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.read(frame))
             {
-                seat.node.handle_port(now, age, port, message);
-                self.hears_changed |= seat.collect(self.format, &mut self.outbox);
+                hosted_cell.node.handle_port(now, age, port, message);
+                self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
             }
             return Ok(());
         }
         let Ok(id) = packet::data_id(frame) else {
             // Each counts what it cannot use.
-            self.cells.iter_mut().for_each(|seat| seat.node.handle_frame(now, age, frame));
+            self.cells.iter_mut().for_each(|hosted_cell| hosted_cell.node.handle_frame(now, age, frame));
             return Ok(());
         };
         // Of what the cells of this process say, the others of them hear sums only; who speaks under its own number
@@ -243,28 +245,28 @@ impl Cells {
         if received.own && id.kind != Kind::Sum {
             return Ok(());
         }
-        for &place in self.ears.of_id(id) {
-            let Some(seat) = self.cells.get_mut(place) else { continue };
-            seat.node.handle_frame(now, age, frame);
-            if let Some(serial) = seat.node.taken() {
-                let (bus, cell) = (bus.to_owned(), seat.node.identity().cell.map_or(0, CellId::get));
+        for &place in self.subscriptions.of_id(id) {
+            let Some(hosted_cell) = self.cells.get_mut(place) else { continue };
+            hosted_cell.node.handle_frame(now, age, frame);
+            if let Some(serial) = hosted_cell.node.taken() {
+                let (bus, cell) = (bus.to_owned(), hosted_cell.node.identity().cell.map_or(0, CellId::get));
                 return Err(Stopped::Taken { bus, cell, serial });
             }
-            self.hears_changed |= seat.collect(self.format, &mut self.outbox);
+            self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
         }
         Ok(())
     }
 }
 
-impl Seat {
+impl HostedCell {
     /// Writes what the cell has for flash, and takes what it has to send; whether what it hears has changed.
     fn collect(&mut self, format: Format, outbox: &mut Vec<Frame>) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());
         }
         while let Some((port, message)) = self.node.poll_port_transmit() {
-            let lane = self.lanes.get(port).copied().flatten();
-            outbox.extend(lane.map(|lane| lane.frame(message)));
+            let link_id = self.link_ids.get(port).copied().flatten();
+            outbox.extend(link_id.map(|link_id| link_id.frame(message)));
         }
         while let Some(packet) = self.node.poll_transmit() {
             outbox.extend(packet.frames(format));

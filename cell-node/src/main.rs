@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail, ensure};
 use cell_node::flash::{Flash, Kept};
 use cell_node::identity::Identity;
-use cell_node::io::{Cells, FlashFile, Lanes, Line, Sockets, Stopped};
+use cell_node::io::{Cells, FlashFile, Line, LinkIds, Sockets, Stopped};
 use clap::Parser;
 use protocol::bus::Choice;
 use protocol::id::CellId;
@@ -57,9 +57,9 @@ struct Arguments {
 }
 
 fn range(text: &str) -> Result<(u8, u8), String> {
-    let numbers =
+    let node_ids =
         text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
-    numbers
+    node_ids
         .filter(|&(first, last)| 1 <= first && first <= last && last <= CellId::MAX.get())
         .ok_or_else(|| "two numbers of 1 to 254, the lesser one first, such as 1-64".to_owned())
 }
@@ -74,7 +74,7 @@ fn main() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         // Help and version, which are asked for, are printed as they are.
-        Err(asked) if !asked.use_stderr() => asked.exit(),
+        Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) => {
             say(protocol::usage::one_line(&wrong.render().to_string()));
             return ExitCode::from(2);
@@ -176,7 +176,7 @@ fn start(
             Flash::Damaged
         }
     };
-    let lanes = wires.map_or_else(Lanes::default, |wires| wires.of_cell(cell));
-    cells.start(identity, &flash, file, lanes);
+    let link_ids = wires.map_or_else(LinkIds::default, |wires| wires.of_cell(cell));
+    cells.start(identity, &flash, file, link_ids);
     Ok(())
 }

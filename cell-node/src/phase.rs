@@ -15,6 +15,6 @@ pub(crate) const fn by_serial(period: Span, serial: u32) -> Span {
 
 /// When to speak next after what was due: what was missed in a hang is skipped, and the phase is kept.
 pub(crate) fn next(due: Micros, period: Span, now: Micros) -> Micros {
-    let missed = now.since(due).0.checked_div(period.0).unwrap_or(0);
-    due + Span((missed + 1) * period.0)
+    let skipped = now.since(due).0.checked_div(period.0).unwrap_or(0);
+    due + Span((skipped + 1) * period.0)
 }

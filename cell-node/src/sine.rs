@@ -131,28 +131,28 @@ mod tests {
     use protocol::fixed::Acc;
 
     /// Mean and greatest error over all angles.
-    fn errors(function: impl Fn(Q1_14) -> f64, witness: impl Fn(f64) -> f64) -> (f64, f64) {
+    fn errors(function: impl Fn(Q1_14) -> f64, oracle: impl Fn(f64) -> f64) -> (f64, f64) {
         let mut sum = 0.0;
-        let mut greatest = 0.0_f64;
+        let mut max = 0.0_f64;
         for bits in i16::MIN..=i16::MAX {
             let angle = Q1_14::from_bits(bits);
-            let error = (function(angle) - witness(angle.to_radians())).abs();
+            let error = (function(angle) - oracle(angle.to_radians())).abs();
             sum += error;
-            greatest = greatest.max(error);
+            max = max.max(error);
         }
-        (sum / 65_536.0, greatest)
+        (sum / 65_536.0, max)
     }
 
     #[test]
     fn the_errors_over_all_angles_are_within_what_the_table_says() {
-        for (name, (mean, greatest), bars) in [
+        for (name, (mean, max), bars) in [
             ("sine", errors(|z| sine(z).to_f64(), f64::sin), (1.6e-5, 6.2e-5)),
             ("cosine", errors(|z| cosine(z).to_f64(), f64::cos), (1.6e-5, 6.2e-5)),
             ("paper's sine", errors(|z| paper_sine(z).to_f64(), f64::sin), (1.9e-4, 4.4e-4)),
             ("paper's cosine", errors(|z| paper_cosine(z).to_f64(), f64::cos), (1.9e-4, 4.4e-4)),
         ] {
-            println!("{name}: mean {mean:.3e}, greatest {greatest:.3e}");
-            assert!(mean <= bars.0 && greatest <= bars.1, "{name}: mean {mean:e}, greatest {greatest:e}");
+            println!("{name}: mean {mean:.3e}, greatest {max:.3e}");
+            assert!(mean <= bars.0 && max <= bars.1, "{name}: mean {mean:e}, greatest {max:e}");
         }
     }
 
@@ -165,13 +165,13 @@ mod tests {
     #[test]
     fn the_quarter_turns_are_exact() {
         for function in [sine, paper_sine] {
-            for (angle, wanted) in [(0, 0), (1 << 14, 1 << 14), (-1 << 14, -1 << 14), (i16::MIN, 0)] {
-                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), wanted, "at {angle}");
+            for (angle, target) in [(0, 0), (1 << 14, 1 << 14), (-1 << 14, -1 << 14), (i16::MIN, 0)] {
+                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), target, "at {angle}");
             }
         }
         for function in [cosine, paper_cosine] {
-            for (angle, wanted) in [(0, 1 << 14), (1 << 14, 0), (-1 << 14, 0), (i16::MIN, -1 << 14)] {
-                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), wanted, "at {angle}");
+            for (angle, target) in [(0, 1 << 14), (1 << 14, 0), (-1 << 14, 0), (i16::MIN, -1 << 14)] {
+                assert_eq!(function(Q1_14::from_bits(angle)).to_bits(), target, "at {angle}");
             }
         }
     }
@@ -196,15 +196,15 @@ mod tests {
     #[test]
     fn the_fine_ones_are_exact_at_quarter_turns_and_fine_between() {
         let one = 1 << FINE;
-        for (angle, wanted) in
+        for (angle, target) in
             [(0, [0, one]), (1 << 14, [one, 0]), (-1 << 14, [-one, 0]), (i16::MIN, [0, -one])]
         {
-            assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), wanted, "at {angle}");
+            assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), target, "at {angle}");
         }
         let real = |fine: i64| Acc::<FINE>::from_steps(fine).to_f64();
-        for (index, witness) in [f64::sin, f64::cos].into_iter().enumerate() {
-            let (_, greatest) = errors(|z| real(fine_sine_cosine(z)[index]), witness);
-            assert!(greatest <= 1e-8, "{greatest:e}");
+        for (index, oracle) in [f64::sin, f64::cos].into_iter().enumerate() {
+            let (_, max) = errors(|z| real(fine_sine_cosine(z)[index]), oracle);
+            assert!(max <= 1e-8, "{max:e}");
         }
     }
 }

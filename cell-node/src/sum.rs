@@ -81,7 +81,7 @@ pub struct Sum {
     /// The parent did not take the last sum, and has to be told anew whom they are for.
     pub(crate) restate: bool,
     /// Whether it has been looked who is missing in this epoch.
-    judged: bool,
+    rated: bool,
     /// When it is looked, if not only at the next joints.
     check: Option<Micros>,
     /// Sums sent, resends among them.
@@ -144,7 +144,7 @@ impl Sum {
         self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         self.due = None;
         self.plan(begin.at);
-        (self.judged, self.check) = (false, None);
+        (self.rated, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
             self.watch();
         }
@@ -152,7 +152,7 @@ impl Sum {
 
     /// It is looked who is missing before the next joints come, while there is time to do something about it.
     pub(crate) fn watch(&mut self) {
-        if !self.judged && self.epoch.is_some() {
+        if !self.rated && self.epoch.is_some() {
             self.check = Some(self.begin.at + self.settles());
         }
     }
@@ -166,9 +166,9 @@ impl Sum {
     fn round(&mut self, exact: &[Acc<30>; WORDS], carries: bool) -> [i32; WORDS] {
         let mut words = [0; WORDS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
-            let wanted = exact.steps() + if carries { *carry } else { 0 };
-            let rounded = (wanted + (1 << (SHORTENED - 1))) >> SHORTENED;
-            *carry = wanted - (rounded << SHORTENED);
+            let target = exact.steps() + if carries { *carry } else { 0 };
+            let rounded = (target + (1 << (SHORTENED - 1))) >> SHORTENED;
+            *carry = target - (rounded << SHORTENED);
             *word = i32::try_from(rounded).unwrap_or(if rounded < 0 { i32::MIN } else { i32::MAX });
         }
         words
@@ -334,14 +334,14 @@ impl Sum {
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
         self.held = false;
-        self.judged = true;
+        self.rated = true;
     }
 
     /// Something was heard so long after it stood on the bus: when that is more than a quarter of a period, the machine
     /// itself is late, nobody is to blame, and it is not looked who is missing in this epoch.
     pub(crate) const fn heard_after(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
-            self.judged = true;
+            self.rated = true;
             self.check = None;
         }
     }
@@ -358,11 +358,11 @@ impl Sum {
 
     /// Looks once in an epoch: bit p says that the sum of the child at port p should have come and did not. Such a
     /// sum is not taken any more.
-    pub(crate) fn judge(&mut self) -> Option<(Epoch, u8)> {
-        if core::mem::replace(&mut self.judged, true) {
+    pub(crate) fn comparator(&mut self) -> Option<(Epoch, u8)> {
+        if core::mem::replace(&mut self.rated, true) {
             return None;
         }
-        let mut missed = 0;
+        let mut nack = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
             // Nothing came, or what came was without a word whom it is for.
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
@@ -372,10 +372,10 @@ impl Sum {
             }
             if child.missing > 0 {
                 child.missing -= 1;
-                missed |= 1 << port;
+                nack |= 1 << port;
             }
         }
-        Some((self.epoch?, missed))
+        Some((self.epoch?, nack))
     }
 }
 

@@ -10,7 +10,7 @@ use std::process::{Command, exit};
 use std::time::{Duration, Instant};
 
 use criterion::{Criterion, Throughput};
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
@@ -87,7 +87,7 @@ struct Listener {
 
 impl Listener {
     fn new() -> Self {
-        let text = generate(&Wanted { cells: CELLS, ..Wanted::default() }).expect("a UR5 has room");
+        let text = generate(&Target { cells: CELLS, ..Target::default() }).expect("a UR5 has room");
         let skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
         let mut table = Table::new(&skin, 0);
         table.set_comparing(false);

@@ -14,7 +14,7 @@ use control::cycle::turn::{Line, Shared, Timed, Turn};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario};
 use model::table::{Snapshot, Sums};
 use protocol::fixed::{Q1_14, Q5_10};
@@ -47,7 +47,7 @@ impl Case {
         }
     }
 
-    fn felt(self) -> SkinSensors {
+    fn reference_torque(self) -> SkinSensors {
         match self {
             Self::CentralNoneActive => SkinSensors::default(),
             Self::Distributed | Self::CentralAllActive => SkinSensors {
@@ -61,7 +61,7 @@ impl Case {
 
 /// A UR5 with so many cells; from the second bus on it wears the first one's again.
 fn skin(cells: usize) -> Skin {
-    let text = generate(&Wanted { cells: cells.min(ON_A_BUS), ..Wanted::default() }).expect("a UR5 has room");
+    let text = generate(&Target { cells: cells.min(ON_A_BUS), ..Target::default() }).expect("a UR5 has room");
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
     let first = skin.clone();
     for bus in 1..cells.div_ceil(ON_A_BUS) {
@@ -95,8 +95,8 @@ impl Bench {
     fn new(skin: &Skin, case: Case) -> Self {
         let (mut lines, mut buses) = (Vec::new(), Vec::new());
         for (index, bus) in skin.buses.iter().enumerate() {
-            let felt = skin.cells_of(index).map(|_| case.felt()).collect::<Vec<_>>();
-            let snapshot = Snapshot { sums: Sums::default(), felt };
+            let reference_torque = skin.cells_of(index).map(|_| case.reference_torque()).collect::<Vec<_>>();
+            let snapshot = Snapshot { sums: Sums::default(), reference_torque };
             let (snapshots, snapshot) = triple_buffer::triple_buffer(&snapshot);
             let (producer, positions) = rtrb::RingBuffer::new(64);
             lines.push(Line { format: bus.format, snapshot, positions: producer, state: Arc::default() });
@@ -118,7 +118,7 @@ impl Bench {
         for Receiver { snapshots, .. } in &mut self.buses {
             let next = snapshots.input_buffer_mut();
             next.sums.read_back = last;
-            next.sums.contributing = u32::try_from(next.felt.len()).unwrap_or(u32::MAX);
+            next.sums.contributing = u32::try_from(next.reference_torque.len()).unwrap_or(u32::MAX);
             next.sums.torque = [0.01, -0.02, 0.03, 0.01, -0.01, 0.0];
             snapshots.publish();
         }
@@ -138,7 +138,7 @@ impl Bench {
         let mut active = 0;
         while let Ok(record) = self.records.pop() {
             assert_eq!((record.record.bad, record.record.halted), (None, None));
-            active = record.central.map_or(0, |(_, felt)| felt.active);
+            active = record.central.map_or(0, |(_, reference_torque)| reference_torque.active);
         }
         (took, active)
     }

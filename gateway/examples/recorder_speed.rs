@@ -107,8 +107,8 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
     let mcap = Mcap { path: path.clone(), split, attachments: Vec::new(), command_line: Vec::new() };
     let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
     let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
-    let (mut outlet, lane) = feed::lane(true, Arc::default(), Arc::default());
-    let feed = Feed { lanes: vec![lane], ticks: None };
+    let (mut outlet, lane) = feed::bus_feed(true, Arc::default(), Arc::default());
+    let feed = Feed { bus_feeds: vec![lane], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;
     let began = Instant::now();
     let mut count = 0_u64;

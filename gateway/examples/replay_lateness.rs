@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use bench::replay::player::Pace;
-use bench::replay::reel::Only;
+use bench::replay::replay_plan::Only;
 use bench::replay::survey::Part;
 use bench::replay::{Options, replay};
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Kinds, Options as BusOptions};
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             spawn: None,
             vcan_setup: None,
             test_mode: false,
-            patience: Duration::from_millis(100),
+            timeout: Duration::from_millis(100),
             receive_buffer: 1 << 20,
             strict: true,
             quiet: true,

@@ -34,22 +34,22 @@ impl Ack {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.whom.display();
         let is_skin = self.whom.is_file();
-        let wanted: Vec<_> = if is_skin {
+        let target: Vec<_> = if is_skin {
             let skin = Skin::read(&self.whom).map_err(Failure::usage)?;
             skin.buses.into_iter().map(|bus| (bus.name, bus.format)).collect()
         } else {
             vec![(name.to_string(), self.format)]
         };
-        let kinds = self.kinds.of(wanted.iter().map(|(bus, _)| bus.as_str()))?;
+        let kinds = self.kinds.of(target.iter().map(|(bus, _)| bus.as_str()))?;
         // All are opened before anybody is told.
         let mut buses = Vec::new();
-        for (bus, format) in &wanted {
+        for (bus, format) in &target {
             buses.push(open(bus, kinds.of(bus), *format).map_err(|error| match is_skin {
                 true => Failure::usage(error),
                 false => Failure::usage(format!("there is no file {name}, and as a bus: {error}")),
             })?);
         }
-        buses.iter().zip(&wanted).try_for_each(|(bus, (_, format))| send(bus, &Message::Resume, *format))
+        buses.iter().zip(&target).try_for_each(|(bus, (_, format))| send(bus, &Message::Resume, *format))
     }
 }
 

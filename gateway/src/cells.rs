@@ -72,7 +72,7 @@ impl Cells {
         while seconds.is_none_or(|seconds| watch.elapsed().as_secs_f64() < seconds)
             && !stopped.load(Ordering::Relaxed)
         {
-            watch.ask(self.watch).and_then(|()| watch.hear(&stopped)).map_err(Failure::run)?;
+            watch.request(self.watch).and_then(|()| watch.hear(&stopped)).map_err(Failure::run)?;
             if self.watch && drawn.elapsed() >= DRAW {
                 drawn = Instant::now();
                 let text = show(&watch)?;

@@ -9,7 +9,7 @@ use std::time::Instant;
 use bench::commission::{Done, commission, open};
 use bench::run::progress::Progress as Line;
 use clap::Args;
-use model::commission::numbers::{Numbers, renumbered};
+use model::commission::node_ids::{NodeIds, renumbered};
 use model::commission::{Outcome, Progress, Wish};
 use protocol::document;
 use protocol::skin::Skin;
@@ -49,7 +49,7 @@ pub(crate) struct Commission {
     verify: bool,
     /// Write a copy of the description with the numbers that the cells have on their buses
     #[arg(long, value_name = "FILE")]
-    numbers: Option<PathBuf>,
+    node_ids: Option<PathBuf>,
     #[command(flatten)]
     force: Force,
     /// Show no progress, only the table at the end
@@ -65,17 +65,17 @@ impl Commission {
         let text = document::text(&self.skin).map_err(Failure::usage)?;
         let file = self.skin.display().to_string();
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
-        let wanted = match &self.bus {
+        let target = match &self.bus {
             Some(name) => vec![bus_of(&skin, &file, name)?],
             None => (0..skin.buses.len()).collect(),
         };
         // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
-        let begun = self.numbers.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
+        let begun = self.node_ids.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = self.kinds.of(bus_names(&skin))?;
         // All are opened before anybody is told.
-        let benches = wanted.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
+        let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
         let mut line = Line::new(self.quiet);
@@ -92,16 +92,16 @@ impl Commission {
             buses: done.iter().map(show::BusShown::of).collect(),
         };
         if !self.quiet && !self.json {
-            whole.notes(self.numbers.is_some()).iter().for_each(output::note);
+            whole.notes(self.node_ids.is_some()).iter().for_each(output::note);
         }
         print(&if self.json { super::print::json(&whole)? } else { whole.table() })?;
         if let Some((file, out)) = begun {
-            let numbers: Numbers = done
+            let node_ids: NodeIds = done
                 .iter()
                 .flat_map(|done| &done.report.cells)
                 .map(|cell| (cell.serial, cell.number))
                 .collect();
-            let copy = renumbered(&skin, &text, &numbers);
+            let copy = renumbered(&skin, &text, &node_ids);
             let copy =
                 copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", file.path().display())))?;
             output::finish("--numbers", file, out, &copy)?;
@@ -140,12 +140,13 @@ fn nobody(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
     if found {
         return Ok(());
     }
-    let strangers: Vec<_> = done.iter().flat_map(|done| &done.report.strangers).collect();
+    let unknown_nodes: Vec<_> = done.iter().flat_map(|done| &done.report.unknown_nodes).collect();
     let buses = list(done.iter().map(|done| &done.name));
-    Err(Failure::run(if strangers.is_empty() {
+    Err(Failure::run(if unknown_nodes.is_empty() {
         format!("no cells are on {buses}: start them, or switch them on, and run this again")
     } else {
-        let serials: Vec<_> = strangers.iter().map(|stranger| stranger.serial.to_string()).collect();
+        let serials: Vec<_> =
+            unknown_nodes.iter().map(|unknown_node| unknown_node.serial.to_string()).collect();
         format!(
             "none of the cells on {buses} is one of {file}: their serial numbers are {}; name the description \
              that has them",

@@ -238,7 +238,7 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
         (done.can_xl, "are CAN XL frames: not read"),
         (done.dropped, "frames are missing: whoever took the capture lost them"),
         (done.shortened, shortened),
-        (done.left_out, "notes are left out"),
+        (done.omitted, "notes are left out"),
     ] {
         if count > 0 {
             lines.push(format!("{count} {what}"));

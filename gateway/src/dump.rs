@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use analysis::stats::Report;
 use clap::Args;
-use model::decode::pick::{self, Pick, Wanted};
+use model::decode::pick::{self, Pick, Selector};
 use protocol::bus::Options;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
@@ -23,7 +23,7 @@ use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 
 use self::show::{How, Show};
 use super::arguments::{BusKind, Word, nanos, one_of};
-use super::input::{self, Ear, LOOK, Missing, captures, is_file, no_frame, place, stopped};
+use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, stopped};
 use super::output;
 use super::print::{json, list};
 
@@ -51,7 +51,7 @@ pub(crate) struct Dump {
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
     /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
-    kind: Vec<Wanted>,
+    kind: Vec<Selector>,
     /// Only packets from or to these: a cell's number, gateway, everyone
     #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node)]
     node: Vec<Node>,
@@ -125,8 +125,9 @@ impl Dump {
         } else {
             // Signals are caught before it says that it listens.
             let stopped = stopped()?;
-            let mut ear = Ear::open(&title, self.on.bus_kind, self.format, Options::default())?;
-            ("live", None, live(&mut ear, &mut show, self.to, &stopped))
+            let mut receive_end =
+                ReceiveEnd::open(&title, self.on.bus_kind, self.format, Options::default())?;
+            ("live", None, live(&mut receive_end, &mut show, self.to, &stopped))
         };
         written(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();
@@ -238,7 +239,7 @@ fn now() -> Micros {
 
 /// Shows a bus until somebody says stop, or it is closed.
 fn live(
-    ear: &mut Ear,
+    receive_end: &mut ReceiveEnd,
     show: &mut Show<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
@@ -248,17 +249,17 @@ fn live(
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
         }
-        let shown = match ear.hear(if show.is_waiting() { SETTLE } else { LOOK }) {
+        let shown = match receive_end.hear(if show.is_waiting() { SETTLE } else { LOOK }) {
             Ok(false) => show.handle_time(now()),
             Ok(true) => {
                 // When nothing more comes, the end comes all the same.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
-                ear.frames().try_for_each(|received| {
+                receive_end.frames().try_for_each(|received| {
                     if show.has_enough() {
                         return Ok(());
                     }
                     let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
-                    let interface = ear.bus().name();
+                    let interface = receive_end.bus().name();
                     show.frame(&Record { time, interface, frame: received.frame, direction: None })
                 })
             }
@@ -272,9 +273,9 @@ fn live(
             break Ok(());
         }
     };
-    match ear.missing("shown") {
+    match receive_end.missing("shown") {
         0 => {}
-        missing => show.dropped(ear.bus().name(), missing),
+        missing => show.dropped(receive_end.bus().name(), missing),
     }
     done
 }

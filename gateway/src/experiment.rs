@@ -89,10 +89,10 @@ impl Experiment {
         let Some(output) = &self.output else {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
         };
-        let wanted = |named: &Named| {
+        let target = |named: &Named| {
             self.names.iter().any(|word| matches!(word, Word::All) || *word == Word::One(*named))
         };
-        let named: Vec<Named> = Named::ALL.into_iter().filter(wanted).collect();
+        let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
         // Before anything is measured: nobody wants to hear after minutes that there is nowhere to write.
         let folder = Folder::create(output, self.force)?;
@@ -226,7 +226,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
             let beside = [paper.as_ref().map(|paper| format!("paper {paper}")), bar.clone()];
             let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
             let verdict = match verdict {
-                Verdict::Told => String::new(),
+                Verdict::Stated => String::new(),
                 Verdict::Better | Verdict::Same | Verdict::Worse => format!("  {verdict}"),
             };
             rows.row(what, ours, format!("{beside}{verdict}"));

@@ -4,7 +4,7 @@ mod show;
 
 use std::path::PathBuf;
 
-use analysis::explain::{Asked, Explanation, explain, find};
+use analysis::explain::{Explanation, Requested, explain, find};
 use clap::Args;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
@@ -91,8 +91,8 @@ impl Explain {
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
-        let asked = Asked { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
-        let found = find(&mut reader, &skin, asked).map_err(Failure::run)?;
+        let requested = Requested { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
+        let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; what was felt may be older"),
             (found.unreadable, "lines before this point could not be read"),
@@ -103,9 +103,9 @@ impl Explain {
         }
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
         let mut explanation = explain(&skin, &moments);
-        if let Some(wanted) = &self.cell {
+        if let Some(target) = &self.cell {
             let named = |bus: &str, node: u8| {
-                node == wanted.node.get() && wanted.bus.as_ref().is_none_or(|wanted| wanted == bus)
+                node == target.node.get() && target.bus.as_ref().is_none_or(|target| target == bus)
             };
             explanation.cells.retain(|cell| named(&cell.bus, cell.node));
         }

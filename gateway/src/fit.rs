@@ -88,7 +88,7 @@ impl Fit {
                 BitRates::classic(nominal).map_err(Failure::usage)?;
                 Err(Failure::usage(format!(
                     "CAN FD needs a data bit rate: say --data, {nominal} to {}, or --format classic",
-                    BitRates::GREATEST_DATA
+                    BitRates::MAX_DATA
                 )))
             }
         };

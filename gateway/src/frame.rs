@@ -150,7 +150,7 @@ struct Configure {
     #[arg(long, value_name = "NODE")]
     node: String,
     #[command(flatten)]
-    request: Asked,
+    request: Requested,
     /// Comes back in the answer
     #[arg(long, value_name = "T", default_value_t = 0)]
     tag: u8,
@@ -158,7 +158,7 @@ struct Configure {
 
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
-struct Asked {
+struct Requested {
     /// Ask for a parameter, by name or number
     #[arg(long, value_name = "PARAMETER")]
     read: Option<String>,
@@ -234,7 +234,7 @@ impl Stimulus {
                 proximity: self
                     .proximity
                     .as_deref()
-                    .map_or(Ok(Q1_14::ZERO), |text| felt("--proximity", "proximity", text))?,
+                    .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
                 temperature: several(
                     "--temperature",
                     "temperature_c",
@@ -268,7 +268,7 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
 }
 
 /// A value of a field of the sensors.
-fn felt<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
+fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let layouts =
         packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
     let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
@@ -285,7 +285,7 @@ fn several<const F: u32, const N: usize>(
 ) -> Result<[Q<F>; N], String> {
     let mut all = [Q::ZERO; N];
     for (one, text) in all.iter_mut().zip(texts) {
-        *one = felt(option, name, text)?;
+        *one = contact_state(option, name, text)?;
     }
     Ok(all)
 }
@@ -296,8 +296,8 @@ fn contact(text: &str) -> Result<[Q5_10; 3], String> {
     let words = contact_words(force);
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {
-        let [least, greatest] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
-        return Err(format!("--force {text}: three contact words say {least} to {greatest:.3} N"));
+        let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
+        return Err(format!("--force {text}: three contact words say {min} to {max:.3} N"));
     }
     Ok(words)
 }

@@ -93,12 +93,12 @@ impl Missing {
 
 /// A live bus. That it is down is said once, until it works again.
 #[derive(Debug)]
-pub(crate) struct Ear {
+pub(crate) struct ReceiveEnd {
     listener: Listener,
     is_down: bool,
 }
 
-impl Ear {
+impl ReceiveEnd {
     /// Opens a bus to hear all of it, and says of which kind it is; with `None` a classic interface too.
     pub(crate) fn open(
         name: &str,

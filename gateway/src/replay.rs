@@ -4,12 +4,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use bench::replay::player::Pace;
-use bench::replay::reel::Only;
+use bench::replay::replay_plan::Only;
 use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::Part;
 use bench::replay::{Options, ReplayError, Spawn, replay};
 use clap::Args;
-use model::decode::pick::{self, Pick, Wanted};
+use model::decode::pick::{self, Pick, Selector};
 use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
@@ -74,7 +74,7 @@ pub(crate) struct Replay {
     test_mode: bool,
     /// How many milliseconds a full bus is waited for, before frames are refused
     #[arg(long, value_name = "MS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=60_000))]
-    patience: u32,
+    timeout: u32,
     /// End before anything is sent when a line of a log cannot be read
     #[arg(long)]
     strict: bool,
@@ -107,7 +107,7 @@ struct Frames {
     /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
     /// joints, sync, resume, report alone, wire, and foreign
     #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
-    kind: Vec<Wanted>,
+    kind: Vec<Selector>,
     /// Only packets from or to these: a cell's number, gateway, everyone
     #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
     node: Vec<Node>,
@@ -193,7 +193,7 @@ impl Replay {
             }),
             vcan_setup: self.programs.vcan_setup.clone(),
             test_mode: self.test_mode,
-            patience: Duration::from_millis(self.patience.into()),
+            timeout: Duration::from_millis(self.timeout.into()),
             receive_buffer: RECEIVE_BUFFER as usize,
             strict: self.strict,
             quiet: self.quiet,
@@ -226,7 +226,7 @@ fn table(summary: &Summary) -> String {
     if let Some(lockstep) = &summary.lockstep {
         let silent = list(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
-        rows.section("lockstep", silent, format!("{} joints asked again", lockstep.asked_again));
+        rows.section("lockstep", silent, format!("{} joints asked again", lockstep.retried));
     }
     if let Some(expect) = &summary.expect {
         expectation(&mut rows, expect);
@@ -246,7 +246,7 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    rows.any("not asked for", tally.not_asked, "a bus did not take the joints");
+    rows.any("not asked for", tally.not_requested, "a bus did not take the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use analysis::fit::rates::Asked;
+use analysis::fit::rates::Requested;
 use analysis::shadow::{self, Shadow};
 use clap::Args;
 use protocol::bus::{BusError, Options};
@@ -19,7 +19,7 @@ use trace::capture::{Entry, Format, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::arguments::{BusKind, nanos};
-use super::input::{self, Ear, LOOK, Missing, captures, is_file, place, stopped};
+use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, place, stopped};
 use super::output;
 use super::print::list;
 
@@ -111,8 +111,8 @@ impl ShadowCommand {
             let reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             let mut shadow = self.shadow(skin.or_else(|| attached(&reader)))?;
-            for before in &reader.extras().in_force {
-                shadow.in_force(&before.bus, before.nanos, &before.frame);
+            for before in &reader.extras().latched {
+                shadow.latched(&before.bus, before.nanos, &before.frame);
             }
             let taken = captured(reader, &mut shadow, &mut out)?;
             (shadow, taken)
@@ -161,10 +161,10 @@ impl ShadowCommand {
 
     /// With the rates of the command line, else of the skin, else common ones.
     fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
-        let asked = Asked { nominal: self.nominal, data: self.data };
+        let requested = Requested { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
-            let rates = asked.of_bus(bus);
+            let rates = requested.of_bus(bus);
             let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
             of_bus.push((bus.name.clone(), rates));
         }
@@ -175,7 +175,7 @@ impl ShadowCommand {
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
             skin,
-            ..shadow::Options::new(asked.rates().map_err(Failure::usage)?)
+            ..shadow::Options::new(requested.rates().map_err(Failure::usage)?)
         };
         Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
@@ -189,16 +189,16 @@ impl ShadowCommand {
     ) -> Result<Taken, Failure> {
         let open = |source: &PathBuf| {
             let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
-            Ear::open(&source.display().to_string(), self.kind.bus_kind, None, options)
+            ReceiveEnd::open(&source.display().to_string(), self.kind.bus_kind, None, options)
         };
-        let mut ears = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+        let mut receive_filter = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let end = self.duration.map(|nanos| Instant::now() + Duration::from_nanos(nanos));
         let mut ended = Ok(());
         while ended.is_ok() && !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end)
         {
-            wait(&ears)?;
-            for ear in &mut ears {
-                if let Err(error) = take(ear, shadow) {
+            wait(&receive_filter)?;
+            for receive_end in &mut receive_filter {
+                if let Err(error) = take(receive_end, shadow) {
                     ended = Err(Failure::run(error));
                 }
             }
@@ -208,9 +208,9 @@ impl ShadowCommand {
             }
         }
         let mut missing = 0;
-        for ear in &ears {
-            let lost = ear.missing("read");
-            shadow.missing(ear.bus().name(), lost);
+        for receive_end in &receive_filter {
+            let lost = receive_end.missing("read");
+            shadow.missing(receive_end.bus().name(), lost);
             missing += lost;
         }
         Ok(Taken { what: "live", missing, ended })
@@ -218,19 +218,20 @@ impl ShadowCommand {
 }
 
 /// Takes what has come.
-fn take(ear: &mut Ear, shadow: &mut Shadow) -> Result<(), BusError> {
-    while ear.hear(Duration::ZERO)? {
-        for received in ear.frames() {
-            shadow.frame(ear.bus().name(), received.at_nanos, &received.frame);
+fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
+    while receive_end.hear(Duration::ZERO)? {
+        for received in receive_end.frames() {
+            shadow.frame(receive_end.bus().name(), received.at_nanos, &received.frame);
         }
     }
     Ok(())
 }
 
 /// Waits until a frame comes, or it is time to look at other things.
-fn wait(ears: &[Ear]) -> Result<(), Failure> {
+fn wait(receive_filter: &[ReceiveEnd]) -> Result<(), Failure> {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
-    let mut fds: Vec<_> = ears.iter().map(|ear| PollFd::new(ear.bus(), PollFlags::IN)).collect();
+    let mut fds: Vec<_> =
+        receive_filter.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
     match poll(&mut fds, Timespec::try_from(LOOK).ok().as_ref()) {
         Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
         Err(errno) => Err(Failure::run(io::Error::from(errno))),

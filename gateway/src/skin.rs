@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use model::generate::{Reply as Answers, Robot, Wanted, generate};
+use model::generate::{Reply as Answers, Robot, Target, generate};
 use protocol::can::Format;
 use protocol::packet::crc16;
 use protocol::skin::{Cell, ControllerKind, Reply, Skin as Description};
@@ -91,8 +91,8 @@ impl Skin {
 impl Generate {
     fn run(self) -> Result<(), Failure> {
         let Self { robot, cells, buses, broadcast_hz, reply, format, output, force } = self;
-        let wanted = Wanted { robot, cells, buses, broadcast_hz, reply, format };
-        let text = generate(&wanted).map_err(Failure::usage)?;
+        let target = Target { robot, cells, buses, broadcast_hz, reply, format };
+        let text = generate(&target).map_err(Failure::usage)?;
         match output {
             Some(path) => force.write("-o", &path, &text),
             None => print(&text),

@@ -223,16 +223,16 @@ fn frames(bytes: &[u8]) -> (Vec<(u64, Vec<u8>)>, End) {
 }
 
 #[test]
-fn a_recording_that_is_cut_off_is_read_as_far_as_it_goes() {
+fn a_recording_that_is_truncated_is_read_as_far_as_it_goes() {
     let (mcap, all) = recording();
     let mut most = 0;
-    for cut in (8..mcap.len()).step_by(3_001).chain([mcap.len() - 1]) {
-        let (found, end) = frames(&mcap[..cut]);
-        assert!(all.starts_with(&found), "cut at {cut}");
-        assert!(found.len() >= most, "cut at {cut}");
+    for link_down in (8..mcap.len()).step_by(3_001).chain([mcap.len() - 1]) {
+        let (found, end) = frames(&mcap[..link_down]);
+        assert!(all.starts_with(&found), "cut at {link_down}");
+        assert!(found.len() >= most, "cut at {link_down}");
         most = found.len();
-        let why = end.unwrap_or_else(|error| panic!("cut at {cut}: {error}"));
-        assert!(why.unwrap().contains("it has no end"), "cut at {cut}");
+        let why = end.unwrap_or_else(|error| panic!("cut at {link_down}: {error}"));
+        assert!(why.unwrap().contains("it has no end"), "cut at {link_down}");
     }
     assert_eq!((most, frames(&mcap).1.unwrap()), (all.len(), None));
 }
@@ -296,7 +296,7 @@ fn what_else_a_recording_has_is_named_and_counted() {
     }
     let extras = reader.extras();
     assert_eq!((seen, of(&extras.topics, "/diagnostics").unwrap().messages, extras.topics.len()), (2, 3, 1));
-    assert_eq!((extras.in_force[0].frame, extras.in_force.len()), (frame, 1));
+    assert_eq!((extras.latched[0].frame, extras.latched.len()), (frame, 1));
     assert_eq!(extras.attachments, [("skin.toml".to_owned(), b"version = 1".to_vec())]);
     assert_eq!(extras.metadata[0], ("run".to_owned(), vec![("git".to_owned(), "abc".to_owned())]));
     let (log, _) = converted(&bytes, Format::Candump);

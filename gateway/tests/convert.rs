@@ -217,14 +217,18 @@ fn recording(folder: &Folder) -> Vec<u8> {
 fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_said() {
     let folder = Folder::new(&[]);
     let whole = recording(&folder);
-    let half = whole.get(..whole.len() / 2).unwrap();
-    fs::write(folder.path("cut.mcap"), half).unwrap();
+    let segment = whole.get(..whole.len() / 2).unwrap();
+    fs::write(folder.path("cut.mcap"), segment).unwrap();
     let said = folder.says("convert cut.mcap cut.log", 0);
     let expected =
-        format!("cut.mcap: it has no end: after {} bytes it was cut off, or never finished\n", half.len());
+        format!("cut.mcap: it has no end: after {} bytes it was cut off, or never finished\n", segment.len());
     assert!(said.starts_with(&expected), "{said}");
-    let (long, cut) = (folder.text("long.log"), folder.text("cut.log"));
-    assert!(long.starts_with(&cut) && cut.lines().count() > 2_000, "{} lines", cut.lines().count());
+    let (long, link_down) = (folder.text("long.log"), folder.text("cut.log"));
+    assert!(
+        long.starts_with(&link_down) && link_down.lines().count() > 2_000,
+        "{} lines",
+        link_down.lines().count()
+    );
     let strict = folder.refuses("convert cut.mcap strict.log --strict", 1);
     assert_eq!(format!("{strict}\n"), format!("gateway: {expected}"));
 }

@@ -75,7 +75,7 @@ fn the_examples_are_read_and_mean_what_the_text_says() {
 }
 
 #[test]
-fn what_may_be_left_out_has_the_default_that_the_text_says() {
+fn what_may_be_omitted_has_the_default_that_the_text_says() {
     let safety = "[safety]\nhold_epochs = 2\ndecay_epochs = 4\nbad_cycles = 25\nlost_bus = \"go-on\"\n";
     assert!(skin_text().contains(safety));
     let skin = Skin::parse("skin.toml", skin_text()).unwrap();

@@ -30,7 +30,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
     let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
     let mut python = Running(python.expect("python3 is needed: apt install python3"));
     let torque = [2.0, -1.0, 0.5, 0.0, 0.0, 0.0];
-    let wanted = Step::Move([0.5, -0.25, 0.125, 0.0, 0.0, 0.0]);
+    let target = Step::Move([0.5, -0.25, 0.125, 0.0, 0.0, 0.0]);
     let (start, mut tick, mut answers) = (Instant::now(), 0, 0);
     // A tick as soon as the last one is answered, so that the first report comes after a second.
     while answers < 100 || start.elapsed() < Duration::from_millis(1_500) {
@@ -39,7 +39,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
         let input = Input { tick, time, torque, contributing: 3, valid: true, ..Input::default() };
         tick += 1;
         if let Step::Move(velocity) = gateway.step(&input) {
-            assert_eq!(Step::Move(velocity), wanted);
+            assert_eq!(Step::Move(velocity), target);
             answers += 1;
         }
         std::thread::yield_now();

@@ -49,8 +49,8 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
     let plain = output("skin generate --cells 90 --buses 2");
     let with_rates =
         plain.replace("format = \"fd\"", "format = \"fd\"\nbitrate = 500000\ndata_bitrate = 2000000");
-    let half = with_rates.replacen("\nbitrate = 500000\ndata_bitrate = 2000000", "", 1);
-    for (name, text) in [("plain", &plain), ("rates", &with_rates), ("half", &half)] {
+    let segment = with_rates.replacen("\nbitrate = 500000\ndata_bitrate = 2000000", "", 1);
+    for (name, text) in [("plain", &plain), ("rates", &with_rates), ("half", &segment)] {
         std::fs::write(path(name), text).unwrap();
     }
     let json = |arguments: &str| -> Value { serde_json::from_str(&output(arguments)).unwrap() };

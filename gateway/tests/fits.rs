@@ -211,7 +211,7 @@ fn rates_that_nobody_chose_are_told_and_not_judged() {
         told.contains("vcan0 at 1M/5M, worst case: does not fit: bandwidth (all 253 cells answer) 119 % ")
     );
     assert!(!told.contains("does not hold"), "{told}");
-    let judged = files.report(" --nominal 1M --data 8M");
-    assert!(judged.contains("vcan0 at 1M/8M, worst case: in time, but 254 nodes"), "{judged}");
-    assert!(judged.contains("within all limits ✗ does not hold"), "{judged}");
+    let rated = files.report(" --nominal 1M --data 8M");
+    assert!(rated.contains("vcan0 at 1M/8M, worst case: in time, but 254 nodes"), "{rated}");
+    assert!(rated.contains("within all limits ✗ does not hold"), "{rated}");
 }

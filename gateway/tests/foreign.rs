@@ -171,7 +171,7 @@ fn on_a_bus_that_loses_frames_what_is_left_of_packets_is_damaged_and_not_foreign
     let decoded = settled(&frames);
     let count = |is: fn(&Decoded) -> bool| decoded.iter().filter(|(_, it)| is(it)).count();
     assert_eq!(count(|it| matches!(it, Decoded::Message(_))), whole);
-    assert_eq!(count(|it| matches!(it, Decoded::Half { .. })), whole);
+    assert_eq!(count(|it| matches!(it, Decoded::Segment { .. })), whole);
     let damaged = frames.len() - 2 * whole;
     assert!(damaged > lost / 2, "{damaged} {lost}");
     assert_eq!((count(|it| matches!(it, Decoded::Damaged { .. })), count(is_foreign)), (damaged, 0));

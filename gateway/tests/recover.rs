@@ -100,7 +100,7 @@ fn a_file_that_breaks_off_anywhere_keeps_what_was_handed_on() {
 }
 
 #[test]
-fn a_damaged_chunk_is_left_out_and_said_and_the_others_are_kept() {
+fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
     let bytes = recording();
     let all = messages(&bytes);
     let chunks = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;

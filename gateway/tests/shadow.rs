@@ -74,7 +74,7 @@ fn every_line_that_a_capture_can_have_is_taken() {
 }
 
 #[test]
-fn a_recording_that_was_cut_off_is_looked_at_as_far_as_it_goes() {
+fn a_recording_that_was_truncated_is_looked_at_as_far_as_it_goes() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("run.log"), log()).unwrap();
     assert_eq!(gateway(folder.path(), "convert run.log run.mcap").0, Some(0));

@@ -140,9 +140,9 @@ fn rows() -> impl Iterator<Item = (&'static str, &'static str, &'static str)> {
     })
 }
 
-fn documented(wanted: impl Fn(&str) -> bool) -> BTreeMap<String, &'static str> {
+fn documented(target: impl Fn(&str) -> bool) -> BTreeMap<String, &'static str> {
     let events: BTreeSet<_> = Event::ALL.into_iter().map(Event::name).collect();
-    let rows = rows().filter(|(heading, key, _)| wanted(heading) && !events.contains(key));
+    let rows = rows().filter(|(heading, key, _)| target(heading) && !events.contains(key));
     rows.map(|(_, key, kind)| (key.to_owned(), kind)).collect()
 }
 
@@ -161,7 +161,7 @@ fn every_key_is_documented_with_its_type_and_no_other() {
         sums: Some(SumsSummary::default()),
         network: Some(NetworkSummary {
             differences: vec!["cell 2 does not speak".to_owned()],
-            without_way: vec![2],
+            unreachable: vec![2],
             ..NetworkSummary::default()
         }),
         ..bus

@@ -16,7 +16,7 @@ use control::controller::Kinesthetic;
 use control::cycle::turn::{BusState, Line, Shared, Turn};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};
@@ -52,7 +52,7 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 fn skin(cells: usize) -> Skin {
-    let text = generate(&Wanted { cells, ..Wanted::default() }).unwrap();
+    let text = generate(&Target { cells, ..Target::default() }).unwrap();
     Skin::parse("skin.toml", &text).unwrap()
 }
 

@@ -9,7 +9,7 @@ use std::hint::black_box;
 use gungraun::{library_benchmark, library_benchmark_group};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
-use protocol::packet::{Epoch, Half, Packet, Paired};
+use protocol::packet::{Epoch, Packet, Reassembly, Segment};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
@@ -41,11 +41,11 @@ fn decode(frame: Frame) -> Packet {
 }
 
 fn pair(id: Id, frames: [Frame; 2]) -> Packet {
-    let mut half = Half::NONE;
+    let mut segment = Segment::NONE;
     let [first, second] = black_box(&frames);
-    let waiting = half.push(Micros(0), id, first.data());
-    match (waiting, half.push(Micros(134), id, second.data())) {
-        (Ok(Paired::Waiting), Ok(Paired::Whole(packet))) => packet,
+    let waiting = segment.push(Micros(0), id, first.data());
+    match (waiting, segment.push(Micros(134), id, second.data())) {
+        (Ok(Reassembly::Waiting), Ok(Reassembly::Complete(packet))) => packet,
         paired => unreachable!("two halves of one packet: {paired:?}"),
     }
 }

@@ -68,7 +68,7 @@ pub struct Options {
     /// Bytes that may wait unread, as the kernel counts them: about 1 KiB a frame.
     pub receive_buffer: usize,
     /// How long [`Bus::send`] waits for room before it gives up.
-    pub send_patience: Duration,
+    pub send_timeout: Duration,
     /// Where embedded buses live; `None` is [`embedded::usual_directory`].
     pub directory: Option<PathBuf>,
 }
@@ -82,7 +82,7 @@ impl Default for Options {
             fd: true,
             error_mask: 0,
             receive_buffer: 4 * 254 * 1024,
-            send_patience: Duration::from_millis(100),
+            send_timeout: Duration::from_millis(100),
             directory: None,
         }
     }
@@ -105,7 +105,7 @@ pub struct Bus {
     socket: CanFdSocket,
     receive_buffer: usize,
     fd: bool,
-    send_patience: Duration,
+    send_timeout: Duration,
     /// A sender was told that the interface is down, and the receiver is yet to hear it: the kernel tells a
     /// socket once.
     down: AtomicBool,
@@ -113,7 +113,7 @@ pub struct Bus {
 
 impl Bus {
     /// How long [`Bus::receive_one_patiently`] waits.
-    pub const PATIENCE: Duration = Duration::from_millis(100);
+    pub const TIMEOUT: Duration = Duration::from_millis(100);
 
     /// Opens a bus. When this returns, the filters are in force.
     ///
@@ -124,8 +124,8 @@ impl Bus {
         check_count(name, &options.filters)?;
         let kind = choice.resolve();
         let (socket, receive_buffer) = kind.carrier().open(name, options)?;
-        let Options { fd, send_patience, .. } = *options;
-        sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::PATIENCE)).map_err(|errno| {
+        let Options { fd, send_timeout, .. } = *options;
+        sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::TIMEOUT)).map_err(|errno| {
             BusError::Io { name: name.to_owned(), doing: "set the patience of", source: errno.into() }
         })?;
         Ok(Self {
@@ -134,7 +134,7 @@ impl Bus {
             socket,
             receive_buffer,
             fd,
-            send_patience,
+            send_timeout,
             down: AtomicBool::new(false),
         })
     }
@@ -192,7 +192,7 @@ impl Bus {
         self.take(inbox, |batch, socket| batch.receive(socket))
     }
 
-    /// The same, but waits up to [`Bus::PATIENCE`] for one frame, and takes only this one: one system call
+    /// The same, but waits up to [`Bus::TIMEOUT`] for one frame, and takes only this one: one system call
     /// instead of two for whoever has nothing else to do and is woken for each frame.
     ///
     /// # Errors
@@ -227,14 +227,14 @@ impl Bus {
     }
 
     /// Sends frames, in order. When the bus takes no more, waits for room, as long as
-    /// [`Options::send_patience`] says since the last frame was taken. Never allocates unless it fails.
+    /// [`Options::send_timeout`] says since the last frame was taken. Never allocates unless it fails.
     ///
     /// # Errors
     /// The reason, and how many were sent before it.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
         if !self.carries(frames) {
             let cause = BusError::FdFrame(self.name.clone());
-            return Err(SendError { sent: 0, wanted: frames.len(), cause });
+            return Err(SendError { sent: 0, target: frames.len(), cause });
         }
         self.patiently(frames.len(), |sent| self.send_some(frames.get(sent..).unwrap_or_default()))
     }
@@ -245,9 +245,9 @@ impl Bus {
     }
 
     /// Has everything sent, waiting for room in between; `some` sends from so many on, and says how many.
-    fn patiently(&self, wanted: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
+    fn patiently(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
-        while sent < wanted {
+        while sent < target {
             let waited = match some(sent) {
                 Ok(count) => {
                     sent += count;
@@ -257,7 +257,7 @@ impl Bus {
                 Err(error) if is(&error, Errno::INTR) => continue,
                 Err(error) => self.wait_for_room(error, &mut give_up),
             };
-            waited.map_err(|cause| SendError { sent, wanted, cause })?;
+            waited.map_err(|cause| SendError { sent, target, cause })?;
         }
         Ok(())
     }
@@ -269,9 +269,9 @@ impl Bus {
             return Err(self.io_error("send to", error));
         }
         let now = Instant::now();
-        let left = give_up.get_or_insert(now + self.send_patience).saturating_duration_since(now);
+        let left = give_up.get_or_insert(now + self.send_timeout).saturating_duration_since(now);
         if left.is_zero() {
-            return Err(BusError::Full { name: self.name.clone(), waited: self.send_patience });
+            return Err(BusError::Full { name: self.name.clone(), waited: self.send_timeout });
         }
         let waited = if interface {
             // Its queue is shared and nothing tells when it has room, so look again soon.

@@ -83,8 +83,8 @@ impl Place {
     /// When it is outside.
     pub fn within(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, Fault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
-            let (least, greatest) = range.into_inner();
-            self.fault(got, format_args!("{least} to {greatest}{unit} are possible"))
+            let (min, max) = range.into_inner();
+            self.fault(got, format_args!("{min} to {max}{unit} are possible"))
         })
     }
 
@@ -110,8 +110,8 @@ impl Place {
     /// # Errors
     /// When it is outside the word's range.
     pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
-        fit(value).map_err(|OutOfRange { least, bound, .. }| {
-            self.fault(value, format_args!("its word holds [{least}, {bound})"))
+        fit(value).map_err(|OutOfRange { min, bound, .. }| {
+            self.fault(value, format_args!("its word holds [{min}, {bound})"))
         })
     }
 

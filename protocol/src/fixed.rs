@@ -28,12 +28,12 @@ pub type Q9_6 = Q<6>;
 
 /// A real number that no `Q` of the wanted format can hold.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-#[error("{got} is not in [{least}, {bound})")]
+#[error("{got} is not in [{min}, {bound})")]
 pub struct OutOfRange {
     /// The number that does not fit.
     pub got: f64,
     /// The least number of the format.
-    pub least: f64,
+    pub min: f64,
     /// The first number above the format's range.
     pub bound: f64,
 }
@@ -98,7 +98,7 @@ impl<const F: u32> Q<F> {
     }
 
     fn out_of_range(got: f64) -> OutOfRange {
-        OutOfRange { got, least: Self::MIN.to_f64(), bound: -Self::MIN.to_f64() }
+        OutOfRange { got, min: Self::MIN.to_f64(), bound: -Self::MIN.to_f64() }
     }
 
     /// Whether this word means *saturated* where saturation is marked (torques and sums).
@@ -292,8 +292,8 @@ mod tests {
         fn rounding_errs_by_half_a_step_at_most(a: i16, b: i16) {
             let exact = Q1_14::from_bits(a).mul_wide::<12, 26>(Q3_12::from_bits(b));
             let rounded: Q3_12 = exact.round();
-            let wanted = exact.to_f64().clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
-            prop_assert!((rounded.to_f64() - wanted).abs() <= 0.5 / 4_096.0);
+            let target = exact.to_f64().clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
+            prop_assert!((rounded.to_f64() - target).abs() <= 0.5 / 4_096.0);
         }
 
         #[test]

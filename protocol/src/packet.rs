@@ -27,7 +27,7 @@ pub const WORDS: usize = 6;
 /// Bytes in a packet.
 pub const BYTES: usize = 2 * WORDS + 4;
 /// Bytes in each of its two classic frames.
-const HALF_BYTES: usize = BYTES / 2;
+const SEGMENT_BYTES: usize = BYTES / 2;
 
 /// The CRC of this protocol over some bytes.
 #[must_use]
@@ -189,7 +189,7 @@ impl Packet {
         let (first, second) = match format {
             Format::Fd => (Frame::fd(id, can::BIT_RATE_SWITCH, &bytes).ok(), None),
             Format::Classic => {
-                let (head, tail) = bytes.split_at(HALF_BYTES);
+                let (head, tail) = bytes.split_at(SEGMENT_BYTES);
                 (Frame::classic(id, head).ok(), Frame::classic(id, tail).ok())
             }
         };
@@ -230,11 +230,11 @@ fn checksum(id: Id, words: &[[u8; 2]], end: [u8; 2]) -> u16 {
 
 /// What became of a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Paired {
+pub enum Reassembly {
     /// A first half; its second one is awaited.
     Waiting,
     /// Both halves were there and the CRC is right.
-    Whole(Packet),
+    Complete(Packet),
     /// A packet is lost: two halves that do not belong together, or that came too far apart. The older half is
     /// dropped, and the newer one is now the first. Said once for a packet both of whose halves came.
     Incomplete,
@@ -242,10 +242,10 @@ pub enum Paired {
 
 /// The waiting first half of a packet in two classic frames, one of these per identifier.
 ///
-/// Halves come in order and within [`Half::within`] of each other. When the CRC of a pair fails, only
+/// Halves come in order and within [`Segment::within`] of each other. When the CRC of a pair fails, only
 /// the older half is dropped, so that a lost frame costs one packet and not every later one.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Half {
+pub struct Segment {
     waiting: Option<Waiting>,
 }
 
@@ -257,7 +257,7 @@ struct Waiting {
     counted: bool,
 }
 
-impl Half {
+impl Segment {
     /// The longest time between the arrivals of two halves of joints and of what answers them: less than the 16 ms
     /// after which the next ones usually come, for of 65 536 pairs of halves of two packets one has a right CRC.
     const WITHIN_A_PERIOD: Span = Span::from_millis(15);
@@ -284,11 +284,11 @@ impl Half {
     ///
     /// # Errors
     /// When it does not carry 8 bytes; a waiting half keeps waiting.
-    pub fn push(&mut self, at: Micros, id: Id, data: &[u8]) -> Result<Paired, PacketError> {
-        let length = PacketError::Length { expected: HALF_BYTES, got: data.len() };
+    pub fn push(&mut self, at: Micros, id: Id, data: &[u8]) -> Result<Reassembly, PacketError> {
+        let length = PacketError::Length { expected: SEGMENT_BYTES, got: data.len() };
         let data: [u8; 8] = data.try_into().map_err(|_| length)?;
         let Some(older) = self.waiting.replace(Waiting { data, since: at, counted: false }) else {
-            return Ok(Paired::Waiting);
+            return Ok(Reassembly::Waiting);
         };
         let mut bytes = [0; BYTES];
         let (head, tail) = bytes.split_at_mut(older.data.len());
@@ -300,10 +300,10 @@ impl Half {
             if let Some(newer) = &mut self.waiting {
                 newer.counted = of_one_packet && !older.counted;
             }
-            return Ok(if older.counted { Paired::Waiting } else { Paired::Incomplete });
+            return Ok(if older.counted { Reassembly::Waiting } else { Reassembly::Incomplete });
         };
         self.waiting = None;
-        Ok(Paired::Whole(*packet))
+        Ok(Reassembly::Complete(*packet))
     }
 }
 
@@ -334,15 +334,15 @@ mod tests {
     fn a_lost_half_costs_one_packet() {
         let id = Id::command(Command::Joints);
         let make = |epoch| Packet { id, words: [7; WORDS], epoch: Epoch(epoch), count: 6 };
-        let halves = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
-        let mut half = Half::NONE;
-        let mut push = |at, frame: &Frame| half.push(Micros(at), id, frame.data()).unwrap();
-        assert_eq!(push(0, &halves(1)[0]), Paired::Waiting);
+        let segments = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
+        let mut segment = Segment::NONE;
+        let mut push = |at, frame: &Frame| segment.push(Micros(at), id, frame.data()).unwrap();
+        assert_eq!(push(0, &segments(1)[0]), Reassembly::Waiting);
         // The second half of epoch 1 is lost.
-        assert_eq!(push(1_000, &halves(2)[0]), Paired::Incomplete);
-        assert_eq!(push(1_100, &halves(2)[1]), Paired::Whole(make(2)));
-        assert_eq!(push(9_000, &halves(3)[0]), Paired::Waiting);
-        assert_eq!(push(24_001, &halves(3)[1]), Paired::Incomplete, "more than 15 ms apart");
+        assert_eq!(push(1_000, &segments(2)[0]), Reassembly::Incomplete);
+        assert_eq!(push(1_100, &segments(2)[1]), Reassembly::Complete(make(2)));
+        assert_eq!(push(9_000, &segments(3)[0]), Reassembly::Waiting);
+        assert_eq!(push(24_001, &segments(3)[1]), Reassembly::Incomplete, "more than 15 ms apart");
     }
 
     #[test]
@@ -355,31 +355,34 @@ mod tests {
         for (id, longest) in longest {
             let packet = Packet { id, words: [7; WORDS], epoch: Epoch(1), count: 1 };
             let came = [longest, longest + 1].map(|apart| {
-                let mut half = Half::NONE;
-                let halves = packet.frames(Format::Classic).zip([0, apart]);
-                halves.map(|(frame, at)| half.push(Micros(at), id, frame.data()).unwrap()).last().unwrap()
+                let mut segment = Segment::NONE;
+                let segments = packet.frames(Format::Classic).zip([0, apart]);
+                segments
+                    .map(|(frame, at)| segment.push(Micros(at), id, frame.data()).unwrap())
+                    .last()
+                    .unwrap()
             });
-            assert_eq!(came, [Paired::Whole(packet), Paired::Incomplete], "{id:?}");
+            assert_eq!(came, [Reassembly::Complete(packet), Reassembly::Incomplete], "{id:?}");
         }
     }
 
     #[test]
-    fn a_packet_both_of_whose_halves_came_is_counted_once() {
+    fn a_packet_both_of_whose_segments_came_is_counted_once() {
         let id = Id::command(Command::Joints);
         let make = |epoch| Packet { id, words: [7; WORDS], epoch: Epoch(epoch), count: 6 };
-        let halves = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
-        let damaged = Frame::classic(halves(2)[0].raw_id(), &[9; 8]).unwrap();
-        for (first, apart) in [(halves(2)[0], 15_001), (damaged, 100)] {
-            let mut half = Half::NONE;
-            let mut push = |at, frame: &Frame| half.push(Micros(at), id, frame.data()).unwrap();
-            assert_eq!(push(0, &first), Paired::Waiting);
-            assert_eq!(push(apart, &halves(2)[1]), Paired::Incomplete);
-            assert_eq!(push(50_000, &halves(3)[0]), Paired::Waiting, "that packet is counted");
-            assert_eq!(push(50_100, &halves(3)[1]), Paired::Whole(make(3)));
+        let segments = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
+        let damaged = Frame::classic(segments(2)[0].raw_id(), &[9; 8]).unwrap();
+        for (first, apart) in [(segments(2)[0], 15_001), (damaged, 100)] {
+            let mut segment = Segment::NONE;
+            let mut push = |at, frame: &Frame| segment.push(Micros(at), id, frame.data()).unwrap();
+            assert_eq!(push(0, &first), Reassembly::Waiting);
+            assert_eq!(push(apart, &segments(2)[1]), Reassembly::Incomplete);
+            assert_eq!(push(50_000, &segments(3)[0]), Reassembly::Waiting, "that packet is counted");
+            assert_eq!(push(50_100, &segments(3)[1]), Reassembly::Complete(make(3)));
             // Halves of two packets, each of which lost its other one, are counted each.
-            assert_eq!(push(90_000, &halves(4)[0]), Paired::Waiting);
-            assert_eq!(push(110_000, &halves(5)[0]), Paired::Incomplete);
-            assert_eq!(push(130_000, &halves(6)[0]), Paired::Incomplete);
+            assert_eq!(push(90_000, &segments(4)[0]), Reassembly::Waiting);
+            assert_eq!(push(110_000, &segments(5)[0]), Reassembly::Incomplete);
+            assert_eq!(push(130_000, &segments(6)[0]), Reassembly::Incomplete);
         }
     }
 
@@ -400,12 +403,12 @@ mod tests {
             let fd: Vec<_> = packet.frames(Format::Fd).collect();
             prop_assert_eq!(fd.len(), 1);
             prop_assert_eq!(Packet::from_fd(&fd[0]), Ok(packet));
-            let mut half = Half::NONE;
-            let mut last = Paired::Waiting;
+            let mut segment = Segment::NONE;
+            let mut last = Reassembly::Waiting;
             for frame in packet.frames(Format::Classic) {
-                last = half.push(Micros(0), packet.id, frame.data()).unwrap();
+                last = segment.push(Micros(0), packet.id, frame.data()).unwrap();
             }
-            prop_assert_eq!(last, Paired::Whole(packet));
+            prop_assert_eq!(last, Reassembly::Complete(packet));
         }
 
         #[test]
@@ -426,7 +429,7 @@ mod tests {
         #[test]
         fn no_bytes_panic(kind in 0_u16..0x800, bytes in proptest::collection::vec(any::<u8>(), 0..70)) {
             let _ = Packet::decode(Id::from_bits(kind), &bytes);
-            let _ = Half::default().push(Micros(0), Id { kind: Kind::Sum, node: 0 }, &bytes);
+            let _ = Segment::default().push(Micros(0), Id { kind: Kind::Sum, node: 0 }, &bytes);
         }
     }
 }

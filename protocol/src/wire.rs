@@ -40,7 +40,7 @@ pub const BYTES: usize = 8;
 
 /// One direction of one simulated wire: whoever sends on it.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
-pub struct Lane {
+pub struct LinkId {
     /// The wire's number on its bus.
     pub wire: u16,
     /// Which of its two directions.
@@ -52,14 +52,14 @@ pub struct Lane {
 /// A label only ever improves: a later round, or the same with a lesser depth. A cell takes a parent only
 /// whose label is better than its own, so that parents never form a circle.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub struct Label {
+pub struct Rank {
     /// The exploration from which the depth is, modulo 2^8.
     pub round: u8,
     /// Wires to the gateway's side: 0 is the gateway, 1 a root.
     pub depth: u8,
 }
 
-impl Label {
+impl Rank {
     /// Whether this one is better: of a later round, or nearer in the same.
     #[must_use]
     pub const fn is_better_than(self, other: Self) -> bool {
@@ -92,7 +92,7 @@ pub struct Hello {
     /// It, or a cell below it, has no number yet.
     pub unnumbered: bool,
     /// How far it is; none without a way to the gateway.
-    pub label: Option<Label>,
+    pub rank: Option<Rank>,
 }
 
 /// A message over a wire.
@@ -103,25 +103,25 @@ pub enum PortMessage {
     /// May I send my sums to you?
     Join,
     /// Yes; this is how far I am.
-    Grant(Label),
+    Grant(Rank),
     /// No; or: you are no child of mine.
     Refuse,
     /// I am no child of yours any more.
     Leave,
     /// I have heard it.
-    Left,
+    LeaveAck,
     /// I am your child: my sums from this epoch on are for you.
     State(Epoch),
     /// I did not take your sum of this epoch.
-    Missed(Epoch),
+    Nack(Epoch),
     /// I have no way up, and a round later than this one would help.
-    Seek(u8),
+    Repair(u8),
     /// Number yourself and those below you.
-    Number(Walk),
+    NodeId(Walk),
     /// Everybody here has a number.
     Return(Walk),
     /// Are you there?
-    Ask,
+    Probe,
 }
 
 /// Numbers to give away, in a walk over the tree.
@@ -150,21 +150,21 @@ impl PortMessage {
                 let flags = flag(hello.hears, HEARS)
                     | flag(hello.up, UP)
                     | flag(hello.unnumbered, UNNUMBERED)
-                    | flag(hello.label.is_some(), LABELLED);
-                let (round, depth) = hello.label.map_or((0, 0), |label| (label.round, label.depth));
+                    | flag(hello.rank.is_some(), LABELLED);
+                let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
                 [1, hello.version, hello.number, (hello.port & 7) | flags, round, depth]
             }
             Self::Join => [2, 0, 0, 0, 0, 0],
-            Self::Grant(label) => [3, label.round, label.depth, 0, 0, 0],
+            Self::Grant(rank) => [3, rank.round, rank.depth, 0, 0, 0],
             Self::Refuse => [4, 0, 0, 0, 0, 0],
             Self::Leave => [5, 0, 0, 0, 0, 0],
-            Self::Left => [6, 0, 0, 0, 0, 0],
+            Self::LeaveAck => [6, 0, 0, 0, 0, 0],
             Self::State(epoch) => [7, epoch.0, 0, 0, 0, 0],
-            Self::Missed(epoch) => [8, epoch.0, 0, 0, 0, 0],
-            Self::Seek(round) => [9, round, 0, 0, 0, 0],
-            Self::Number(walk) => [10, walk.walk, walk.first, walk.last, 0, 0],
+            Self::Nack(epoch) => [8, epoch.0, 0, 0, 0, 0],
+            Self::Repair(round) => [9, round, 0, 0, 0, 0],
+            Self::NodeId(walk) => [10, walk.walk, walk.first, walk.last, 0, 0],
             Self::Return(walk) => [11, walk.walk, walk.first, walk.last, 0, 0],
-            Self::Ask => [12, 0, 0, 0, 0, 0],
+            Self::Probe => [12, 0, 0, 0, 0, 0],
         }
     }
 
@@ -179,25 +179,25 @@ impl PortMessage {
                 hears: c & HEARS != 0,
                 up: c & UP != 0,
                 unnumbered: c & UNNUMBERED != 0,
-                label: if c & LABELLED == 0 { None } else { Some(Label { round: d, depth: e }) },
+                rank: if c & LABELLED == 0 { None } else { Some(Rank { round: d, depth: e }) },
             }),
             2 => Self::Join,
-            3 => Self::Grant(Label { round: a, depth: b }),
+            3 => Self::Grant(Rank { round: a, depth: b }),
             4 => Self::Refuse,
             5 => Self::Leave,
-            6 => Self::Left,
+            6 => Self::LeaveAck,
             7 => Self::State(Epoch(a)),
-            8 => Self::Missed(Epoch(a)),
-            9 => Self::Seek(a),
-            10 => Self::Number(walk),
+            8 => Self::Nack(Epoch(a)),
+            9 => Self::Repair(a),
+            10 => Self::NodeId(walk),
             11 => Self::Return(walk),
-            12 => Self::Ask,
+            12 => Self::Probe,
             _ => return None,
         })
     }
 }
 
-impl Lane {
+impl LinkId {
     /// The identifier of its frames, with the flag of 29 bits.
     #[must_use]
     pub const fn raw_id(self) -> u32 {
@@ -252,45 +252,45 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_lane_is_its_identifier() {
-        let lane = Lane { wire: 3, back: true };
-        assert_eq!(lane.raw_id(), 0x9000_0007);
-        assert_eq!(Lane::from_raw_id(0x9000_0007), Some(lane));
+    fn a_link_id_is_its_identifier() {
+        let link_id = LinkId { wire: 3, back: true };
+        assert_eq!(link_id.raw_id(), 0x9000_0007);
+        assert_eq!(LinkId::from_raw_id(0x9000_0007), Some(link_id));
         for other in [0x1000_0007, 0x8000_0007, 0xD000_0007, 0x9002_0000] {
-            assert_eq!(Lane::from_raw_id(other), None, "{other:08X}");
+            assert_eq!(LinkId::from_raw_id(other), None, "{other:08X}");
         }
     }
 
     #[test]
-    fn a_label_of_a_later_round_or_a_lesser_depth_is_better() {
-        let label = |round, depth| Label { round, depth };
-        assert!(label(1, 9).is_better_than(label(0, 1)));
-        assert!(label(0, 9).is_better_than(label(255, 1)));
-        assert!(label(4, 1).is_better_than(label(4, 2)));
-        assert!(!label(4, 2).is_better_than(label(4, 2)));
-        assert!(label(4, 2).is_better_than(label(4, 2).below()));
+    fn a_rank_of_a_later_round_or_a_lesser_depth_is_better() {
+        let rank = |round, depth| Rank { round, depth };
+        assert!(rank(1, 9).is_better_than(rank(0, 1)));
+        assert!(rank(0, 9).is_better_than(rank(255, 1)));
+        assert!(rank(4, 1).is_better_than(rank(4, 2)));
+        assert!(!rank(4, 2).is_better_than(rank(4, 2)));
+        assert!(rank(4, 2).is_better_than(rank(4, 2).below()));
     }
 
     proptest! {
         #[test]
-        fn what_is_said_is_heard_on_this_lane_only(wire: u16, back: bool, body: [u8; 6]) {
-            let lane = Lane { wire, back };
+        fn what_is_said_is_heard_on_this_link_id_only(wire: u16, back: bool, body: [u8; 6]) {
+            let link_id = LinkId { wire, back };
             if let Some(message) = PortMessage::decode(body) {
-                let frame = lane.frame(message);
-                prop_assert_eq!(lane.read(&frame), Some(message));
-                prop_assert_eq!(lane.reversed().read(&frame), None);
+                let frame = link_id.frame(message);
+                prop_assert_eq!(link_id.read(&frame), Some(message));
+                prop_assert_eq!(link_id.reversed().read(&frame), None);
             }
         }
 
         #[test]
         fn one_wrong_bit_is_noticed(bit in 0_usize..64, body: [u8; 5]) {
             let [a, b, c, ..] = body;
-            let lane = Lane { wire: 7, back: false };
-            let frame = lane.frame(PortMessage::Number(Walk { walk: a, first: b, last: c }));
+            let link_id = LinkId { wire: 7, back: false };
+            let frame = link_id.frame(PortMessage::NodeId(Walk { walk: a, first: b, last: c }));
             let mut data: [u8; BYTES] = frame.data().try_into().unwrap();
             data[bit / 8] ^= 1 << (bit % 8);
             let damaged = Frame::classic(frame.raw_id(), &data).unwrap();
-            prop_assert_eq!(lane.read(&damaged), None);
+            prop_assert_eq!(link_id.read(&damaged), None);
         }
     }
 }

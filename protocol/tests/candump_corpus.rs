@@ -70,7 +70,7 @@ fn describe(record: &Record<'_>) -> BTreeMap<&'static str, String> {
     } else {
         format!("{:03X}", frame.id())
     };
-    let when = |wanted, text: String| if wanted { text } else { String::new() };
+    let when = |expected, text: String| if expected { text } else { String::new() };
     BTreeMap::from([
         ("kind", kind.to_owned()),
         ("id", id),

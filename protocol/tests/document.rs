@@ -115,8 +115,8 @@ fn range(field: &Field) -> String {
     match field.range {
         Range::All => String::new(),
         Range::NotNegative | Range::NotNegativeAtCommit => ", 0 or more".to_owned(),
-        Range::Within(least, greatest) if least == greatest => String::new(),
-        Range::Within(least, greatest) => format!(", {least} to {greatest}"),
+        Range::Within(min, max) if min == max => String::new(),
+        Range::Within(min, max) => format!(", {min} to {max}"),
     }
 }
 

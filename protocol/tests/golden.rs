@@ -17,10 +17,10 @@ use protocol::candump::{self, Line};
 use protocol::fixed::Acc;
 use protocol::id::{CellId, Id, Kind};
 use protocol::message::{Answer, Message, Request};
-use protocol::packet::{Epoch, Half, Packet, Paired, crc16, data_id};
+use protocol::packet::{Epoch, Packet, Reassembly, Segment, crc16, data_id};
 use protocol::parameters::{Events, Parameter, ParameterError, Parameters, Reply, Sensing};
 use protocol::time::Micros;
-use protocol::wire::Lane;
+use protocol::wire::LinkId;
 
 const FD: &str = include_str!("golden/fd.log");
 const LENIENT: &str = include_str!("golden/lenient.log");
@@ -105,10 +105,10 @@ fn every_kind_command_and_page_has_its_golden_frame() {
         }
     }
     for number in (0..=u8::MAX).filter(|&number| Parameter::from_number(number).is_some()) {
-        let asked = |count| {
+        let requested = |count| {
             seen.iter().any(|packet| packet.id.kind == Kind::Configure && packet.count & 0x7F == count)
         };
-        assert!(asked(number), "parameter {number}");
+        assert!(requested(number), "parameter {number}");
     }
 }
 
@@ -130,25 +130,25 @@ fn bad_frames_are_refused_for_the_reason_given() {
 
 #[test]
 fn classic_frames_pair_as_the_log_says() {
-    let mut halves = BTreeMap::<u16, Half>::new();
+    let mut segments = BTreeMap::<u16, Segment>::new();
     for golden in lines(CLASSIC) {
         let outcome = data_id(&golden.frame).and_then(|id| {
-            let half = halves.entry(id.to_bits()).or_default();
-            half.push(Micros(golden.micros), id, golden.frame.data())
+            let segment = segments.entry(id.to_bits()).or_default();
+            segment.push(Micros(golden.micros), id, golden.frame.data())
         });
         match (golden.comment.split_once(' '), outcome) {
             (None, Ok(outcome)) => {
-                let wanted = match golden.comment {
-                    "waiting" => Paired::Waiting,
-                    _ => Paired::Incomplete,
+                let expected = match golden.comment {
+                    "waiting" => Reassembly::Waiting,
+                    _ => Reassembly::Incomplete,
                 };
-                assert_eq!(outcome, wanted, "{}", golden.text);
+                assert_eq!(outcome, expected, "{}", golden.text);
             }
-            (Some(("whole", rest)), Ok(Paired::Whole(packet))) if rest.starts_with("bad ") => {
+            (Some(("whole", rest)), Ok(Reassembly::Complete(packet))) if rest.starts_with("bad ") => {
                 let decoded = Message::decode(&packet).map_err(Error::Message);
                 assert_eq!(decoded, Err(Meaning::error(rest)), "{}", golden.text);
             }
-            (Some(("whole", meaning)), Ok(Paired::Whole(packet))) => {
+            (Some(("whole", meaning)), Ok(Reassembly::Complete(packet))) => {
                 let message = Meaning::new(meaning).message();
                 assert_eq!(Message::decode(&packet), Ok(message), "{}", golden.text);
                 let second = message.encode().frames(Format::Classic).nth(1).unwrap();
@@ -228,19 +228,19 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
             panic!("{pair:?}");
         };
         let mut spoilt = sound;
-        let wanted = match Parameter::from_number(*number) {
+        let expected = match Parameter::from_number(*number) {
             None => (*number, Answer::UNKNOWN),
             Some(Parameter::Reply) => (*number, cannot_be(Reply::from_words(*words))),
             Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
             Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
             // The cell of the session is not in test mode.
-            Some(Parameter::Cuts) => (*number, Answer::CANNOT_BE),
+            Some(Parameter::LinksDown) => (*number, Answer::CANNOT_BE),
             Some(parameter) => match spoilt.set(parameter, *words) {
                 Err(error) => (*number, error.code()),
                 Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
             },
         };
-        assert_eq!((*refused, *reason), wanted, "{pair:?}");
+        assert_eq!((*refused, *reason), expected, "{pair:?}");
         codes.insert(*reason);
     }
     assert!(codes.into_iter().eq([1, 2, 3, 4, 5, 6, 18, 19]));
@@ -253,7 +253,8 @@ fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
 
 #[test]
 fn wires_bytes_and_meaning_agree_both_ways() {
-    let read = |frame: &Frame| Lane::from_raw_id(frame.raw_id()).map(|lane| (lane, lane.read(frame)));
+    let read =
+        |frame: &Frame| LinkId::from_raw_id(frame.raw_id()).map(|link_id| (link_id, link_id.read(frame)));
     let mut kinds = BTreeSet::new();
     let mut odd = 0;
     for golden in lines(WIRE) {
@@ -263,10 +264,10 @@ fn wires_bytes_and_meaning_agree_both_ways() {
                 assert!(matches!(read(&golden.frame), Some((_, None))), "{}", golden.text);
             }
             comment => {
-                let (lane, message) = Meaning::new(comment).wire();
-                assert_eq!(read(&golden.frame), Some((lane, Some(message))), "{}", golden.text);
+                let (link_id, message) = Meaning::new(comment).wire();
+                assert_eq!(read(&golden.frame), Some((link_id, Some(message))), "{}", golden.text);
                 kinds.insert(golden.frame.data()[0]);
-                odd += u32::from(lane.frame(message).to_string() != golden.text);
+                odd += u32::from(link_id.frame(message).to_string() != golden.text);
             }
         }
     }
@@ -288,8 +289,8 @@ fn the_documents_torque_comes_out() {
     let rounded = (fused.steps() + (1 << 7)) >> 8;
     let torque = [-1_433, 4_260, 0, 0, 0, 0].map(|j| Acc::<30>::from_steps(j * rounded).round::<12>());
     let from = CellId::new(12).unwrap();
-    let wanted = only_frame(&Message::Torque { from, epoch: Epoch(7), torque });
-    assert!(lines(SESSION).iter().any(|golden| golden.text == wanted), "{wanted}");
+    let expected = only_frame(&Message::Torque { from, epoch: Epoch(7), torque });
+    assert!(lines(SESSION).iter().any(|golden| golden.text == expected), "{expected}");
 }
 
 const PROTOCOL_MD: &str = include_str!("../../docs/reference/protocol.md");
@@ -323,11 +324,11 @@ fn the_documents_crc_example_is_right() {
     assert_eq!(crc16(&bytes), 0xD675);
     assert!(PROTOCOL_MD.contains("0C 02 00 10 00 F8 01 00 00 00 00 00 00 00 07 01"));
     assert!(PROTOCOL_MD.contains("D675") && PROTOCOL_MD.contains("29B1"));
-    let halves = lines(DOCUMENT)[0].frame;
-    let (head, tail) = halves.data().split_at(8);
-    for half in [head, tail] {
-        let half = Frame::classic(0x20C, half).unwrap().to_string();
-        assert!(PROTOCOL_MD.contains(&half), "{half}");
+    let segments = lines(DOCUMENT)[0].frame;
+    let (head, tail) = segments.data().split_at(8);
+    for segment in [head, tail] {
+        let segment = Frame::classic(0x20C, segment).unwrap().to_string();
+        assert!(PROTOCOL_MD.contains(&segment), "{segment}");
     }
 }
 

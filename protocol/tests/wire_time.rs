@@ -4,8 +4,8 @@
 
 #[path = "wire_time/every_frame.rs"]
 mod every_frame;
-#[path = "wire_time/witness.rs"]
-mod witness;
+#[path = "wire_time/oracle.rs"]
+mod oracle;
 
 use proptest::prelude::*;
 use protocol::can::{BIT_RATE_SWITCH, ERROR, ERROR_STATE, EXTENDED, Format, Frame, REMOTE};
@@ -34,7 +34,7 @@ fn every_counted_frame_has_its_bits() {
         let frame = frame(format, u32::from_str_radix(id, 16).unwrap() | flag, &data);
         let expected = Bits { nominal: nominal.parse().unwrap(), data: switched.parse().unwrap() };
         assert_eq!(Bits::of(&frame), Some(expected), "{line}");
-        assert_eq!(witness::bits(&frame), expected, "{line}");
+        assert_eq!(oracle::bits(&frame), expected, "{line}");
         count += 1;
     }
     assert_eq!(count, 200);
@@ -50,8 +50,8 @@ fn the_worst_packet_takes_what_the_documents_say() {
     {
         assert!((micros(rates) - expected).abs() < 1e-9, "{rates}: {}", micros(rates));
     }
-    let half = Shape { coding: Coding::Classic, extended: false, len: 8 }.worst();
-    assert_eq!(2 * half.nanoseconds(BitRates::classic(1_000_000).unwrap()), 266_000);
+    let segment = Shape { coding: Coding::Classic, extended: false, len: 8 }.worst();
+    assert_eq!(2 * segment.nanoseconds(BitRates::classic(1_000_000).unwrap()), 266_000);
 }
 
 #[test]
@@ -109,7 +109,7 @@ proptest! {
 
     #[test]
     fn bits_are_those_of_a_second_implementation(frame in any_frame()) {
-        prop_assert_eq!(Bits::of(&frame), Some(witness::bits(&frame)));
+        prop_assert_eq!(Bits::of(&frame), Some(oracle::bits(&frame)));
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub fn check(bench: &Bench) {
     assert_eq!(dead as usize, silent, "the dead are counted");
     assert!(counters.epochs_complete <= counters.epochs_due, "{counters:?}");
     assert!(counters.epochs_due <= counters.epochs, "{counters:?}");
-    assert_eq!(counters.epochs, bench.witness.tally.broadcasts, "every broadcast is an epoch that ends");
+    assert_eq!(counters.epochs, bench.oracle.tally.broadcasts, "every broadcast is an epoch that ends");
 }
 
 /// Each cell's two accounts.
@@ -33,9 +33,9 @@ fn cells(bench: &Bench) {
         let Replies { due, in_time, late, missing, in_doubt, unasked: _, too_late: _ } = replies;
         assert_eq!(due, in_time + late + missing, "replies of cell {node}: {replies:?}");
         assert!(in_doubt <= missing, "replies of cell {node}: {replies:?}");
-        let arrived = bench.witness.arrived(place);
-        let tally = bench.witness.tally;
-        if is_fd(bench) && (tally.flipped, tally.cut, tally.babbled) == (0, 0, 0) {
+        let arrived = bench.oracle.arrived(place);
+        let tally = bench.oracle.tally;
+        if is_fd(bench) && (tally.flipped, tally.link_down, tally.babbled) == (0, 0, 0) {
             let elsewhere = uplink.in_doubt + uplink.unsettled;
             assert_eq!(delivered + elsewhere, arrived, "arrivals of cell {node}: {uplink:?}");
         }
@@ -49,12 +49,12 @@ fn is_fd(bench: &Bench) -> bool {
 
 /// Every torque that came is used, or counted by the reason why not.
 fn torques(bench: &Bench) {
-    let (table, tally) = (&bench.gateway.table, bench.witness.tally);
+    let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let replies = Replies::total(table.cells().iter().map(|cell| cell.replies));
     let used = replies.in_time + replies.late + replies.unasked;
     let dropped = |event| table.counters().events(event);
     let (stale, repeated) = (dropped(Event::StaleTorque), dropped(Event::RepeatedTorque));
-    if bench.witness.compares {
+    if bench.oracle.compares {
         assert_eq!((used, stale, repeated), (tally.used, tally.stale, tally.repeated), "torques");
     } else {
         assert_eq!(used + stale + repeated, tally.used + tally.stale + tally.repeated, "torques");
@@ -63,7 +63,7 @@ fn torques(bench: &Bench) {
 
 /// Every frame that came is somewhere.
 fn frames(bench: &Bench) {
-    let (table, tally) = (&bench.gateway.table, bench.witness.tally);
+    let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let counters = table.counters();
     let count = |event| counters.events(event);
     let by_kind: u64 = Kind::ALL.into_iter().map(|kind| counters.received(kind) + counters.sent(kind)).sum();
@@ -72,7 +72,7 @@ fn frames(bench: &Bench) {
     let foreign = count(Event::Foreign);
     if tally.babbled == 0 {
         assert!(
-            (tally.cut.saturating_sub(foreign)..=tally.cut).contains(&count(Event::Length)),
+            (tally.link_down.saturating_sub(foreign)..=tally.link_down).contains(&count(Event::Length)),
             "cut frames"
         );
     }
@@ -80,15 +80,15 @@ fn frames(bench: &Bench) {
         assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
         if tally.babbled == 0 {
             let harmed = count(Event::Length) + count(Event::Crc) + foreign;
-            assert_eq!(harmed, tally.cut + tally.flipped, "frames with turned bits, and cut ones");
+            assert_eq!(harmed, tally.link_down + tally.flipped, "frames with turned bits, and cut ones");
         }
         assert_eq!(count(Event::Incomplete), 0);
         return;
     }
     // Two halves are a packet; an incomplete one is one half, and each identifier may have one waiting.
     let odd = count(Event::Incomplete) + count(Event::Length);
-    let halves = 2 * (by_kind - odd) + odd;
-    let waiting = tally.frames - elsewhere - halves;
+    let segments = 2 * (by_kind - odd) + odd;
+    let waiting = tally.frames - elsewhere - segments;
     assert!(waiting <= 1 << 11, "{waiting} halves wait");
     assert_eq!(count(Event::Crc), 0);
 }

@@ -31,11 +31,11 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
+use crate::cell_slot::CellSlot;
 use crate::fault::{Fault, Faults, Party};
 use crate::gateway::Gateway;
-use crate::real_bus::{Asked, RealBus};
-use crate::seat::Seat;
-use crate::witness::{Truth, Witness};
+use crate::oracle::{Oracle, Truth};
+use crate::real_bus::{RealBus, Requested};
 use wire::{Delivery, Inlet, Sent};
 
 pub use wire::OnTheWire;
@@ -82,11 +82,11 @@ pub struct Bench {
     /// The gateway.
     pub gateway: Gateway,
     /// The cells: first the skin's, in its order, then those of [`Bench::add`].
-    pub seats: Vec<Seat>,
+    pub cell_slots: Vec<CellSlot>,
     /// What goes wrong.
     pub faults: Faults,
     /// What a second, simpler gateway makes of what the first one was handed.
-    pub witness: Witness,
+    pub oracle: Oracle,
     /// All that stood on the wire.
     pub wire: Vec<OnTheWire>,
     agenda: Agenda<Event>,
@@ -121,9 +121,9 @@ impl Bench {
         let mut bench = Self {
             skin: skin.clone(),
             gateway,
-            seats: Vec::new(),
+            cell_slots: Vec::new(),
             faults: Faults::new(seed),
-            witness: Witness::new(skin),
+            oracle: Oracle::new(skin),
             wire: Vec::new(),
             agenda: Agenda::default(),
             format: skin.buses.first().expect("a skin has a bus").format,
@@ -139,8 +139,8 @@ impl Bench {
         };
         for (place, cell) in skin.cells.iter().enumerate() {
             let identity = Identity { cell: Some(cell.node), serial: cell.serial };
-            let seat = bench.add(identity, Flash::Sound(skin.parameters(cell)));
-            bench.at(start(place), Act::Start(seat));
+            let cell_slot = bench.add(identity, Flash::Sound(skin.parameters(cell)));
+            bench.at(start(place), Act::Start(cell_slot));
         }
         bench.agenda.enter(Micros(0), Event::Look);
         bench
@@ -155,11 +155,11 @@ impl Bench {
 
     /// What was asked of the real bus, in order of time.
     #[must_use]
-    pub fn asked(&self) -> &[Asked] {
-        self.real.as_ref().map_or(&[], |real| &real.asked)
+    pub fn requested(&self) -> &[Requested] {
+        self.real.as_ref().map_or(&[], |real| &real.requested)
     }
 
-    /// What has been on the real bus, in order of time; a tag is a place in [`Bench::asked`].
+    /// What has been on the real bus, in order of time; a tag is a place in [`Bench::requested`].
     #[must_use]
     pub fn attempts(&self) -> &[Attempt] {
         self.real.as_ref().map_or(&[], |real| &real.attempts)
@@ -167,13 +167,13 @@ impl Bench {
 
     /// One more cell, switched off; returns its seat.
     pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
-        let seat = self.seats.len();
+        let cell_slot = self.cell_slots.len();
         for id in identity.hears().into_iter().flatten() {
-            self.hearers.entry(u32::from(id.to_bits())).or_default().push(seat);
+            self.hearers.entry(u32::from(id.to_bits())).or_default().push(cell_slot);
         }
-        self.seats.push(Seat::new(identity, flash, self.format));
+        self.cell_slots.push(CellSlot::new(identity, flash, self.format));
         self.inlets.push(Inlet::default());
-        seat
+        cell_slot
     }
 
     /// What time it is.
@@ -234,9 +234,9 @@ impl Bench {
     }
 
     fn is_settled(&self) -> bool {
-        let mut cells = self.seats.iter().zip(self.gateway.table.cells());
-        let started = self.seats.iter().any(|seat| seat.lives > 0);
-        started && cells.all(|(seat, cell)| !seat.runs() || cell.is_ready())
+        let mut cells = self.cell_slots.iter().zip(self.gateway.table.cells());
+        let started = self.cell_slots.iter().any(|cell_slot| cell_slot.lives > 0);
+        started && cells.all(|(cell_slot, cell)| !cell_slot.runs() || cell.is_ready())
     }
 
     /// The loop begins to tick now.
@@ -285,10 +285,10 @@ impl Bench {
         match event {
             Event::Send(sent, may_be_hit) => self.send(sent, may_be_hit),
             Event::Deliver(delivery) => self.deliver(delivery),
-            Event::Wake(seat) => self.wake(seat),
+            Event::Wake(cell_slot) => self.wake(cell_slot),
             Event::Tick if self.ticking => {
                 let messages = self.gateway.turn(self.agenda.now);
-                self.witness.check_sum(self.agenda.now, &self.gateway.table.snapshot().sums);
+                self.oracle.check_sum(self.agenda.now, &self.gateway.table.snapshot().sums);
                 self.say(&messages);
                 self.agenda.enter_in(self.gateway.period(), Event::Tick);
             }
@@ -297,7 +297,7 @@ impl Bench {
                 let known = self.gateway.notices.len();
                 let messages = self.gateway.look(self.agenda.now);
                 for (_, notice) in self.gateway.notices.iter().skip(known) {
-                    self.witness.notice(*notice);
+                    self.oracle.notice(*notice);
                 }
                 self.say(&messages);
                 self.agenda.enter_in(LOOK, Event::Look);
@@ -316,41 +316,45 @@ impl Bench {
     }
 
     fn perform(&mut self, act: Act) {
-        let of = |bench: &mut Self, seat: usize, packets: Vec<Packet>| bench.sends(seat, &packets);
+        let of = |bench: &mut Self, cell_slot: usize, packets: Vec<Packet>| bench.sends(cell_slot, &packets);
         match act {
             Act::Say(message) => self.say(&[message]),
-            Act::Inject(message) => self.packets(Party::Stranger, 0, self.agenda.now, &[message.encode()]),
+            Act::Inject(message) => self.packets(Party::UnknownNode, 0, self.agenda.now, &[message.encode()]),
             Act::Babble(frame) => {
-                let from = Party::Stranger;
-                let truth = Truth { from, life: 0, packet: None, number: 0, half: 0, damage: None };
+                let from = Party::UnknownNode;
+                let truth = Truth { from, life: 0, packet: None, number: 0, segment: 0, damage: None };
                 self.agenda.enter_in(Span(0), Event::Send(Sent { frame, truth }, true));
             }
-            Act::Kill(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::kill),
-            Act::Hang(seat) => self.seats.get_mut(seat).into_iter().for_each(Seat::hang),
-            Act::Start(seat) => {
+            Act::Kill(cell_slot) => self.cell_slots.get_mut(cell_slot).into_iter().for_each(CellSlot::kill),
+            Act::Hang(cell_slot) => self.cell_slots.get_mut(cell_slot).into_iter().for_each(CellSlot::hang),
+            Act::Start(cell_slot) => {
                 let now = self.agenda.now;
-                self.seats.get_mut(seat).into_iter().for_each(|seat| seat.start(now));
-                of(self, seat, Vec::new());
+                self.cell_slots.get_mut(cell_slot).into_iter().for_each(|cell_slot| cell_slot.start(now));
+                of(self, cell_slot, Vec::new());
             }
-            Act::GoOn(seat) => {
+            Act::GoOn(cell_slot) => {
                 let now = self.agenda.now;
-                let packets = self.seats.get_mut(seat).map(|seat| seat.go_on(now)).unwrap_or_default();
-                of(self, seat, packets);
+                let packets = self
+                    .cell_slots
+                    .get_mut(cell_slot)
+                    .map(|cell_slot| cell_slot.go_on(now))
+                    .unwrap_or_default();
+                of(self, cell_slot, packets);
             }
         }
     }
 
-    fn wake(&mut self, seat: usize) {
+    fn wake(&mut self, cell_slot: usize) {
         let now = self.agenda.now;
-        let Some(there) = self.seats.get_mut(seat) else { return };
+        let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
         there.wake = None;
         let packets = there.time(now);
-        self.sends(seat, &packets);
+        self.sends(cell_slot, &packets);
     }
 
     /// A cell's packets go out when it has thought, and its next timer is set.
-    fn sends(&mut self, seat: usize, packets: &[Packet]) {
-        let Some(there) = self.seats.get_mut(seat) else { return };
+    fn sends(&mut self, cell_slot: usize, packets: &[Packet]) {
+        let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
         let (life, at) = (there.lives, self.agenda.now + there.thinks);
         let timeout =
             there.node().filter(|_| there.runs()).map(|node| node.poll_timeout().max(self.agenda.now));
@@ -358,9 +362,9 @@ impl Bench {
             && there.wake != Some(timeout)
         {
             there.wake = Some(timeout);
-            self.agenda.enter(timeout, Event::Wake(seat));
+            self.agenda.enter(timeout, Event::Wake(cell_slot));
         }
-        self.packets(Party::Seat(seat), life, at, packets);
+        self.packets(Party::CellSlot(cell_slot), life, at, packets);
     }
 
     fn say(&mut self, messages: &[Message]) {
@@ -372,14 +376,14 @@ impl Bench {
     #[must_use]
     pub fn transcript(&self) -> String {
         let lines = self.wire.iter().map(|it| format!("{} {:?} {:?}\n", it.at.0, it.from, it.frame));
-        let end = format!("{:?}\n{:?}\n{:?}", self.gateway, self.seats, self.agenda.now);
+        let end = format!("{:?}\n{:?}\n{:?}", self.gateway, self.cell_slots, self.agenda.now);
         lines.chain([end]).collect()
     }
 
     /// The torques that stood on the wire whole: epoch and words, in their order, of one cell.
     #[must_use]
     pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
-        self.witness.torques(place)
+        self.oracle.torques(place)
     }
 }
 

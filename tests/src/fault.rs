@@ -14,9 +14,9 @@ pub enum Party {
     /// The gateway; it also reads its own frames back.
     Gateway,
     /// The cell on this seat, see [`crate::bench::Bench`].
-    Seat(usize),
+    CellSlot(usize),
     /// Somebody at a shell, another gateway, a babbling idiot: sends and does not listen.
-    Stranger,
+    UnknownNode,
 }
 
 /// What happens to a frame.
@@ -33,7 +33,7 @@ pub enum Harm {
     /// One to three of its bits are turned, in the identifier, the data or the CRC.
     Flip,
     /// Its last bytes are missing.
-    Cut,
+    LinkDown,
 }
 
 impl Harm {
@@ -44,7 +44,7 @@ impl Harm {
         Self::Duplicate,
         Self::Reorder,
         Self::Flip,
-        Self::Cut,
+        Self::LinkDown,
     ];
 }
 
@@ -114,14 +114,14 @@ impl Fault {
             Hits::Each => to.is_some(),
             Hits::Only(party) => to == Some(party),
         };
-        let of_kind = self.kind.is_none_or(|wanted| wanted == kind);
-        hits && of_kind && self.from.is_none_or(|wanted| wanted == from) && self.during.contains(&now)
+        let of_kind = self.kind.is_none_or(|expected| expected == kind);
+        hits && of_kind && self.from.is_none_or(|expected| expected == from) && self.during.contains(&now)
     }
 }
 
 /// What a frame has become.
 #[derive(Clone, Copy, Debug)]
-pub struct Fate {
+pub struct BroadcastStatus {
     /// The frame that comes.
     pub frame: Frame,
     /// How often it comes.
@@ -159,28 +159,35 @@ impl Faults {
     }
 
     /// What becomes of a frame on the wire (`to` is `None`), or on its way from there to a receiver.
-    pub fn fate(&mut self, now: Micros, from: Party, to: Option<Party>, frame: Frame) -> Fate {
-        let mut fate = Fate { frame, times: 1, delay: Span(0), after_next: false, damage: None };
+    pub fn broadcast_status(
+        &mut self,
+        now: Micros,
+        from: Party,
+        to: Option<Party>,
+        frame: Frame,
+    ) -> BroadcastStatus {
+        let mut broadcast_status =
+            BroadcastStatus { frame, times: 1, delay: Span(0), after_next: false, damage: None };
         let kind = Id::from_bits(u16::try_from(frame.id()).unwrap_or(u16::MAX)).kind;
         for fault in &self.all {
             if !fault.may_hit(now, from, to, kind) || !self.dice.random_bool(fault.probability) {
                 continue;
             }
             match fault.harm {
-                Harm::Lose => fate.times = 0,
-                Harm::Delay(most) => fate.delay = Span(self.dice.random_range(0..=most.0)),
-                Harm::Duplicate => fate.times *= 2,
-                Harm::Reorder => fate.after_next = true,
-                Harm::Flip => fate.frame = flipped(fate.frame, &mut self.dice),
-                Harm::Cut => fate.frame = cut(fate.frame, &mut self.dice),
+                Harm::Lose => broadcast_status.times = 0,
+                Harm::Delay(most) => broadcast_status.delay = Span(self.dice.random_range(0..=most.0)),
+                Harm::Duplicate => broadcast_status.times *= 2,
+                Harm::Reorder => broadcast_status.after_next = true,
+                Harm::Flip => broadcast_status.frame = flipped(broadcast_status.frame, &mut self.dice),
+                Harm::LinkDown => broadcast_status.frame = link_down(broadcast_status.frame, &mut self.dice),
             }
             match fault.harm {
-                Harm::Cut => fate.damage = Some(Harm::Cut),
-                Harm::Flip => fate.damage = fate.damage.or(Some(Harm::Flip)),
+                Harm::LinkDown => broadcast_status.damage = Some(Harm::LinkDown),
+                Harm::Flip => broadcast_status.damage = broadcast_status.damage.or(Some(Harm::Flip)),
                 Harm::Lose | Harm::Delay(_) | Harm::Duplicate | Harm::Reorder => {}
             }
         }
-        fate
+        broadcast_status
     }
 }
 
@@ -204,7 +211,7 @@ fn flipped(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     Frame::with_data(id, frame.format(), frame.flags(), &data).unwrap_or(frame)
 }
 
-fn cut(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
+fn link_down(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     let keep = dice.random_range(0..frame.data().len().max(1));
     let data = frame.data().get(..keep).unwrap_or_default();
     Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), data).unwrap_or(frame)

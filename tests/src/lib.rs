@@ -16,12 +16,12 @@
 pub mod accounts;
 mod agenda;
 pub mod bench;
+pub mod cell_slot;
 pub mod fault;
 pub mod gateway;
 mod life;
 pub mod network;
+pub mod oracle;
 pub mod real_bus;
-pub mod seat;
 pub mod skins;
-pub mod witness;
 pub mod workshop;

@@ -27,7 +27,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{self, Epoch, WORDS};
-use protocol::parameters::{Cuts, Parameter, Reply, Slots};
+use protocol::parameters::{LinksDown, Parameter, Reply, Slots};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
 use rand::seq::{IndexedRandom, SliceRandom};
@@ -179,19 +179,20 @@ impl Wiring {
     }
 
     /// A broken direction of a wire: what `cell` says through `port` is not heard.
-    pub fn cut(&mut self, cell: usize, port: usize, is_cut: bool) {
+    pub fn link_down(&mut self, cell: usize, port: usize, is_link_down: bool) {
         if let Some(End::Cell(other, at)) = self.cells[cell].wires[port] {
-            self.cells[other].deaf[at] = is_cut;
-            self.tell_cuts(other);
+            self.cells[other].deaf[at] = is_link_down;
+            self.report_links_down(other);
         }
     }
 
     /// As the gateway tells a cell which of its ports are cut.
-    pub fn tell_cuts(&mut self, cell: usize) {
+    pub fn report_links_down(&mut self, cell: usize) {
         let place = &self.cells[cell];
         let Some(number) = place.number else { return };
         let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
-        let request = Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
+        let request =
+            Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
         let message = Message::Configure { to: protocol::id::Node::Cell(number), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         self.hand(cell, self.agenda.now, Inlet::Frame(frame));
@@ -212,7 +213,7 @@ impl Wiring {
         let node = Node::new(identity, Format::Fd, &Flash::Sound(place.parameters), true, now);
         place.life = Life::Runs(Box::new(node.with_ports(wired)));
         place.wake = None;
-        place.aside.clear();
+        place.deferred.clear();
         (place.tree, place.ports) = (None, None);
         self.after(cell);
     }
@@ -278,7 +279,7 @@ impl Wiring {
     }
 
     fn pass(&mut self, cell: usize) {
-        self.hear_aside(cell);
+        self.receive_deferred(cell);
         let now = self.agenda.now;
         if let Life::Runs(node) = &mut self.cells[cell].life {
             node.handle_timeout(now);
@@ -287,12 +288,12 @@ impl Wiring {
     }
 
     /// What a cell hears aside is read when something else wakes it, and before that.
-    fn hear_aside(&mut self, cell: usize) {
+    fn receive_deferred(&mut self, cell: usize) {
         let now = self.agenda.now;
         loop {
             let place = &mut self.cells[cell];
             let Life::Runs(node) = &mut place.life else { return };
-            let Some((stood, frame)) = place.aside.pop_front() else { return };
+            let Some((stood, frame)) = place.deferred.pop_front() else { return };
             node.handle_frame(now, now.since(stood), &frame);
             self.after(cell);
         }
@@ -302,12 +303,12 @@ impl Wiring {
         let now = self.agenda.now;
         let place = &mut self.cells[cell];
         if let (Life::Runs(node), Inlet::Frame(frame)) = (&place.life, inlet)
-            && packet::data_id(&frame).is_ok_and(|id| node.hears_aside(id))
+            && packet::data_id(&frame).is_ok_and(|id| node.defers(id))
         {
-            place.aside.push_back((stood, frame));
+            place.deferred.push_back((stood, frame));
             return;
         }
-        self.hear_aside(cell);
+        self.receive_deferred(cell);
         let place = &mut self.cells[cell];
         if let Life::Runs(node) = &mut place.life {
             match inlet {

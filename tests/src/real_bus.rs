@@ -8,7 +8,7 @@ use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};
 
 /// A frame that somebody wanted to send, and when.
-pub type Asked = (Micros, Frame);
+pub type Requested = (Micros, Frame);
 
 /// A real bus, and what waits to go out on it.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub(crate) struct RealBus<T> {
     waiting: BTreeMap<u64, T>,
     /// When it is looked at next, if that has been entered.
     pub(crate) look: Option<Micros>,
-    pub(crate) asked: Vec<Asked>,
+    pub(crate) requested: Vec<Requested>,
     pub(crate) attempts: Vec<Attempt>,
 }
 
@@ -27,17 +27,17 @@ impl<T> RealBus<T> {
             model: BusModel::new(rates),
             waiting: BTreeMap::new(),
             look: None,
-            asked: Vec::new(),
+            requested: Vec::new(),
             attempts: Vec::new(),
         }
     }
 
     /// Somebody wants to send a frame now.
-    pub(crate) fn ask(&mut self, now: Micros, frame: &Frame, item: T) {
+    pub(crate) fn probe(&mut self, now: Micros, frame: &Frame, item: T) {
         let Some(bits) = Bits::of(frame) else { return };
-        let tag = u64::try_from(self.asked.len()).unwrap_or(u64::MAX);
+        let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
         let request = Request { at: now.0 * 1_000, priority: Priority::of(frame), bits, queue: None, tag };
-        self.asked.push((now, *frame));
+        self.requested.push((now, *frame));
         self.waiting.insert(tag, item);
         self.model.request(request);
     }

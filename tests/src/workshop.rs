@@ -21,7 +21,7 @@ use crate::agenda::Agenda;
 /// From the wire to a receiver, at least and at most.
 const LATENCY: (u64, u64) = (40, 300);
 /// No commissioning takes longer.
-const PATIENCE: Span = Span::from_millis(60_000);
+const TIMEOUT: Span = Span::from_millis(60_000);
 
 /// One cell on the bench of the workshop.
 #[derive(Debug)]
@@ -173,7 +173,7 @@ impl Workshop {
                 self.agenda.now = end;
                 return commission.report();
             }
-            assert!(at.since(began) < PATIENCE, "it does not end: {commission:#?}");
+            assert!(at.since(began) < TIMEOUT, "it does not end: {commission:#?}");
             self.step(at, &mut |now, frame| {
                 if let Decoded::Message(message) = decoder.decode(now, "bus", &frame) {
                     commission.handle_message(now, &message);
@@ -267,14 +267,14 @@ impl Workshop {
         let all = self.pieces.iter().enumerate();
         let hearers: Vec<_> = all.filter(|(_, piece)| hears(piece)).map(|(place, _)| place).collect();
         for place in hearers.into_iter().filter(|place| from != Some(*place)) {
-            for frame in self.fate(frame) {
+            for frame in self.broadcast_status(frame) {
                 let at = self.arrival(self.pieces.get(place).map(|piece| piece.newest));
                 self.pieces.get_mut(place).into_iter().for_each(|piece| piece.newest = at);
                 self.agenda.enter(at, Event::ToCell(place, frame));
             }
         }
         if from.is_some() {
-            for frame in self.fate(frame) {
+            for frame in self.broadcast_status(frame) {
                 self.gateway_newest = self.arrival(Some(self.gateway_newest));
                 self.agenda.enter(self.gateway_newest, Event::ToGateway(frame));
             }
@@ -287,7 +287,7 @@ impl Workshop {
     }
 
     /// What comes of a frame at one receiver.
-    fn fate(&mut self, frame: Frame) -> Vec<Frame> {
+    fn broadcast_status(&mut self, frame: Frame) -> Vec<Frame> {
         if self.dice.random_bool(self.loss) {
             return Vec::new();
         }
@@ -302,8 +302,8 @@ impl Workshop {
 
     /// The cells whose flash holds exactly this.
     #[must_use]
-    pub fn holding(&self, wanted: impl Fn(usize) -> Parameters) -> usize {
-        let holds = |(place, piece): &(usize, &Piece)| piece.flash == Flash::Sound(wanted(*place));
+    pub fn holding(&self, expected: impl Fn(usize) -> Parameters) -> usize {
+        let holds = |(place, piece): &(usize, &Piece)| piece.flash == Flash::Sound(expected(*place));
         self.pieces.iter().enumerate().filter(holds).count()
     }
 }

@@ -48,7 +48,7 @@ fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
     // Stimuli were on this bus too.
     let options = Options { each_frame: true, bench_traffic: true, ..Options::new(rates) };
     let mut shadow = Shadow::new(options).unwrap();
-    bench.asked().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
+    bench.requested().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
     shadow.finish();
     let frames = std::iter::from_fn(|| shadow.poll()).collect();
     (frames, shadow.report().buses.remove(0))

@@ -51,7 +51,7 @@ fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
     let whole = magnitude(&bench.gateway.table.snapshot().sums.torque);
     assert!(whole > 0.01);
     // The cell goes on to speak of a contact, but none of its torques arrives.
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::Seat(CELL)));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::CellSlot(CELL)));
     let course: Vec<_> = (0..10)
         .map(|_| {
             bench.run_epochs(1);
@@ -90,10 +90,10 @@ fn a_heartbeat_that_says_quiet_clears_a_held_torque() {
     bench.run_epochs(3);
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque));
     bench.press(CELL, 0.0);
-    let let_go = bench.now();
+    let released = bench.now();
     while bench.gateway.table.snapshot().sums.contributing > 0 {
         bench.run(Span::from_millis(1));
-        assert!(bench.now().since(let_go) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
+        assert!(bench.now().since(released) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
     }
     assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; WORDS]);
     assert_eq!(status(&bench, CELL), Status::Quiet);
@@ -109,7 +109,7 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         bench.act(Act::Kill(CELL));
         let killed = bench.now();
         bench.run(Span(DEAD_AFTER.0 + HEARTBEAT.0));
-        let node = bench.seats[CELL].identity.cell.unwrap();
+        let node = bench.cell_slots[CELL].identity.cell.unwrap();
         let [(dead, Notice::Dead(who))] = bench.gateway.notices[..] else {
             panic!("{:?}", bench.gateway.notices)
         };
@@ -153,7 +153,7 @@ fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
 }
 
 #[test]
-fn replies_that_a_cell_owed_when_it_started_anew_are_in_doubt() {
+fn replies_that_a_cell_owed_when_it_restarted_are_in_doubt() {
     let mut bench = bench(12);
     bench.press(CELL, 2.0);
     bench.run_epochs(20);
@@ -168,7 +168,7 @@ fn replies_that_a_cell_owed_when_it_started_anew_are_in_doubt() {
 }
 
 #[test]
-fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
+fn a_cell_that_restarts_unheard_is_noticed_by_its_count() {
     for seed in 0..20 {
         let mut bench = bench(seed);
         bench.press(CELL, 2.0);
@@ -177,9 +177,9 @@ fn a_cell_that_starts_anew_unheard_is_noticed_by_its_count() {
         bench.act(Act::Start(CELL));
         // Its claim is lost; the first word that is heard comes when the number is its own.
         let claim = bench.now()..bench.now() + CLAIM;
-        bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::Seat(CELL)).during(claim));
+        bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::CellSlot(CELL)).during(claim));
         bench.run(START);
-        let node = bench.seats[CELL].identity.cell.unwrap();
+        let node = bench.cell_slots[CELL].identity.cell.unwrap();
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, [Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
@@ -239,7 +239,7 @@ fn joints_that_a_cell_never_heard_are_told_apart_from_those_it_skipped() {
     bench.run_epochs(5);
     bench.act(Act::Say(Message::Report));
     bench.run(Span(2_000));
-    bench.fault(Fault::new(Harm::Lose, 0.3).at(Party::Seat(CELL)).of(Kind::Command));
+    bench.fault(Fault::new(Harm::Lose, 0.3).at(Party::CellSlot(CELL)).of(Kind::Command));
     bench.run_epochs(100);
     bench.faults.clear();
     finish(&mut bench);
@@ -285,13 +285,13 @@ fn of_two_cells_with_one_number_exactly_one_stays_whenever_they_start() {
         for (serial, seed) in [(1, 1), (900_000, 2)] {
             let skin = skins::arm(2, Format::Fd);
             let mut bench = Bench::new(&skin, seed);
-            bench.witness.compares = false;
-            let first = bench.seats[0].identity;
+            bench.oracle.compares = false;
+            let first = bench.cell_slots[0].identity;
             let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
             let second = bench.add(Identity { serial, ..first }, flash);
             bench.at(Micros(apart), Act::Start(second));
             bench.run(Span::from_millis(2_000));
-            let gave_up = [0, second].map(|seat| bench.seats[seat].gave_up().is_some());
+            let gave_up = [0, second].map(|cell_slot| bench.cell_slots[cell_slot].gave_up().is_some());
             assert_ne!(gave_up[0], gave_up[1], "{apart} us apart, serial {serial}");
             if apart + 64_000 < CLAIM.0 {
                 let greater = usize::from(serial > first.serial);
@@ -314,20 +314,20 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         bench.run(Span(21_000 * start as u64));
         let before = replies(&bench, 0);
         let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
-        let newcomer = bench.add(Identity { serial, ..bench.seats[0].identity }, flash);
+        let newcomer = bench.add(Identity { serial, ..bench.cell_slots[0].identity }, flash);
         bench.act(Act::Start(newcomer));
         for _ in 0..60 {
             bench.run_epochs(1);
             assert_eq!(bench.gateway.table.snapshot().sums.contributing, 1, "the torque is held throughout");
         }
-        assert_eq!(bench.seats[newcomer].gave_up(), Some(bench.seats[0].identity.serial));
+        assert_eq!(bench.cell_slots[newcomer].gave_up(), Some(bench.cell_slots[0].identity.serial));
         let now = replies(&bench, 0);
         assert_eq!((now.due, now.in_time), (before.due + 60, before.in_time + 60), "{now:?}");
         // It may hear a heartbeat before its first word, and then says none.
-        let claim = bench.wire.iter().find(|it| it.from == Party::Seat(newcomer)).map(|it| it.at);
+        let claim = bench.wire.iter().find(|it| it.from == Party::CellSlot(newcomer)).map(|it| it.at);
         let claimed = claim.is_some();
         claims[usize::from(claimed)] += 1;
-        let node = bench.seats[0].identity.cell.unwrap();
+        let node = bench.cell_slots[0].identity.cell.unwrap();
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(told, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
         if let (Some(claim), Some((told, _))) = (claim, bench.gateway.notices.first()) {
@@ -350,7 +350,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
     bench.run_epochs(60);
     bench.act(Act::Kill(0));
     let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
-    let other = bench.add(Identity { serial: 77, ..bench.seats[0].identity }, flash);
+    let other = bench.add(Identity { serial: 77, ..bench.cell_slots[0].identity }, flash);
     bench.act(Act::Start(other));
     bench.run(START);
     assert_eq!(status(&bench, 0), Status::Active, "it was told what touches it");
@@ -364,7 +364,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
 fn a_damaged_flash_is_said_and_nothing_is_due() {
     let skin = skins::arm(2, Format::Fd);
     let mut bench = Bench::with(&skin, &model::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
-    bench.seats[0].flash = Flash::Damaged;
+    bench.cell_slots[0].flash = Flash::Damaged;
     bench.run(Span::from_millis(1_000));
     bench.begin();
     bench.press(0, 2.0);

@@ -26,7 +26,7 @@ const SEEDS: u64 = 100;
 const CELLS: u8 = 5;
 
 /// The last of these lines says which run failed.
-fn label(harm: Option<Harm>, format: Format, seed: u64) {
+fn rank(harm: Option<Harm>, format: Format, seed: u64) {
     println!("{harm:?} {format:?} seed {seed}");
 }
 
@@ -57,11 +57,11 @@ fn some_fault(dice: &mut Pcg64Mcg) -> Fault {
         0 => fault,
         1 => fault.on_the_wire(),
         2 => fault.at(Party::Gateway),
-        _ => fault.at(Party::Seat(dice.random_range(0..usize::from(CELLS)))),
+        _ => fault.at(Party::CellSlot(dice.random_range(0..usize::from(CELLS)))),
     };
     match dice.random_range(0..3) {
         0 => fault.of(Kind::ALL[dice.random_range(0..Kind::ALL.len())]),
-        1 => fault.from(Party::Seat(dice.random_range(0..usize::from(CELLS)))),
+        1 => fault.from(Party::CellSlot(dice.random_range(0..usize::from(CELLS)))),
         _ => fault,
     }
 }
@@ -69,13 +69,13 @@ fn some_fault(dice: &mut Pcg64Mcg) -> Fault {
 /// Kills, starts and hangs cells at any time.
 fn some_trouble(bench: &mut Bench, dice: &mut Pcg64Mcg) {
     for _ in 0..dice.random_range(0..6) {
-        let seat = dice.random_range(0..usize::from(CELLS));
+        let cell_slot = dice.random_range(0..usize::from(CELLS));
         let at = bench.now() + Span(dice.random_range(0..1_200_000));
         let later = at + Span(dice.random_range(0..900_000));
         let (first, then) = if dice.random() {
-            (Act::Kill(seat), Act::Start(seat))
+            (Act::Kill(cell_slot), Act::Start(cell_slot))
         } else {
-            (Act::Hang(seat), Act::GoOn(seat))
+            (Act::Hang(cell_slot), Act::GoOn(cell_slot))
         };
         bench.at(at, first);
         bench.at(later, then);
@@ -88,7 +88,7 @@ fn every_harm_to_every_receiver_by_itself() {
         let skin = skins::arm(CELLS, format);
         for harm in Harm::ALL {
             for seed in 0..SEEDS / 2 {
-                label(Some(harm), format, seed);
+                rank(Some(harm), format, seed);
                 campaign(&skin, seed, |bench, _| bench.fault(Fault::new(harm, 0.1)));
             }
         }
@@ -101,7 +101,7 @@ fn every_harm_on_the_wire() {
         let skin = skins::arm(CELLS, format);
         for harm in Harm::ALL {
             for seed in 0..SEEDS / 2 {
-                label(Some(harm), format, seed);
+                rank(Some(harm), format, seed);
                 campaign(&skin, seed, |bench, _| bench.fault(Fault::new(harm, 0.1).on_the_wire()));
             }
         }
@@ -121,7 +121,7 @@ fn everything_at_once() {
     for format in [Format::Fd, Format::Classic] {
         let skin = skins::arm(CELLS, format);
         for seed in 0..2 * SEEDS {
-            label(None, format, seed);
+            rank(None, format, seed);
             campaign(&skin, seed, |bench, dice| {
                 (0..4).for_each(|_| bench.fault(some_fault(dice)));
                 some_trouble(bench, dice);

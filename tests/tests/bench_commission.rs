@@ -43,8 +43,8 @@ fn outcomes(report: &Report) -> Vec<Outcome> {
     report.cells.iter().map(|cell| cell.outcome).collect()
 }
 
-fn all(report: &Report, wanted: Outcome) {
-    assert_eq!(outcomes(report), vec![wanted; report.cells.len()], "{report:#?}");
+fn all(report: &Report, expected: Outcome) {
+    assert_eq!(outcomes(report), vec![expected; report.cells.len()], "{report:#?}");
     assert_eq!(report.trouble, None);
 }
 
@@ -174,7 +174,7 @@ fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
 }
 
 #[test]
-fn cells_that_are_switched_off_and_on_in_the_middle_are_written_anew_or_named() {
+fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
     let mut restarted = 0;
     for seed in 0..SEEDS {
         let (skin, old, new) = skin();
@@ -272,19 +272,22 @@ fn who_is_missing_is_named_and_who_is_not_the_skins_is_left_alone() {
     let (skin, old, _) = skin();
     let mut workshop = Workshop::of(&skin, 5, |place| Flash::Sound(old(place)));
     workshop.switch_off_in(Span(0), 4);
-    let stranger = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, Flash::Sound(old(0)));
+    let unknown_node = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, Flash::Sound(old(0)));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::Written; CELLS.into()];
     expected[4] = Outcome::Failed(Reason::Missing);
     assert_eq!(outcomes(&report), expected);
-    assert_eq!(report.strangers.iter().map(|it| (it.number.get(), it.serial)).collect::<Vec<_>>(), [(77, 9)]);
+    assert_eq!(
+        report.unknown_nodes.iter().map(|it| (it.number.get(), it.serial)).collect::<Vec<_>>(),
+        [(77, 9)]
+    );
     // Nothing is even staged: it may commit what it has.
     let mut words = [0; WORDS];
     words[0] = old(0).hash().cast_signed();
     let request = Request::Write { number: Parameter::Commit.number(), words };
     workshop.say(&Message::Configure { to: Node::Cell(cell(77)), tag: 1, request });
     workshop.rest(Span::from_millis(10));
-    assert_eq!(workshop.pieces[stranger].history, [Flash::Sound(old(0)); 2]);
+    assert_eq!(workshop.pieces[unknown_node].history, [Flash::Sound(old(0)); 2]);
 }
 
 #[test]
@@ -322,7 +325,7 @@ fn joints_or_another_configuration_on_the_bus_end_it_before_a_word_is_said() {
     let joints = Joints { in_use: 6, ..Joints::default() };
     let write = Request::Write { number: Parameter::Pose.number(), words: [1; WORDS] };
     for (message, trouble) in [
-        (Message::Joints { epoch: Epoch(3), joints }, Trouble::Rival),
+        (Message::Joints { epoch: Epoch(3), joints }, Trouble::OtherGateway),
         (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, Trouble::Meddler),
     ] {
         let mut workshop = Workshop::of(&skin, 8, |place| Flash::Sound(old(place)));

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Asked, Explanation, Origin, Verdict, Watch, explain};
+use analysis::explain::{Explanation, Origin, Requested, Verdict, Watch, explain};
 use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
@@ -20,9 +20,9 @@ const EPOCHS: u64 = 60;
 
 /// What a capture of these frames explains.
 fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
-    let asked = Asked { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
+    let requested = Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
     let bus = &bench.skin.buses[0].name;
-    let (mut watch, mut decoder) = (Watch::new(&bench.skin, asked), Decoder::new(None));
+    let (mut watch, mut decoder) = (Watch::new(&bench.skin, requested), Decoder::new(None));
     for sent in wire {
         let decoded = decoder.decode(sent.at, bus, &sent.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
@@ -148,7 +148,7 @@ fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
 }
 
 #[test]
-fn a_cell_that_has_just_started_says_nothing_and_one_that_lets_go_says_zeros() {
+fn a_cell_that_has_just_started_says_nothing_and_one_that_releases_says_zeros() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
     (0..4).for_each(|place| bench.press(place, 2.0));
     bench.run_epochs(5);
@@ -168,9 +168,9 @@ fn a_cell_that_has_just_started_says_nothing_and_one_that_lets_go_says_zeros() {
         node(2)
     );
     assert_eq!(explanation.missing, [why]);
-    let let_go = cell(3).unwrap();
-    assert_eq!(let_go.force.unwrap().force_steps, 0);
-    assert!(let_go.rows.iter().all(|row| row.word == Some(0) && row.verdict == Verdict::Nearest));
+    let released = cell(3).unwrap();
+    assert_eq!(released.force.unwrap().force_steps, 0);
+    assert!(released.rows.iter().all(|row| row.word == Some(0) && row.verdict == Verdict::Nearest));
 }
 
 #[test]

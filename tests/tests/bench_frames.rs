@@ -98,14 +98,14 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         let mut bench = pressed(Format::Fd, 4);
         let epoch = bench.epoch();
         // Cell 1's next torque is repeated by somebody so many epochs later, and it says nothing itself.
-        bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of(Kind::Torque).from(Party::Seat(0)));
+        bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of(Kind::Torque).from(Party::CellSlot(0)));
         bench.run_epochs(1);
         let answers = epoch_of(bench.gateway.broadcasts() - 1);
         let before = bench.gateway.table.cells()[0].replies;
         bench.run_epochs(late);
         let torque = [protocol::fixed::Q3_12::from_bits(5); WORDS];
-        let from = bench.seats[0].identity.cell.unwrap();
-        bench.witness.compares = false;
+        let from = bench.cell_slots[0].identity.cell.unwrap();
+        bench.oracle.compares = false;
         bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque }));
         bench.run(Span(epoch.0 / 4));
         let now = bench.gateway.table.cells()[0].replies;
@@ -180,7 +180,7 @@ fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
 #[test]
 fn a_touch_that_a_cell_never_heard_of_shows_as_missing_replies() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Seat(0)).of(Kind::Stimulus));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
     bench.press(0, 2.0);
     bench.run_epochs(30);
     finish(&mut bench);
@@ -191,9 +191,9 @@ fn a_touch_that_a_cell_never_heard_of_shows_as_missing_replies() {
 }
 
 #[test]
-fn a_release_that_a_cell_never_heard_of_shows_as_torques_that_nobody_asked_for() {
+fn a_release_that_a_cell_never_heard_of_shows_as_torques_that_nobody_requested() {
     let mut bench = pressed(Format::Fd, 10);
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Seat(0)).of(Kind::Stimulus));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
     bench.press(0, 0.0);
     bench.run_epochs(30);
     finish(&mut bench);
@@ -213,10 +213,10 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         let mut bench = pressed(Format::Fd, 11);
         bench.act(Act::Inject(message));
         bench.run(Span(5_000));
-        assert_eq!(events(&bench, Event::Rival), 1);
-        assert_eq!(bench.gateway.table.snapshot().sums.rivals, 1);
+        assert_eq!(events(&bench, Event::OtherGateway), 1);
+        assert_eq!(bench.gateway.table.snapshot().sums.other_gateways, 1);
         let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(told, [Notice::Rival]);
+        assert_eq!(told, [Notice::OtherGateway]);
         finish(&mut bench);
         // What cells answered to the other one is nothing that this one uses.
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
@@ -241,12 +241,12 @@ fn half_a_packet_that_is_lost_costs_that_packet_and_no_other() {
 }
 
 #[test]
-fn cells_pair_halves_as_the_gateway_does() {
+fn cells_pair_segments_as_the_gateway_does() {
     for seed in 0..20 {
         let mut bench = pressed(Format::Classic, seed);
         bench.act(Act::Say(Message::Report));
         bench.run(Span(2_000));
-        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::Seat(0)).of(Kind::Command));
+        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::CellSlot(0)).of(Kind::Command));
         bench.run_epochs(100);
         finish(&mut bench);
         let cell = &bench.gateway.table.cells()[0];
@@ -265,9 +265,9 @@ fn neither_the_order_of_starts_nor_that_of_replies_changes_a_single_torque() {
         let starts: Vec<u64> = (0..6).map(|_| dice.random_range(0..400_000)).collect();
         let idle = model::scenario::Scenario::idle(Span(0));
         let mut bench = Bench::with(&skin, &idle, seed, |place| Micros(starts[place]));
-        for seat in &mut bench.seats {
+        for cell_slot in &mut bench.cell_slots {
             // Within a tick, or the arm, which gives way to the sum, would move differently.
-            seat.thinks = Span(dice.random_range(0..1_500));
+            cell_slot.thinks = Span(dice.random_range(0..1_500));
         }
         bench.settle();
         bench.begin();

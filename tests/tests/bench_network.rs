@@ -13,7 +13,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 /// Cells are started in any order within a third of a second, and have until then to be a tree.
-const ORGANISED: Span = Span::from_millis(2_000);
+const TREE_READY: Span = Span::from_millis(2_000);
 
 /// Starts all cells at random times, and waits until they are organised.
 fn organise(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
@@ -25,11 +25,11 @@ fn organise(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
         wiring.run(Span(until));
         wiring.start(cell);
     }
-    wiring.run(ORGANISED);
+    wiring.run(TREE_READY);
 }
 
 /// The tree spans what can be reached, numbers are dense and unique, and neighbours agree on their wires.
-fn check_organised(wiring: &Wiring, seed: u64) {
+fn check_tree_ready(wiring: &Wiring, seed: u64) {
     let reachable = wiring.reachable();
     let mut numbers = BTreeSet::new();
     for (place, cell) in wiring.cells.iter().enumerate() {
@@ -37,7 +37,7 @@ fn check_organised(wiring: &Wiring, seed: u64) {
         assert_eq!(cell.number.is_some(), reached, "seed {seed}, cell {place}: {cell:?}");
         if let Some(number) = cell.number {
             assert!(numbers.insert(number.get()), "seed {seed}: number {number} twice");
-            assert!(wiring.way(place).is_some(), "seed {seed}: cell {place} has no way: {}", wiring.ways());
+            assert!(wiring.route(place).is_some(), "seed {seed}: cell {place} has no way: {}", wiring.ways());
         }
     }
     let dense = (1..=u8::try_from(numbers.len()).unwrap()).collect::<BTreeSet<_>>();
@@ -58,7 +58,8 @@ fn check_organised(wiring: &Wiring, seed: u64) {
 }
 
 fn deepest(wiring: &Wiring) -> u8 {
-    let depths = wiring.reachable().into_iter().filter_map(|cell| wiring.way(cell)).map(|way| way.len() - 1);
+    let depths =
+        wiring.reachable().into_iter().filter_map(|cell| wiring.route(cell)).map(|route| route.len() - 1);
     u8::try_from(depths.max().unwrap_or(0)).unwrap()
 }
 
@@ -84,10 +85,10 @@ fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
             wiring.switch(depth, false);
         }
     }
-    let wanted = Wiring::bits(&wiring.reachable());
+    let expected = Wiring::bits(&wiring.reachable());
     let took: Vec<bool> = wiring.took[from.saturating_sub(1)..wiring.took.len() - 1]
         .iter()
-        .map(|took| took.cells == wanted)
+        .map(|took| took.cells == expected)
         .collect();
     let last = took.iter().rposition(|complete| !complete);
     match last {
@@ -98,7 +99,7 @@ fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
 }
 
 /// What breaks, or comes back.
-fn break_something(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
+fn inject_fault(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
     let cell = dice.random_range(0..wiring.cells.len());
     let port = dice.random_range(0..4);
     match dice.random_range(0..6) {
@@ -111,19 +112,19 @@ fn break_something(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
             format!("hang {cell}")
         }
         2 | 3 => {
-            wiring.cut(cell, port, true);
+            wiring.link_down(cell, port, true);
             format!("cut {cell} port {port}")
         }
         4 => {
-            wiring.cut(cell, port, true);
+            wiring.link_down(cell, port, true);
             if let Some(End::Cell(other, at)) = wiring.cells[cell].wires[port] {
-                wiring.cut(other, at, true);
+                wiring.link_down(other, at, true);
             }
             format!("cut {cell} port {port} both ways")
         }
         _ => {
             for port in 0..4 {
-                wiring.cut(cell, port, false);
+                wiring.link_down(cell, port, false);
             }
             if wiring.runs(cell) { format!("mend {cell}") } else { restart(wiring, cell) }
         }
@@ -136,7 +137,7 @@ fn restart(wiring: &mut Wiring, cell: usize) -> String {
         wiring.start(cell);
     }
     wiring.run(Span::from_millis(700));
-    wiring.tell_cuts(cell);
+    wiring.report_links_down(cell);
     wiring.switch(deepest(wiring), false);
     wiring.press(cell, true);
     format!("restart {cell}")
@@ -154,11 +155,11 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
         let mut wiring = Wiring::random(seed);
         organise(&mut wiring, &mut dice);
-        check_organised(&wiring, seed);
+        check_tree_ready(&wiring, seed);
         press_all(&mut wiring);
         assert_eq!(incomplete(&mut wiring, 3), Some(0), "seed {seed}: all is in, before anything breaks");
         for _ in 0..4 {
-            let what = break_something(&mut wiring, &mut dice);
+            let what = inject_fault(&mut wiring, &mut dice);
             let after = incomplete(&mut wiring, 40).unwrap_or_else(|| {
                 let (took, reachable) = (wiring.took.iter().rev().nth(1), wiring.reachable());
                 panic!(
@@ -175,8 +176,12 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
         println!("  {what:8}{epochs:4}: {times}");
     }
     let broken = |(what, _): &&(String, usize)| ["cut", "hang", "kill"].contains(&what.as_str());
-    let of = |wanted: &dyn Fn(usize) -> bool| {
-        repairs.iter().filter(|(key, _)| broken(key) && wanted(key.1)).map(|(_, times)| times).sum::<usize>()
+    let of = |expected: &dyn Fn(usize) -> bool| {
+        repairs
+            .iter()
+            .filter(|(key, _)| broken(key) && expected(key.1))
+            .map(|(_, times)| times)
+            .sum::<usize>()
     };
     // What is slower loses its root, or finds a way only through those that were below it.
     assert!(of(&|epochs| epochs > 3) * 10 < of(&|epochs| epochs > 0) * 3, "most are whole again in 3 epochs");
@@ -203,7 +208,7 @@ fn messages_that_are_lost_on_wires_make_no_cell_count_twice() {
         // Who is in a sum is looked at in every epoch, see `Wiring`.
         wiring.loss = 0.05;
         for _ in 0..4 {
-            break_something(&mut wiring, &mut dice);
+            inject_fault(&mut wiring, &mut dice);
             wiring.run(Span(20 * PERIOD.0));
         }
         wiring.loss = 0.0;
@@ -212,7 +217,7 @@ fn messages_that_are_lost_on_wires_make_no_cell_count_twice() {
 }
 
 #[test]
-fn without_a_touch_all_have_a_way_again_within_a_second() {
+fn without_a_touch_all_be_reachable_again_within_a_second() {
     let mut slowest = 0;
     for seed in 0..wirings() / 2 {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
@@ -222,20 +227,21 @@ fn without_a_touch_all_have_a_way_again_within_a_second() {
         wiring.begin();
         wiring.run(Span::from_millis(300));
         for _ in 0..4 {
-            let what = break_something(&mut wiring, &mut dice);
-            let mends = what.starts_with("mend") || what.starts_with("restart");
+            let what = inject_fault(&mut wiring, &mut dice);
+            let repairs = what.starts_with("mend") || what.starts_with("restart");
             let from = wiring.now();
             let whole = |wiring: &Wiring| {
                 let mut reachable = wiring.reachable().into_iter();
-                let goes =
-                    |cell| wiring.way(cell).is_some_and(|way| way.iter().all(|&cell| wiring.runs(cell)));
+                let goes = |cell| {
+                    wiring.route(cell).is_some_and(|route| route.iter().all(|&cell| wiring.runs(cell)))
+                };
                 reachable.all(|cell| wiring.cells[cell].number.is_none() || goes(cell))
             };
             // What a cell hears no more it believes for 600 ms.
             wiring.run(Span::from_millis(600));
             while !whole(&wiring) {
                 let (took, ways) = (wiring.now().since(from), wiring.ways());
-                assert!(took <= Span::from_millis(1_000) || mends, "seed {seed}, {what}: {took:?}, {ways}");
+                assert!(took <= Span::from_millis(1_000) || repairs, "seed {seed}, {what}: {took:?}, {ways}");
                 wiring.run(Span::from_millis(20));
             }
             slowest = slowest.max(wiring.now().since(from).0);

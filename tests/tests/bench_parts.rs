@@ -3,10 +3,10 @@
 //! on up to another one, are replayed to cells that were just started: they answer as it is recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Asked, Watch};
-use bench::record::force::{InForce, Seen};
-use bench::replay::judge::{Judge, Tally};
-use bench::replay::reel::{Only, Reel, Role, Selection, Step};
+use analysis::explain::{Requested, Watch};
+use bench::record::force::{Latched, Seen};
+use bench::replay::comparator::{Comparator, Tally};
+use bench::replay::replay_plan::{Only, ReplayPlan, Role, Selection, Step};
 use bench::replay::survey::{Part, Survey};
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
@@ -100,7 +100,7 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
     let is_recorded = |from: Party, rng: &mut Pcg64Mcg| {
         trouble == Trouble::None
             || from == Party::Gateway
-            || from == Party::Stranger
+            || from == Party::UnknownNode
             || !rng.random_ratio(1, 200)
     };
     let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| Seen {
@@ -113,20 +113,20 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
 }
 
 /// The first place from `at` on at which the recorder may begin another file, and what is in force there.
-fn cut(seen: &[Seen], at: usize) -> (usize, Vec<capture::InForce>) {
-    let mut force = InForce::default();
+fn link_down(seen: &[Seen], at: usize) -> (usize, Vec<capture::Latched>) {
+    let mut force = Latched::default();
     for (place, frame) in seen.iter().enumerate() {
         if place >= at && !force.is_within_a_packet(frame.at_nanos) {
-            return (place, in_force(&force));
+            return (place, latched(&force));
         }
         force.take(*frame);
     }
-    (seen.len(), in_force(&force))
+    (seen.len(), latched(&force))
 }
 
-fn in_force(force: &InForce) -> Vec<capture::InForce> {
+fn latched(force: &Latched) -> Vec<capture::Latched> {
     let frames = force.frames().into_iter();
-    let kept = |seen: Seen| capture::InForce {
+    let kept = |seen: Seen| capture::Latched {
         bus: BUS.to_owned(),
         own: seen.own,
         frame: seen.frame,
@@ -160,63 +160,63 @@ impl Cells {
     }
 
     /// All take a frame in time, and answer.
-    fn take(&mut self, frame: &Frame, judge: &mut Judge) {
+    fn take(&mut self, frame: &Frame, comparator: &mut Comparator) {
         for node in &mut self.0 {
             node.handle_frame(Micros(300_000), Span(0), frame);
             if node.poll_store().is_some() {
                 node.handle_stored(true);
             }
             while let Some(packet) = node.poll_transmit() {
-                judge.hear(0, &Message::decode(&packet).unwrap());
+                comparator.hear(0, &Message::decode(&packet).unwrap());
             }
         }
     }
 
-    fn tell(&mut self, message: &Message, format: Format, judge: &mut Judge) {
-        message.encode().frames(format).for_each(|frame| self.take(&frame, judge));
+    fn tell(&mut self, message: &Message, format: Format, comparator: &mut Comparator) {
+        message.encode().frames(format).for_each(|frame| self.take(&frame, comparator));
     }
 }
 
 /// What a replay of a part comes to, in lockstep.
-fn replayed(skin: &Skin, before: &[capture::InForce], part: &[Seen]) -> Judge {
+fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparator {
     let format = skin.buses[0].format;
     let mut survey = Survey::new(Part::default());
     survey.begin(before);
     part.iter().for_each(|seen| survey.take(&record(seen)));
     survey.finish();
     let bus = &survey.buses[0];
-    let mut judge = Judge::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, true);
-    judge.record_begin();
-    bus.in_force.iter().for_each(|message| judge.record(0, message, false));
+    let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, true);
+    comparator.record_begin();
+    bus.latched.iter().for_each(|message| comparator.record(0, message, false));
     let selection =
-        Selection { only: Only::Inputs, pick: Default::default(), lanes: vec![Some(0)], reads: true };
-    let mut reel = Reel::new(&survey, &selection);
+        Selection { only: Only::Inputs, pick: Default::default(), bus_links: vec![Some(0)], reads: true };
+    let mut replay_plan = ReplayPlan::new(&survey, &selection);
     let mut cells = Cells::of(skin);
-    cells.tell(&Message::Report, format, &mut judge);
+    cells.tell(&Message::Report, format, &mut comparator);
     if !bus.state.is_fresh() {
-        let Step::Restore(states) = reel.restoring() else { unreachable!() };
+        let Step::Restore(states) = replay_plan.restoring() else { unreachable!() };
         for message in &states[0].1 {
             if let Message::Joints { epoch, .. } = message {
-                judge.announce(0, None, *epoch);
+                comparator.announce(0, None, *epoch);
             }
-            cells.tell(message, format, &mut judge);
+            cells.tell(message, format, &mut comparator);
         }
     }
-    judge.mute(false);
+    comparator.mute(false);
     for seen in part {
-        let _ = reel.take(&record(seen), &mut judge);
+        let _ = replay_plan.take(&record(seen), &mut comparator);
     }
-    reel.end_pass(&mut judge);
-    judge.record_end();
-    while let Some(step) = reel.next_step() {
+    replay_plan.end_pass(&mut comparator);
+    comparator.record_end();
+    while let Some(step) = replay_plan.next_step() {
         let Step::Frame(due) = step else { unreachable!() };
         if let Role::Joints(open) = due.role {
-            judge.announce(0, open.round, open.epoch);
+            comparator.announce(0, open.round, open.epoch);
         }
-        cells.take(&due.frame, &mut judge);
+        cells.take(&due.frame, &mut comparator);
     }
-    judge.finish(true);
-    judge
+    comparator.finish(true);
+    comparator
 }
 
 /// Torques in a part.
@@ -230,8 +230,8 @@ fn torques(part: &[Seen]) -> u64 {
 }
 
 #[test]
-fn a_recording_that_is_cut_anywhere_replays_from_there() {
-    let (mut equal, mut excused) = (0, 0);
+fn a_recording_that_is_link_down_anywhere_replays_from_there() {
+    let (mut equal, mut explained) = (0, 0);
     for seed in 0..SEEDS {
         let format = if seed % 3 == 2 { Format::Classic } else { Format::Fd };
         let (skin, seen) = recorded(seed, format, Trouble::Late);
@@ -239,45 +239,45 @@ fn a_recording_that_is_cut_anywhere_replays_from_there() {
         assert!(whole.tally().is_good(), "seed {seed}: {:#?} {:#?}", whole.tally(), whole.first());
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         for _ in 0..12 {
-            let (from, before) = cut(&seen, rng.random_range(0..seen.len() - 50));
+            let (from, before) = link_down(&seen, rng.random_range(0..seen.len() - 50));
             let to = rng.random_range(from + 40..=seen.len());
             let part = &seen[from..to];
-            let judge = replayed(&skin, &before, part);
-            let Tally { lacking, .. } = *judge.tally();
+            let comparator = replayed(&skin, &before, part);
+            let Tally { lacking, .. } = *comparator.tally();
             assert!(
-                judge.tally().is_good(),
+                comparator.tally().is_good(),
                 "seed {seed}, {from} to {to} of {}: {:#?} {:#?}",
                 seen.len(),
-                judge.tally(),
-                judge.first()
+                comparator.tally(),
+                comparator.first()
             );
             // Each recorded torque is compared, or it is said why not.
             let apart = lacking.joints_earlier + lacking.joints_unrecorded + lacking.said_later;
-            assert!(judge.tally().equal + apart >= torques(part), "{:#?}", judge.tally());
-            equal += judge.tally().equal;
-            excused += apart + lacking.uncounted + lacking.untaken + lacking.unrecorded;
+            assert!(comparator.tally().equal + apart >= torques(part), "{:#?}", comparator.tally());
+            equal += comparator.tally().equal;
+            explained += apart + lacking.uncounted + lacking.untaken + lacking.unrecorded;
         }
     }
     assert!(
-        equal > 20 * SEEDS * 12 && excused > 0 && excused < equal / 4,
-        "{equal} equal, {excused} excused"
+        equal > 20 * SEEDS * 12 && explained > 0 && explained < equal / 4,
+        "{equal} equal, {explained} excused"
     );
 }
 
 #[test]
-fn where_nothing_was_lost_or_late_nothing_is_excused() {
+fn where_nothing_was_lost_or_late_nothing_is_explained() {
     for seed in 100..112 {
         let format = if seed % 2 == 0 { Format::Classic } else { Format::Fd };
         let (skin, seen) = recorded(seed, format, Trouble::None);
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
-            let (from, before) = cut(&seen, at);
+            let (from, before) = link_down(&seen, at);
             // Up to the next joints: all that was asked is answered.
             let is_joints = |seen: &&Seen| seen.frame.raw_id() == 1;
             let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
             let to = if at % 2 == 0 { seen.len() } else { (from + 400).min(last) };
-            let judge = replayed(&skin, &before, &seen[from..to]);
-            let tally = judge.tally();
-            assert!(tally.is_good(), "seed {seed}, {from} to {to}: {tally:#?} {:#?}", judge.first());
+            let comparator = replayed(&skin, &before, &seen[from..to]);
+            let tally = comparator.tally();
+            assert!(tally.is_good(), "seed {seed}, {from} to {to}: {tally:#?} {:#?}", comparator.first());
             let mut lacking = tally.lacking;
             assert!(
                 lacking.ended <= u64::from(CELLS) && lacking.joints_earlier <= u64::from(CELLS),
@@ -304,14 +304,14 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
         else {
             continue;
         };
-        let (from, before) = cut(&seen, at);
+        let (from, before) = link_down(&seen, at);
         packet.words[0] += 1;
         let kept = seen[place].frame;
         seen[place].frame = packet.frames(Format::Fd).next().unwrap();
-        let judge = replayed(&skin, &before, &seen[from..]);
+        let comparator = replayed(&skin, &before, &seen[from..]);
         seen[place].frame = kept;
         // Unless its joints came before the part.
-        let tally = judge.tally();
+        let tally = comparator.tally();
         assert!(tally.different <= 1 && tally.missing + tally.extra == 0, "{tally:#?}");
         found += tally.different;
     }
@@ -322,8 +322,8 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
 fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
     for seed in 200..210 {
         let (skin, seen) = recorded(seed, Format::Fd, Trouble::None);
-        let frames_of = |from: usize, before: &[capture::InForce], asked: Asked| {
-            let (mut watch, mut decoder) = (Watch::new(&skin, asked), Decoder::new(None));
+        let frames_of = |from: usize, before: &[capture::Latched], requested: Requested| {
+            let (mut watch, mut decoder) = (Watch::new(&skin, requested), Decoder::new(None));
             for kept in before {
                 if let Decoded::Message(message) =
                     decoder.decode(Micros(kept.nanos / 1_000), BUS, &kept.frame)
@@ -338,14 +338,20 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             }
             watch.moments().unwrap().remove(0).unwrap()
         };
-        let (from, before) = cut(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
-        let asked = |epoch| Asked { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
+        let (from, before) = link_down(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
+        let requested = |epoch| Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
         for epoch in [160, 172, 185] {
-            let (whole, part) = (frames_of(0, &[], asked(epoch)), frames_of(from, &before, asked(epoch)));
+            let (whole, part) =
+                (frames_of(0, &[], requested(epoch)), frames_of(from, &before, requested(epoch)));
             assert_eq!(whole.at_ns, part.at_ns);
             for (whole, part) in whole.cells.iter().zip(&part.cells) {
-                let felt = |cell: &analysis::explain::CellMoment| cell.felt.map(|(skin, _)| skin);
-                assert_eq!((felt(whole), whole.test_mode), (felt(part), part.test_mode), "epoch {epoch}");
+                let contact_state =
+                    |cell: &analysis::explain::CellMoment| cell.contact_state.map(|(skin, _)| skin);
+                assert_eq!(
+                    (contact_state(whole), whole.test_mode),
+                    (contact_state(part), part.test_mode),
+                    "epoch {epoch}"
+                );
             }
         }
         let mut table = Table::new(&skin, 0);

@@ -12,7 +12,7 @@ use bench::replay::state::State;
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
@@ -27,7 +27,7 @@ use rand_pcg::Pcg64;
 const CELL: i64 = 12;
 
 fn parameters() -> Parameters {
-    let skin = generate(&Wanted { cells: 1, ..Wanted::default() }).unwrap();
+    let skin = generate(&Target { cells: 1, ..Target::default() }).unwrap();
     let skin = Skin::parse("skin.toml", &skin).unwrap();
     skin.parameters(&skin.cells[0])
 }
@@ -135,8 +135,8 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
     for seed in 0..600 {
         let mut random = Pcg64::seed_from_u64(seed);
         let script_of_recording = script(&mut random, false);
-        let cut = random.random_range(0..script_of_recording.len());
-        let (before, after) = script_of_recording.split_at(cut);
+        let link_down = random.random_range(0..script_of_recording.len());
+        let (before, after) = script_of_recording.split_at(link_down);
         let (mut recorded, mut state) = (started(), State::default());
         for message in before {
             state.take(message);
@@ -168,7 +168,7 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
             assert_eq!(
                 then,
                 now,
-                "seed {seed}, {at} messages after {cut}: {message:?}\nrestored: {:#?}",
+                "seed {seed}, {at} messages after {link_down}: {message:?}\nrestored: {:#?}",
                 state.restoring(|_| true, next)
             );
             let zero = |answer: &&Message| matches!(answer, Message::Torque { torque, .. } if *torque == [Q3_12::ZERO; WORDS]);

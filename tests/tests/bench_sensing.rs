@@ -14,7 +14,7 @@ use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Half, Packet, Paired, data_id};
+use protocol::packet::{Packet, Reassembly, Segment, data_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -69,14 +69,14 @@ fn to(to: Node, mode: Sensing) -> Message {
 /// The sensors frames that stood on the wire since, by time, with their senders.
 fn told(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
     let format = bench.skin.buses[0].format;
-    let mut halves = BTreeMap::new();
+    let mut segments = BTreeMap::new();
     let packet = |frame| match format {
         Format::Fd => Packet::from_fd(frame).ok(),
         Format::Classic => {
             let id = data_id(frame).ok()?;
-            match halves.entry(id).or_insert(Half::NONE).push(Micros(0), id, frame.data()) {
-                Ok(Paired::Whole(packet)) => Some(packet),
-                Ok(Paired::Waiting | Paired::Incomplete) | Err(_) => None,
+            match segments.entry(id).or_insert(Segment::NONE).push(Micros(0), id, frame.data()) {
+                Ok(Reassembly::Complete(packet)) => Some(packet),
+                Ok(Reassembly::Waiting | Reassembly::Incomplete) | Err(_) => None,
             }
         }
     };
@@ -109,7 +109,7 @@ fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros)
 
 /// What every touched cell felt at each joints that it took, of stimuli that stood on the wire: each turn of its
 /// contact is a touch or a release, and has its frame before the next joints.
-fn every_turn_was_told(bench: &Bench, since: Micros) -> (usize, usize) {
+fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
     let events = bench.skin.events;
     let told = told(bench, since);
     let mut by_cell = BTreeMap::<CellId, Vec<(Micros, SkinSensors)>>::new();
@@ -119,7 +119,7 @@ fn every_turn_was_told(bench: &Bench, since: Micros) -> (usize, usize) {
         }
     }
     let mut stimuli = BTreeMap::<CellId, Vec<(u8, SkinSensors)>>::new();
-    let mut felt = BTreeMap::<CellId, (SkinSensors, Touch)>::new();
+    let mut contact_state = BTreeMap::<CellId, (SkinSensors, Touch)>::new();
     let (mut touches, mut releases) = (0, 0);
     let period = bench.epoch();
     for it in &bench.wire {
@@ -131,7 +131,7 @@ fn every_turn_was_told(bench: &Bench, since: Micros) -> (usize, usize) {
             }
             Some(Message::Joints { epoch, .. }) => {
                 for (cell, waiting) in &mut stimuli {
-                    let (now, touch) = felt.entry(*cell).or_default();
+                    let (now, touch) = contact_state.entry(*cell).or_default();
                     waiting.retain(|&(first, skin)| {
                         let due = epoch.0.wrapping_sub(first).cast_signed() >= 0;
                         if due {
@@ -196,7 +196,7 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     assert!(share(at_rest) <= 16.0 && share(in_contact) <= 48.0 && share(hit) <= 48.0);
 
     // All 100 were in contact at the same time, and almost always.
-    let (touches, releases) = every_turn_was_told(&bench, since);
+    let (touches, releases) = every_turn_was_reported(&bench, since);
     println!("  {touches} touches and {releases} releases, each told before the next joints");
     assert!(touches > 5 * TOUCHED && releases > 4 * TOUCHED, "{touches} {releases}");
     let active: usize = bench.wire.iter().filter(|it| it.frame.id() >> 8 == Kind::Torque as u32).count();

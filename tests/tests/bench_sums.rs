@@ -36,13 +36,13 @@ fn turn(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> Ca
 }
 
 fn touched(dice: &mut Pcg64Mcg, cells: usize) -> Vec<(usize, SkinSensors)> {
-    let felt = |dice: &mut Pcg64Mcg| SkinSensors {
+    let contact_state = |dice: &mut Pcg64Mcg| SkinSensors {
         contact: [0; 3].map(|_| Q5_10::nearest(dice.random_range(0.2..2.0))),
         ..SkinSensors::default()
     };
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
-    places.into_iter().take(ACTIVE).map(|place| (place, felt(dice))).collect()
+    places.into_iter().take(ACTIVE).map(|place| (place, contact_state(dice))).collect()
 }
 
 #[derive(Default)]
@@ -93,15 +93,15 @@ fn constant(carry: bool) -> f64 {
         let touch = touched(&mut dice, tree.cells());
         let q: [f64; WORDS] = core::array::from_fn(|_| dice.random_range(-1.5..1.5));
         let mut average = [0.0; WORDS];
-        let mut wanted = ([0.0; WORDS], 0);
+        let mut expected = ([0.0; WORDS], 0);
         for _ in 0..AVERAGED {
             let came = turn(&mut tree, &q, &touch);
             for (average, sum) in average.iter_mut().zip(came.sum) {
                 *average += sum / 32.0;
             }
-            wanted = (came.central, came.loaded);
+            expected = (came.central, came.loaded);
         }
-        errors.add(&difference(&average, &wanted.0)[..wanted.1]);
+        errors.add(&difference(&average, &expected.0)[..expected.1]);
     }
     errors.mean()
 }

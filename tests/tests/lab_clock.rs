@@ -4,7 +4,7 @@
 
 mod process;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use process::log::Log;
 use process::vcan::tool;
 use process::{PRESSED, Place, whole};
@@ -43,18 +43,18 @@ const SATURATED: f64 = 0.7;
 #[ignore = "needs the lab machine"]
 fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
     let place = Place::on_vcan();
-    let wanted = Wanted { cells: 4, broadcast_hz: 20.0, ..Wanted::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = Target { cells: 4, broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(PRESSED);
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for_epoch(20);
+    let test_client = place.test_client();
+    test_client.waits_for_epoch(20);
     let back = tool("date +%s").stdout;
     let back: u64 = String::from_utf8(back).unwrap().trim().parse().unwrap();
     tool(&format!("date --set @{}", back - 100));
-    guest.waits_for_epoch(60);
+    test_client.waits_for_epoch(60);
     tool(&format!("date --set @{back}"));
-    guest.waits_for_epoch(120);
+    test_client.waits_for_epoch(120);
     bench.signal(Signal::TERM);
     bench.end().well();
     place.summary().adds_up();

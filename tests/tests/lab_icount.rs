@@ -4,7 +4,7 @@
 
 mod process;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use process::log::Log;
 use process::{Place, whole};
 use protocol::can::Format;
@@ -48,8 +48,8 @@ profile = "half-sine"
 #[ignore = "needs the lab machine"]
 fn the_same_run_on_vcan_and_on_the_embedded_bus_differs_in_times_and_interleaving_only() {
     let [vcan, embedded] = [Place::on_vcan(), Place::new()].map(|place| {
-        let wanted = Wanted { cells: 24, ..Wanted::default() };
-        place.write("skin.toml", &generate(&wanted).unwrap());
+        let expected = Target { cells: 24, ..Target::default() };
+        place.write("skin.toml", &generate(&expected).unwrap());
         place.scenario(LIVELY);
         place.bench(4.0, "").end().well();
         place.summary().adds_up();

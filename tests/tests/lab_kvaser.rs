@@ -17,14 +17,14 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use model::generate::{Format as Generated, Wanted, generate};
+use model::generate::{Format as Generated, Target, generate};
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, by_identifier, command, frames_of, tool};
-use process::{PATIENCE, Place, Running, Summary, until};
+use process::{Place, Running, Summary, TIMEOUT, until};
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Line, parse};
-use protocol::packet::{Half, Paired, data_id};
+use protocol::packet::{Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -154,8 +154,8 @@ fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
 
 /// The files of a bench whose gateway is on one bus and whose cells are on another, which are the same to them.
 fn prepare(place: &Place, gateway: &str, cells: &str) {
-    let wanted = Wanted { cells: CELLS, broadcast_hz: 20.0, format: Generated::Classic, ..Wanted::default() };
-    let skin = generate(&wanted).unwrap();
+    let target = Target { cells: CELLS, broadcast_hz: 20.0, format: Generated::Classic, ..Target::default() };
+    let skin = generate(&target).unwrap();
     place.write("skin.toml", &skin.replace("vcan0", gateway));
     place.write("cells.toml", &skin.replace("vcan0", cells));
     place.scenario(&scenario());
@@ -181,15 +181,15 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
 
 /// How many packets a log has, and how many halves that found no other in time.
 fn pairs(log: &str) -> (u64, u64) {
-    let (mut halves, mut whole, mut incomplete) = (vec![Half::NONE; 1 << 11], 0, 0);
+    let (mut segments, mut whole, mut incomplete) = (vec![Segment::NONE; 1 << 11], 0, 0);
     for line in log.lines() {
         let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
         let Ok(id) = data_id(&record.frame) else { continue };
-        let half = &mut halves[usize::from(id.to_bits())];
-        match half.push(Micros(record.time.nanos / 1_000), id, record.frame.data()) {
-            Ok(Paired::Waiting) => {}
-            Ok(Paired::Incomplete) => incomplete += 1,
-            Ok(Paired::Whole(_)) => whole += 1,
+        let segment = &mut segments[usize::from(id.to_bits())];
+        match segment.push(Micros(record.time.nanos / 1_000), id, record.frame.data()) {
+            Ok(Reassembly::Waiting) => {}
+            Ok(Reassembly::Incomplete) => incomplete += 1,
+            Ok(Reassembly::Complete(_)) => whole += 1,
             Err(error) => panic!("{line}: {error}"),
         }
     }
@@ -226,10 +226,10 @@ fn adds_up(place: &Place) -> Log {
 fn torques_come(bus: &str) {
     let torque = Filter { id: 0x201, mask: Filter::EXACT_MASK };
     let bus = open(bus, &options(&[torque])).unwrap();
-    let (mut inbox, mut halves) = (Inbox::new(), 0);
+    let (mut inbox, mut segments) = (Inbox::new(), 0);
     until("torques", || {
-        halves += bus.receive(&mut inbox).unwrap();
-        (halves >= 10).then_some(())
+        segments += bus.receive(&mut inbox).unwrap();
+        (segments >= 10).then_some(())
     });
 }
 
@@ -285,7 +285,7 @@ fn a_full_queue_is_waited_for_and_nothing_is_lost_or_sent_twice() {
     const FRAMES: u32 = 2_000;
     let controllers = Controllers::up();
     let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
-    let sender = open("can0", &Options { send_patience: PATIENCE, ..options(&[]) }).unwrap();
+    let sender = open("can0", &Options { send_timeout: TIMEOUT, ..options(&[]) }).unwrap();
     let frames: Vec<_> = (0..FRAMES).map(numbered).collect();
     for (round, part) in frames.chunks(400).enumerate() {
         let before = refused("can0");
@@ -307,18 +307,18 @@ fn a_full_queue_is_waited_for_and_nothing_is_lost_or_sent_twice() {
 fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let controllers = Controllers::up();
     let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
-    let patience = Duration::from_millis(50);
-    let patient = open("can0", &Options { send_patience: patience, ..options(&[]) }).unwrap();
-    let hasty = open("can0", &Options { send_patience: Duration::ZERO, ..options(&[]) }).unwrap();
+    let timeout = Duration::from_millis(50);
+    let patient = open("can0", &Options { send_timeout: timeout, ..options(&[]) }).unwrap();
+    let hasty = open("can0", &Options { send_timeout: Duration::ZERO, ..options(&[]) }).unwrap();
     let frames: Vec<_> = (0..40).map(numbered).collect();
 
     let hanging = controllers.hang();
     let (before, began) = (refused("can0"), Instant::now());
     let error = patient.send(&frames).unwrap_err();
-    assert!(began.elapsed() >= patience);
+    assert!(began.elapsed() >= timeout);
     // Ten in the queue, one in the controller, and where a queue is passed by while it is empty, one between.
     let sent = error.sent;
-    assert!((11..=12).contains(&sent) && error.wanted == 40, "{error}");
+    assert!((11..=12).contains(&sent) && error.target == 40, "{error}");
     assert!(error.cause.may_pass() && matches!(error.cause, BusError::Full { .. }), "{error}");
     let said =
         "can0 took no frame for 50 ms: its queue is full; send less, or ask whether anybody is on the bus";
@@ -379,7 +379,7 @@ fn wires_are_not_simulated_on_a_real_bus() {
     assert!(!open("can0", &options(&[])).unwrap().is_virtual().unwrap());
     let place = Place::new();
     let (reply, format) = (model::generate::Reply::Sum, Generated::Classic);
-    let text = generate(&Wanted { cells: CELLS, reply, format, ..Wanted::default() }).unwrap();
+    let text = generate(&Target { cells: CELLS, reply, format, ..Target::default() }).unwrap();
     place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
     let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");
     let said = "cell-node: can0 is real hardware, and cells that answer with sums simulate their wires by frames that \
@@ -432,7 +432,7 @@ fn error_frames_of_the_driver_are_counted() {
 
 #[test]
 #[ignore = "needs Kvaser controllers"]
-fn a_controller_that_is_not_ready_is_refused_with_the_remedy() {
+fn a_controller_that_is_not_ready_is_refused_with_the_hint() {
     let _controllers = Controllers::up();
     // A driver that has just found its hardware knows no bit timing.
     let (driver, address) = ("/sys/bus/pci/drivers/kvaser_pci", address("can0"));

@@ -4,9 +4,9 @@
 
 mod process;
 
-use model::generate::{Format as Wire, Reply, Wanted, generate};
+use model::generate::{Format as Wire, Reply, Target, generate};
 use process::buses::{carries, mixed_skin};
-use process::guest::Guest;
+use process::test_client::TestClient;
 use process::{PRESSED, Place, Running, signal, skin_of, until};
 use protocol::can::Format;
 use rustix::process::{Pid, Signal};
@@ -38,8 +38,8 @@ fn server(place: &Place, bus: &str) -> Pid {
 }
 
 /// Listens on each bus.
-fn guests(place: &Place) -> [Guest; 3] {
-    BUSES.map(|(bus, format)| Guest::on(place, bus, format))
+fn test_clients(place: &Place) -> [TestClient; 3] {
+    BUSES.map(|(bus, format)| TestClient::on(place, bus, format))
 }
 
 /// Ends a bench, and who served vcan1 for it; sees that all adds up on all buses, and that only vcan1 was lost, so
@@ -76,7 +76,7 @@ fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64
 fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same() {
     let place = place();
     let bench = place.running_bench(60.0, "");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     let cells = bench.cells();
     for times in 1..=2 {
         signal(server(&place, "vcan1"), Signal::KILL);
@@ -85,7 +85,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
         said(LOST);
         said("the process that served vcan1 ended (signal: 9 (SIGKILL)); it is served again");
         said("vcan1 works again");
-        guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+        test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     }
     assert_eq!(bench.cells(), cells, "nobody was started anew");
     ended_well(&place, bench, None, 2);
@@ -97,10 +97,10 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
 #[test]
 fn each_bus_has_a_tree_of_its_own_which_is_whole_again_when_the_bus_is_back() {
     let place = place();
-    let wanted = Wanted { cells: CELLS, buses: 3, reply: Reply::Sum, ..Wanted::default() };
-    place.write("skin.toml", &mixed_skin(&generate(&wanted).unwrap(), &["vcan1"]));
+    let expected = Target { cells: CELLS, buses: 3, reply: Reply::Sum, ..Target::default() };
+    place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
     let bench = place.running_bench(60.0, "");
-    let whole = || guests(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
+    let whole = || test_clients(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
     whole();
     let cells = bench.cells();
     signal(server(&place, "vcan1"), Signal::KILL);
@@ -116,16 +116,16 @@ fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_u
     let place = place();
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "--record run.mcap");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     let cells = bench.cells();
     first.signal(Signal::KILL);
     first.end();
     bench.hears(LOST);
     (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "fallen silent"));
     for (bus, format) in [BUSES[0], BUSES[2]] {
-        let guest = Guest::on(&place, bus, format);
-        guest.waits_for_joints(30);
-        guest.waits_for_torques(1..=4);
+        let test_client = TestClient::on(&place, bus, format);
+        test_client.waits_for_joints(30);
+        test_client.waits_for_torques(1..=4);
     }
     // The robot is halted and goes on while the bus does not hear of it.
     place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
@@ -133,11 +133,11 @@ fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_u
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
     (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "spoken again"));
-    let [_, vcan1, _] = guests(&place);
+    let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
     place.start("gateway", "ack vcan2 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     assert_eq!(bench.cells(), cells, "nobody was started anew");
     ended_well(&place, bench, Some(second), 1);
     assert_eq!(place.summary().total("/loop/bad_cycles"), 0, "{:#}", place.summary().0);
@@ -162,16 +162,16 @@ fn cells_that_were_away_hear_of_a_resume_and_of_a_touch_that_they_missed() {
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "");
     place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    Guest::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
+    TestClient::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
     first.signal(Signal::KILL);
     first.end();
     bench.hears(LOST);
     place.start("gateway", "ack vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     // More than the two seconds after which the cells that are away are touched.
-    Guest::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
+    TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
     let second = serve(&place, "vcan1");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);
 }
 
@@ -180,11 +180,11 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     let place = place();
     let vcan1 = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     vcan1.signal(Signal::KILL);
     vcan1.end();
     bench.hears(LOST);
-    Guest::on(&place, "vcan0", Format::Fd).waits_for_joints(30);
+    TestClient::on(&place, "vcan0", Format::Fd).waits_for_joints(30);
     bench.signal(Signal::TERM);
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -204,7 +204,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     place.write("skin.toml", &place.read("skin.toml").replacen("[controller]", safety, 1));
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     first.signal(Signal::KILL);
     first.end();
     bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
@@ -212,7 +212,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     bench.hears("vcan1 works again");
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
-    guests(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
+    test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);
     assert!(place.summary().count("/loop/bad_cycles", "the torque is not valid") >= 25);
 }

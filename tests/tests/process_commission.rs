@@ -8,7 +8,7 @@ use std::fs;
 
 use cell_node::flash;
 use cell_node::identity::Identity;
-use model::generate::{Format, Reply, Wanted, generate};
+use model::generate::{Format, Reply, Target, generate};
 use process::{Ended, Place, Running, skin, skin_of, until};
 use protocol::id::CellId;
 use protocol::parameters::Parameters;
@@ -249,7 +249,7 @@ fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
 #[test]
 fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters() {
     let place = Place::new();
-    let text = generate(&Wanted { cells: 8, reply: Reply::Sum, ..Wanted::default() }).unwrap();
+    let text = generate(&Target { cells: 8, reply: Reply::Sum, ..Target::default() }).unwrap();
     place.write("skin.toml", &text);
     fs::create_dir(place.path("flash")).unwrap();
     let bus = place.start("vcan-setup", "serve vcan0");
@@ -266,9 +266,9 @@ fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters
     until("all of them", || (commission("--quiet --numbers as-is.toml").code() == Some(0)).then_some(()));
     let skin = Skin::read(&place.path("skin.toml")).unwrap();
     let copy = Skin::read(&place.path("as-is.toml")).unwrap();
-    let mut numbers: Vec<_> = copy.cells.iter().map(|cell| cell.node.get()).collect();
-    numbers.sort_unstable();
-    assert_eq!(numbers, (1..=8).collect::<Vec<_>>(), "dense and unique");
+    let mut node_ids: Vec<_> = copy.cells.iter().map(|cell| cell.node.get()).collect();
+    node_ids.sort_unstable();
+    assert_eq!(node_ids, (1..=8).collect::<Vec<_>>(), "dense and unique");
     for (described, there) in skin.cells.iter().zip(&copy.cells) {
         let file = fs::read(place.path(&format!("flash/vcan0-s{}.flash", described.serial))).unwrap();
         let kept = flash::decode(Identity { cell: None, serial: described.serial }, &file).unwrap();
@@ -309,7 +309,7 @@ fn several_buses_are_commissioned_at_the_same_time_or_one_alone() {
 }
 
 #[test]
-fn a_list_is_drawn_anew_while_it_is_watched() {
+fn a_list_is_redrawn_while_it_is_watched() {
     let workshop = Workshop::new(&skin(3));
     let watched = workshop
         .place
@@ -323,7 +323,7 @@ fn a_list_is_drawn_anew_while_it_is_watched() {
 }
 
 #[test]
-fn strangers_are_named_and_left_alone_and_who_is_missing_is_named() {
+fn unknown_nodes_are_named_and_left_alone_and_who_is_missing_is_named() {
     let text = skin(6);
     let workshop = Workshop::new(&text);
     let without: String = {
@@ -333,8 +333,8 @@ fn strangers_are_named_and_left_alone_and_who_is_missing_is_named() {
     workshop.place.write("skin.toml", &without);
     let ended = workshop.commission("").end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    let stranger = "cells on vcan0 that skin.toml does not have, left alone: 4 (serial number 100004)";
-    assert!(ended.stderr.contains(stranger), "{ended:#?}");
+    let unknown_node = "cells on vcan0 that skin.toml does not have, left alone: 4 (serial number 100004)";
+    assert!(ended.stderr.contains(unknown_node), "{ended:#?}");
     assert!(ended.stdout.contains("is not on the bus: switch it on"), "{ended:#?}");
     let listed = workshop.list("--skin skin.toml").unwrap();
     let says: Vec<_> =

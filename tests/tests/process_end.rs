@@ -33,7 +33,7 @@ fn a_signal_ends_a_bench_early_and_well() {
         let place = Place::new();
         place.pressed();
         let bench = place.running_bench(60.0, "");
-        place.guest().waits_for_epoch(10);
+        place.test_client().waits_for_epoch(10);
         bench.signal(signal);
         let ended = bench.end().well();
         place.is_left_clean();
@@ -68,7 +68,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
         command
     });
     bench.hears_the_loop();
-    place.guest().waits_for_epoch(10);
+    place.test_client().waits_for_epoch(10);
     kill_process_group(bench.pid(), Signal::INT).unwrap();
     let ended = bench.end().well();
     place.is_left_clean();
@@ -103,7 +103,7 @@ fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for_epoch(10);
+    place.test_client().waits_for_epoch(10);
     let (server, _) = place.processes().into_iter().find(|(_, line)| line.contains("vcan-setup")).unwrap();
     process::signal(server, Signal::TERM);
     let ended = bench.end();

@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use process::external::{answer, place};
-use process::{PATIENCE, Place, Running, example, until};
+use process::{Place, Running, TIMEOUT, example, until};
 use protocol::message::Message;
 use rustix::process::Signal;
 
@@ -29,7 +29,7 @@ fn the_example_in_python_moves_the_arm() {
     let python = python(&place);
     python.hears("waiting for a gateway at ");
     let bench = place.running_bench(3.0, "");
-    place.guest().waits_for_motion();
+    place.test_client().waits_for_motion();
     bench.end().well();
     place.is_left_clean();
     assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"], "no socket is left");
@@ -48,7 +48,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     let first = python(&place);
     first.hears("waiting for a gateway at ");
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for_motion();
+    place.test_client().waits_for_motion();
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
     bench.hears(&format!(
@@ -60,7 +60,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
-    place.guest().waits_for_motion();
+    place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
     bench.end().well();
     place.is_left_clean();
@@ -80,7 +80,7 @@ fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
     own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), &gateway).unwrap();
 
     let mut state = [0; 200];
-    let (mut told, give_up) = (0, Instant::now() + PATIENCE);
+    let (mut told, give_up) = (0, Instant::now() + TIMEOUT);
     while told < 200 {
         assert!(Instant::now() < give_up, "the gateway stopped talking to us: {}", bench.stderr());
         let Ok(184) = own.recv(&mut state) else { continue };

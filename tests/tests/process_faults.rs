@@ -107,10 +107,10 @@ fn a_cell_that_is_stopped_and_continued_skips_what_it_missed_and_comes_back() {
     process::signal(cell, Signal::STOP);
     until("a stopped cell", || is_stopped(cell).then_some(()));
     bench.tells(7, "fallen silent");
-    let guest = place.guest();
+    let test_client = place.test_client();
     process::signal(cell, Signal::CONT);
     bench.tells(7, "spoken again");
-    guest.waits_for("a torque of cell 7", torque_of(7));
+    test_client.waits_for("a torque of cell 7", torque_of(7));
     bench.signal(Signal::TERM);
     bench.end().well();
     let summary = place.summary();
@@ -148,7 +148,7 @@ fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
     }
     let files = ["buses", "run.log", "scenario.toml", "second.json", "second.log", "skin.toml"];
     assert_eq!(place.files(), files.sorted());
-    place.guest().waits_for("a torque", torque_of(1));
+    place.test_client().waits_for("a torque", torque_of(1));
     assert_eq!(bench.cells().len(), 8);
     bench.signal(Signal::TERM);
     bench.end().well();
@@ -177,7 +177,7 @@ fn cells_on_the_bus_are_not_started_twice() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 2-3 --skin skin.toml");
-    place.guest().waits_for(
+    place.test_client().waits_for(
         "cell 3",
         |message| matches!(message, Message::Network { from: Node::Cell(cell), .. } if cell.get() == 3),
     );
@@ -200,7 +200,7 @@ fn a_newcomer_under_a_taken_number_leaves_with_one_line() {
         let said = "cell-node: cell 3 is on vcan0 already, with serial number 100003: stop that one or give \
                     this one another number";
         assert_eq!(newcomer.end().refusal(1), said);
-        place.guest().waits_for("a torque of cell 3", torque_of(3));
+        place.test_client().waits_for("a torque of cell 3", torque_of(3));
         bench.signal(Signal::TERM);
         let ended = bench.end().well();
         let summary = place.summary();
@@ -258,15 +258,15 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for_epoch(5);
+    let test_client = place.test_client();
+    test_client.waits_for_epoch(5);
     let odd = odd_frames();
     for _ in 0..3 {
         for (frame, _) in &odd {
-            guest.bus.send(&[*frame]).unwrap();
+            test_client.bus.send(&[*frame]).unwrap();
         }
     }
-    guest.waits_for("torques after that", torque_of(8));
+    test_client.waits_for("torques after that", torque_of(8));
     bench.signal(Signal::TERM);
     bench.end().well();
     let summary = place.summary();
@@ -299,17 +299,17 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     // The touch moves the arm.
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for_motion();
+    let test_client = place.test_client();
+    test_client.waits_for_motion();
     let sent = place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
     bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded` lets it go on");
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
-    let guest = place.guest();
-    guest.waits_for("a torque", torque_of(1));
-    guest.waits_for_motion();
-    guest.sends(&Message::Halt);
+    let test_client = place.test_client();
+    test_client.waits_for("a torque", torque_of(1));
+    test_client.waits_for_motion();
+    test_client.sends(&Message::Halt);
     let halted = || bench.stderr().matches("the robot is halted").count() == 2;
     until("a second halt", || halted().then_some(()));
     bench.signal(Signal::TERM);
@@ -325,7 +325,7 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     assert!(ended.stdout.contains("somebody sent a halt frame"), "{}", ended.stdout);
 
     let log = Log::read(&place.read("run.log"), Format::Fd);
-    let at = |wanted: &Message| log.messages.iter().rposition(|(message, _)| message == wanted).unwrap();
+    let at = |expected: &Message| log.messages.iter().rposition(|(message, _)| message == expected).unwrap();
     let halt = log.messages.iter().position(|(message, _)| *message == Message::Halt).unwrap();
     let resume = at(&Message::Resume);
     assert!(halt < resume);
@@ -346,20 +346,20 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
 }
 
 #[test]
-fn a_cell_that_starts_anew_while_the_robot_is_halted_is_halted_too() {
+fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for("a torque", torque_of(3));
-    guest.sends(&Message::Halt);
+    let test_client = place.test_client();
+    test_client.waits_for("a torque", torque_of(3));
+    test_client.sends(&Message::Halt);
     bench.hears("the robot is halted");
     process::signal(bench.cell(3), Signal::KILL);
     bench.hears("the process of cell 3 on vcan0 ended");
     let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
     bench.hears("cell 3 on vcan0 started anew");
     // One that has heard nothing of its first life.
-    let guest = place.guest();
+    let test_client = place.test_client();
     let state = |message: &Message| match message {
         Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
             (from.to_byte() == 3).then_some(heartbeat.state)
@@ -368,22 +368,22 @@ fn a_cell_that_starts_anew_while_the_robot_is_halted_is_halted_too() {
     };
     let says = |bits| move |message: &Message| state(message).is_some_and(|state| state.has(bits));
     let settled = |message: &Message| state(message).is_some_and(|state| !state.has(State::CLAIMING));
-    guest.waits_for("cell 3 that has its number", settled);
-    guest.waits_for("another halt", |message| *message == Message::Halt);
-    guest.waits_for("a cell 3 that is halted", says(State::HALTED));
+    test_client.waits_for("cell 3 that has its number", settled);
+    test_client.waits_for("another halt", |message| *message == Message::Halt);
+    test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
-    guest.waits_for("its torque", torque_of(3));
+    test_client.waits_for("its torque", torque_of(3));
     bench.signal(Signal::TERM);
     bench.end().well();
     place.summary().adds_up();
 
     let log = Log::read(&place.read("run.log"), Format::Fd);
-    let from = |index: usize, wanted: &dyn Fn(&Message) -> bool| {
-        index + log.messages[index..].iter().position(|(message, _)| wanted(message)).unwrap()
+    let from = |index: usize, expected: &dyn Fn(&Message) -> bool| {
+        index + log.messages[index..].iter().position(|(message, _)| expected(message)).unwrap()
     };
     let halt = from(0, &|message| *message == Message::Halt);
-    let anew = from(from(halt, &says(State::CLAIMING)), &settled);
-    let told = from(anew, &|message| *message == Message::Halt);
+    let restarted = from(from(halt, &says(State::CLAIMING)), &settled);
+    let told = from(restarted, &|message| *message == Message::Halt);
     let resumed = from(told, &|message| *message == Message::Resume);
     assert_eq!(log.torques_after(told, 3) - log.torques_after(resumed, 3), 0, "torques of a halted cell");
 }

@@ -74,11 +74,8 @@ fn a_log_survives_its_writer_being_killed_at_any_moment() {
         .collect();
     let mut older: Vec<_> = threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect();
     older.sort_by(f64::total_cmp);
-    let [median, greatest] = [older[older.len() / 2], older[older.len() - 1]];
-    println!(
-        "{} kills: the last line is {median:.0} ms older (median), at most {greatest:.0} ms",
-        older.len()
-    );
+    let [median, max] = [older[older.len() / 2], older[older.len() - 1]];
+    println!("{} kills: the last line is {median:.0} ms older (median), at most {max:.0} ms", older.len());
 }
 
 #[test]
@@ -293,10 +290,10 @@ fn a_run_that_fails_has_a_summary_that_says_why() {
 
     // While it runs: another gateway.
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for_epoch(10);
+    let test_client = place.test_client();
+    test_client.waits_for_epoch(10);
     let positions = [Q1_14::ZERO; WORDS];
-    guest.sends(&Message::Joints { epoch: Epoch(77), joints: Joints { positions, in_use: 6 } });
+    test_client.sends(&Message::Joints { epoch: Epoch(77), joints: Joints { positions, in_use: 6 } });
     let ended = bench.end();
     let summary = failed(&place, &ended);
     assert!(summary.number("/loop/ticks") > 0 && ended.stdout.contains(" s, failed "), "{ended:#?}");

@@ -104,7 +104,7 @@ fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     let cells = place
         .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
     cells.hears("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
-    place.guest().waits_for("a heartbeat of cell 3 that says so", |message| {
+    place.test_client().waits_for("a heartbeat of cell 3 that says so", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
             if cell.get() == 3
                 && heartbeat.state.has(State::FLASH_DAMAGED)
@@ -113,7 +113,7 @@ fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     });
     let bench = place.running_bench(60.0, "--no-spawn");
     bench.hears("cells that have no parameters, the run goes on without them: 3 on vcan0");
-    place.guest().waits_for_epoch(20);
+    place.test_client().waits_for_epoch(20);
     bench.signal(Signal::TERM);
     bench.end().well();
     let summary = place.summary();

@@ -7,7 +7,7 @@ use std::os::unix::net::UnixDatagram;
 use std::time::{Duration, Instant};
 
 use process::external::{answer, place};
-use process::{PATIENCE, PRESSED, Place, Running, Summary, until};
+use process::{PRESSED, Place, Running, Summary, TIMEOUT, until};
 use protocol::message::Message;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -24,7 +24,7 @@ fn control(place: &Place, bench: &Running, answers: u32) {
     own.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
     until("the gateway's socket", || gateway.exists().then_some(()));
     own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), &gateway).unwrap();
-    let (mut state, mut answered, give_up) = ([0; 200], 0, Instant::now() + PATIENCE);
+    let (mut state, mut answered, give_up) = ([0; 200], 0, Instant::now() + TIMEOUT);
     loop {
         assert!(Instant::now() < give_up, "the robot is not halted: {}", bench.stderr());
         let Ok(184) = own.recv(&mut state) else { continue };
@@ -127,7 +127,7 @@ fn a_lost_bus_that_halts_is_told_with_its_name_and_the_halt_has_the_exit_code() 
     let server = place.start("vcan-setup", "serve vcan1");
     server.prints("serving vcan1 at ");
     let bench = place.running_bench(60.0, "");
-    process::guest::Guest::on(&place, "vcan1", protocol::can::Format::Fd).waits_for_epoch(20);
+    process::test_client::TestClient::on(&place, "vcan1", protocol::can::Format::Fd).waits_for_epoch(20);
     server.signal(Signal::TERM);
     server.end().well();
     bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
@@ -149,8 +149,8 @@ fn a_halt_that_was_resumed_is_told_and_the_run_is_well() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for_epoch(10);
+    let test_client = place.test_client();
+    test_client.waits_for_epoch(10);
     place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot is halted: somebody sent a halt frame");
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
@@ -189,7 +189,7 @@ fn cells_that_are_halted_at_the_end_of_a_run_are_no_halt_of_the_robot() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for_epoch(5);
+    place.test_client().waits_for_epoch(5);
     bench.signal(Signal::INT);
     let ended = bench.end().well();
     let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);

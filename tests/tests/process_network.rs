@@ -16,10 +16,10 @@ use std::time::{Duration, Instant};
 use cell_node::flash;
 use cell_node::identity::Identity;
 use model::decode::Decoded;
-use model::generate::{Format as Wanted, Reply, generate};
+use model::generate::{Format as Target, Reply, generate};
 use model::network::Uplinks;
-use process::guest::Guest;
-use process::{PATIENCE, Place, Running, names, until};
+use process::test_client::TestClient;
+use process::{Place, Running, TIMEOUT, names, until};
 use protocol::bus::Inbox;
 use protocol::can::Frame;
 use protocol::fixed::Q5_10;
@@ -31,7 +31,7 @@ use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Reply as Answers, Slots};
 use protocol::skin::{Skin, Wires};
 use protocol::time::Micros;
-use protocol::wire::Lane;
+use protocol::wire::LinkId;
 use rustix::process::Signal;
 
 /// Cells in most skins.
@@ -40,10 +40,10 @@ const CELLS: u8 = 12;
 const UNCONFIGURED: u16 = 0;
 
 /// A skin of cells that answer with sums.
-fn sums(place: &Place, cells: u8, format: Wanted) -> Skin {
+fn sums(place: &Place, cells: u8, format: Target) -> Skin {
     let cells = usize::from(cells);
-    let wanted = model::generate::Wanted { cells, reply: Reply::Sum, format, ..Default::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = model::generate::Target { cells, reply: Reply::Sum, format, ..Default::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     Skin::read(&place.path("skin.toml")).unwrap()
 }
 
@@ -60,9 +60,9 @@ fn cells(place: &Place, which: &str, more: &str) -> Running {
 
 /// The gateway's side of the bus: the other end of the roots' wires, and an ear.
 struct Side {
-    guest: Guest,
+    test_client: TestClient,
     cells: usize,
-    roots: Vec<(CellId, Lane)>,
+    roots: Vec<(CellId, LinkId)>,
     uplinks: Uplinks,
     start: Instant,
     heartbeats: BTreeMap<u8, Heartbeat>,
@@ -76,7 +76,7 @@ impl Side {
         let wires: Wires = skin.wires(0);
         let roots: Vec<_> = wires.roots().collect();
         Self {
-            guest: Guest::on(place, "vcan0", skin.buses[0].format),
+            test_client: TestClient::on(place, "vcan0", skin.buses[0].format),
             cells: skin.cells.len(),
             uplinks: Uplinks::new(roots.len(), 0, Micros(0)),
             roots,
@@ -92,9 +92,9 @@ impl Side {
     }
 
     /// Lets everything happen until it is as wanted.
-    fn until(&mut self, what: &str, wanted: impl Fn(&Self) -> bool) {
-        let give_up = Instant::now() + PATIENCE;
-        while !wanted(self) {
+    fn until(&mut self, what: &str, expected: impl Fn(&Self) -> bool) {
+        let give_up = Instant::now() + TIMEOUT;
+        while !expected(self) {
             assert!(
                 Instant::now() < give_up,
                 "{what}: {:?} {:?} {:?}",
@@ -113,14 +113,14 @@ impl Side {
         loop {
             self.uplinks.handle_time(self.now());
             while let Some((root, message)) = self.uplinks.poll_transmit() {
-                self.guest.bus.send(&[self.roots[root].1.frame(message)]).unwrap();
+                self.test_client.bus.send(&[self.roots[root].1.frame(message)]).unwrap();
             }
             let left = end.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;
             }
-            self.guest.bus.wait(Some(left.min(Duration::from_millis(1)))).unwrap();
-            self.guest.bus.receive(&mut inbox).unwrap();
+            self.test_client.bus.wait(Some(left.min(Duration::from_millis(1)))).unwrap();
+            self.test_client.bus.receive(&mut inbox).unwrap();
             for received in inbox.frames() {
                 self.take(&received.frame);
             }
@@ -129,16 +129,16 @@ impl Side {
 
     fn take(&mut self, frame: &Frame) {
         let now = self.now();
-        if let Some(lane) = Lane::from_raw_id(frame.raw_id()) {
-            let root = self.roots.iter().position(|(_, ours)| ours.reversed() == lane);
-            if let (Some(root), Some(message)) = (root, lane.read(frame)) {
+        if let Some(link) = LinkId::from_raw_id(frame.raw_id()) {
+            let root = self.roots.iter().position(|(_, ours)| ours.reversed() == link);
+            if let (Some(root), Some(message)) = (root, link.read(frame)) {
                 self.uplinks.handle(now, root, message);
             }
             return;
         }
-        let message = match self.guest.decodes(now, frame) {
+        let message = match self.test_client.decodes(now, frame) {
             Decoded::Message(message) => message,
-            Decoded::Half { .. } => return,
+            Decoded::Segment { .. } => return,
             other => panic!("{other:?}"),
         };
         match message {
@@ -157,7 +157,7 @@ impl Side {
     }
 
     /// Whether every cell has a number of its own and a parent.
-    fn is_organised(&self) -> bool {
+    fn is_tree_ready(&self) -> bool {
         let settled = |heartbeat: &&Heartbeat| !heartbeat.state.has(State::CLAIMING);
         self.heartbeats.values().filter(settled).count() == self.cells
             && self.trees.len() == self.cells
@@ -172,7 +172,7 @@ impl Side {
 
 #[test]
 fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
-    for format in [Wanted::Fd, Wanted::Classic] {
+    for format in [Target::Fd, Target::Classic] {
         let place = Place::new();
         let skin = sums(&place, CELLS, format);
         fs::create_dir(place.path("flash")).unwrap();
@@ -188,7 +188,7 @@ fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
         };
         let running = start();
         let mut side = Side::new(&place, &skin);
-        side.until("a tree of cells with numbers", Side::is_organised);
+        side.until("a tree of cells with numbers", Side::is_tree_ready);
         let numbers = side.numbers();
         let serials: BTreeSet<_> = skin.cells.iter().map(|cell| cell.serial).collect();
         assert_eq!(numbers.keys().copied().collect::<BTreeSet<_>>(), serials);
@@ -218,19 +218,19 @@ fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
 #[test]
 fn sums_reach_the_roots_whoever_shares_a_process() {
     for (format, count, shared) in [
-        (Wanted::Fd, 12, vec!["--nodes 1-12"]),
-        (Wanted::Classic, 12, vec!["--nodes 1-12"]),
-        (Wanted::Fd, 12, vec!["--nodes 1-4", "--node 5", "--nodes 6-12"]),
-        (Wanted::Classic, 12, vec!["--nodes 1-7", "--nodes 8-12"]),
+        (Target::Fd, 12, vec!["--nodes 1-12"]),
+        (Target::Classic, 12, vec!["--nodes 1-12"]),
+        (Target::Fd, 12, vec!["--nodes 1-4", "--node 5", "--nodes 6-12"]),
+        (Target::Classic, 12, vec!["--nodes 1-7", "--nodes 8-12"]),
         // More identifiers and wires than a socket takes filters.
-        (Wanted::Fd, 100, vec!["--nodes 1-99", "--node 100"]),
+        (Target::Fd, 100, vec!["--nodes 1-99", "--node 100"]),
     ] {
         let place = Place::new();
         let skin = sums(&place, count, format);
         let server = server(&place);
         let running: Vec<_> = shared.iter().map(|which| cells(&place, which, "")).collect();
         let mut side = Side::new(&place, &skin);
-        side.until("a tree", Side::is_organised);
+        side.until("a tree", Side::is_tree_ready);
         assert!(side.numbers().iter().all(|(&serial, &number)| {
             skin.cells.iter().any(|cell| cell.serial == serial && cell.node.get() == number)
         }));
@@ -239,20 +239,20 @@ fn sums_reach_the_roots_whoever_shares_a_process() {
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).unwrap();
         let reply = Answers::Sum(Slots { slot_us, deepest, carry: true });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
-        side.guest.sends(&Message::Configure { to: Node::Everyone, tag: 1, request });
+        side.test_client.sends(&Message::Configure { to: Node::Everyone, tag: 1, request });
         let touch = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-        side.guest.sends(&Message::Stimulus {
+        side.test_client.sends(&Message::Stimulus {
             to: Node::Everyone,
             from: From::Next,
             page: SensorPage::Skin(touch),
         });
         // A parent hears a child's sums from the epoch on that the child told it of.
         let (root, _) = side.roots[0];
-        let give_up = Instant::now() + PATIENCE;
+        let give_up = Instant::now() + TIMEOUT;
         let mut epoch = 0_u8;
         loop {
             epoch = epoch.wrapping_add(1);
-            side.guest.sends(&Message::Joints {
+            side.test_client.sends(&Message::Joints {
                 epoch: Epoch(epoch),
                 joints: Joints { in_use: 6, ..Joints::default() },
             });
@@ -269,7 +269,7 @@ fn sums_reach_the_roots_whoever_shares_a_process() {
 #[test]
 fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     let place = Place::new();
-    let skin = sums(&place, CELLS, Wanted::Fd);
+    let skin = sums(&place, CELLS, Target::Fd);
     let away = "no embedded bus vcan0 is served in";
     let refused = cells(&place, "--node 1", "").end();
     assert!(refused.refusal(2).contains(away), "{refused:?}");
@@ -279,7 +279,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     let first = server(&place);
     let last = cells(&place, "--node 12", "--reconnect");
     let mut side = Side::new(&place, &skin);
-    side.until("a tree", Side::is_organised);
+    side.until("a tree", Side::is_tree_ready);
     let without = cells(&place, "--node 1", "");
     let said = without.end();
     assert!(said.refusal(1).contains("cell 1 is on vcan0 already"), "{said:?}");
@@ -294,8 +294,8 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
         assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not start anew");
         assert!(heartbeat.sent.wrapping_sub(before[cell].sent) < 0x8000, "cell {cell} went on counting");
     }
-    side.guest.sends(&Message::Report);
-    side.until("a tree again", Side::is_organised);
+    side.test_client.sends(&Message::Report);
+    side.until("a tree again", Side::is_tree_ready);
     until("nobody said anything else", || (shared.stderr().lines().count() == 1).then_some(()));
     assert_eq!(last.stderr(), "");
 
@@ -320,7 +320,7 @@ fn heard(side: &mut Side) -> BTreeMap<u8, Heartbeat> {
 #[test]
 fn flash_of_another_number_is_not_used() {
     let place = Place::new();
-    let skin = sums(&place, CELLS, Wanted::Fd);
+    let skin = sums(&place, CELLS, Target::Fd);
     fs::create_dir(place.path("flash")).unwrap();
     let server = server(&place);
     let serial = skin.cells[1].serial;

@@ -8,7 +8,7 @@ use std::fs;
 use std::time::Duration;
 
 use analysis::report::run::{Options, report};
-use model::generate::{Format, Reply, Wanted, generate};
+use model::generate::{Format, Reply, Target, generate};
 use process::replay::{TOUCHED, says_everything};
 use process::{Place, skin_of, until};
 use rustix::process::Signal;
@@ -33,24 +33,24 @@ fn parts(place: &Place) -> Vec<String> {
 }
 
 /// Sees that each part answers by itself as it is recorded, and all together.
-fn all_come_back(place: &Place, least: u64) {
+fn all_come_back(place: &Place, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
     assert!(parts.len() >= 4, "{parts:?}");
-    let way = "--expect --spawn --max --quiet --cells-per-process 8";
+    let route = "--expect --spawn --max --quiet --cells-per-process 8";
     let mut equal = 0;
     for part in &parts {
-        let (ended, replayed) = place.replayed(part, way);
+        let (ended, replayed) = place.replayed(part, route);
         let came_back = replayed.all_came_back(&ended);
         // In the second part at least something was pressed in the one before.
-        assert!(part != "run-1.mcap" || came_back > least / 10, "{came_back} in {part}: {:#}", replayed.0);
+        assert!(part != "run-1.mcap" || came_back > min / 10, "{came_back} in {part}: {:#}", replayed.0);
         equal += came_back;
     }
     // In whatever order.
     let backwards = parts.iter().rev().map(String::as_str).collect::<Vec<_>>().join(" ");
-    let (ended, replayed) = place.replayed(&backwards, way);
+    let (ended, replayed) = place.replayed(&backwards, route);
     let together = replayed.all_came_back(&ended);
-    assert!(together >= least && equal >= least, "{equal} one by one, {together} together");
+    assert!(together >= min && equal >= min, "{equal} one by one, {together} together");
     let title = format!("run.mcap to {} ({} parts)", parts.last().unwrap(), parts.len());
     assert_eq!(replayed.text("/file"), title);
     place.is_left_clean();
@@ -62,7 +62,7 @@ fn parts_of_a_run_in_which_everything_was_said_come_back() {
     let skin = place.skin(8);
     place.scenario(&touched(1));
     let bench = place.running_bench(4.2, "--record run.mcap --record-split 1s");
-    says_everything(&place.guest(), &skin);
+    says_everything(&place.test_client(), &skin);
     bench.end().well();
     all_come_back(&place, 300);
 }
@@ -91,9 +91,9 @@ fn parts_of_cells_that_tell_events_come_back() {
 #[test]
 fn parts_of_cells_that_tell_all_the_time_on_a_slow_bus_come_back() {
     let place = Place::new();
-    let wanted = Wanted { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..Wanted::default() };
+    let expected = Target { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..Target::default() };
     let sensing = "format = \"classic\"\nsensing = \"continuous\"\nsensing_hz = 5.0";
-    place.write("skin.toml", &generate(&wanted).unwrap().replace("format = \"classic\"", sensing));
+    place.write("skin.toml", &generate(&expected).unwrap().replace("format = \"classic\"", sensing));
     place.scenario(&touched(1));
     place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
     all_come_back(&place, 150);
@@ -102,8 +102,8 @@ fn parts_of_cells_that_tell_all_the_time_on_a_slow_bus_come_back() {
 #[test]
 fn parts_of_sums_come_back_with_what_rounding_carries() {
     let place = Place::new();
-    let wanted = Wanted { cells: 10, reply: Reply::Sum, ..Wanted::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = Target { cells: 10, reply: Reply::Sum, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(&touched(1));
     place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
     all_come_back(&place, 150);
@@ -126,8 +126,8 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     assert!(ended.stdout.contains("felt       0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
     let whole = place.start("gateway", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
-    let felt = |text: &str| text.lines().find(|line| line.contains("felt")).unwrap().to_owned();
-    assert_eq!(felt(&whole.stdout), felt(&ended.stdout));
+    let contact_state = |text: &str| text.lines().find(|line| line.contains("felt")).unwrap().to_owned();
+    assert_eq!(contact_state(&whole.stdout), contact_state(&ended.stdout));
 
     let stats = |files: &str| -> Value {
         let ended = place.start("gateway", &format!("dump {files} --stats --json")).end().well();
@@ -146,7 +146,7 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     // No packet of the part before counts as lost in this one.
     let summary = place.summary();
     let ways = ["dropped", "backlog", "outage", "unknown"];
-    let lost: u64 = ways.iter().map(|way| summary.number(&format!("/buses/0/uplink/{way}"))).sum();
+    let lost: u64 = ways.iter().map(|route| summary.number(&format!("/buses/0/uplink/{route}"))).sum();
     for files in [parts.as_str(), "run-2.mcap"] {
         let files: Vec<_> = files.split(' ').map(|name| place.path(name)).collect();
         let report = report(&files, &Options::default()).unwrap();
@@ -202,15 +202,15 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     let left: Vec<_> = left.collect();
     let last = left.iter().filter(|name| name.ends_with(".part")).max();
     let last = last.unwrap_or_else(|| panic!("{left:?}"));
-    let way = "--expect --spawn --max --quiet";
+    let route = "--expect --spawn --max --quiet";
     let whole = parts(&place).join(" ");
     let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --max");
     let as_it_is = replayed.all_came_back(&ended);
     assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
     place.start("gateway", &format!("recover {last} -o z-recovered.mcap")).end().well();
-    let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), way);
+    let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), route);
     assert_eq!(replayed.all_came_back(&ended), as_it_is);
-    let (ended, replayed) = place.replayed("z-recovered.mcap", way);
+    let (ended, replayed) = place.replayed("z-recovered.mcap", route);
     replayed.all_came_back(&ended);
     assert!(as_it_is > 100, "{as_it_is}");
     place.is_left_clean();

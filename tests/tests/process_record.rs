@@ -24,7 +24,7 @@ fn frames_are_whole(lines: &[String], place: &Place, summary: &Summary, frames_a
     let log = place.read("run.log");
     let first = log.lines().zip(lines).position(|(log, line)| log != line);
     assert_eq!(first, None, "the first line that differs");
-    let packets = ["received", "sent"].map(|way| summary.total(&format!("/buses/0/{way}")));
+    let packets = ["received", "sent"].map(|route| summary.total(&format!("/buses/0/{route}")));
     let counted = packets.iter().sum::<u64>() * frames_a_packet;
     assert_eq!((log.lines().count() as u64, lines.len() as u64), (counted, counted));
     let recorded = ["frames", "lost"].map(|key| summary.number(&format!("/recording/{key}")));
@@ -262,7 +262,7 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     let recorded = Recorded::read(&place.path("run.mcap"));
     let lines = recorded.lines("/can/vcan0");
     let packets =
-        ["received", "sent"].map(|way| summary.total(&format!("/buses/0/{way}"))).iter().sum::<u64>();
+        ["received", "sent"].map(|route| summary.total(&format!("/buses/0/{route}"))).iter().sum::<u64>();
     let [frames, lost, unwritten] =
         ["frames", "lost", "lost_write"].map(|key| summary.number(&format!("/recording/{key}")));
     assert_eq!((frames, frames + lost, lost), (lines.len() as u64, packets, unwritten), "{:#}", summary.0);
@@ -321,11 +321,11 @@ type Heard = std::sync::Arc<std::sync::Mutex<Vec<(u64, protocol::can::Frame)>>>;
 
 /// Listens on a place's bus until it is gone.
 fn listen(place: &Place) -> (Heard, std::thread::JoinHandle<()>) {
-    let (heard, guest) = (Heard::default(), place.guest());
+    let (heard, test_client) = (Heard::default(), place.test_client());
     let into = std::sync::Arc::clone(&heard);
     let listen = move || {
         let mut inbox = protocol::bus::Inbox::new();
-        while guest.bus.wait(None).and_then(|_| guest.bus.receive(&mut inbox)).is_ok() {
+        while test_client.bus.wait(None).and_then(|_| test_client.bus.receive(&mut inbox)).is_ok() {
             let frames = inbox.frames().map(|received| (received.at_nanos, received.frame));
             into.lock().unwrap().extend(frames);
         }

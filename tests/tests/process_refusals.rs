@@ -172,8 +172,8 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
         ] {
             let said =
                 refusal(&place, "gateway", &format!("run skin.toml --bus-kind embedded {option} {file}"), 2);
-            let remedy = "name a file in a folder that can be written";
-            assert_eq!(said, format!("gateway: {option} {file}: {why}; {remedy}"));
+            let hint = "name a file in a folder that can be written";
+            assert_eq!(said, format!("gateway: {option} {file}: {why}; {hint}"));
         }
     }
     let both = "run skin.toml --bus-kind embedded --candump file --summary file";
@@ -197,7 +197,7 @@ fn a_run_that_fails_to_start_leaves_old_recordings_as_they_were_and_says_so_in_i
 }
 
 #[test]
-fn a_bus_that_does_not_exist_is_named_with_its_remedy() {
+fn a_bus_that_does_not_exist_is_named_with_its_hint() {
     let place = Place::new();
     place.write("skin.toml", &skin(3).replace("\"vcan0\"", "\"nosuch0\""));
     let expected = match Choice::Auto.resolve() {

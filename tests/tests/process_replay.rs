@@ -23,10 +23,10 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
     let place = Place::new();
     place.records(8);
     let mut counts = Vec::new();
-    for way in ["", "--spin 0", "--lockstep --speed 4", "--max", "--max --cells-per-process 8", "--max"] {
-        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {way}"));
+    for route in ["", "--spin 0", "--lockstep --speed 4", "--max", "--max --cells-per-process 8", "--max"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         place.is_left_clean();
-        let count = if way.contains("--max") || way.contains("--lockstep") {
+        let count = if route.contains("--max") || route.contains("--lockstep") {
             replayed.all_came_back(&ended)
         } else {
             replayed.all_came_back_in_time(&ended)
@@ -74,7 +74,7 @@ fn a_recording_brings_its_own_skin() {
 }
 
 #[test]
-fn the_second_file_of_a_recording_begins_with_what_was_in_force() {
+fn the_second_file_of_a_recording_begins_with_what_was_latched() {
     let place = Place::new();
     place.skin(5);
     place.scenario(process::PRESSED);
@@ -94,8 +94,8 @@ fn two_buses_of_classic_frames_come_back_too() {
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));
     place.scenario(process::PRESSED);
     place.bench(2.0, "").end().well();
-    for way in ["--max", "--lockstep --from 1"] {
-        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {way}"));
+    for route in ["--max", "--lockstep --from 1"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         assert!(replayed.all_came_back(&ended) > 100, "{:#}", replayed.0);
         assert_eq!(replayed.0["buses"].as_array().unwrap().len(), 2);
         assert!(replayed.number("/buses/1/sent") > 50, "{:#}", replayed.0);
@@ -128,19 +128,19 @@ fn cells_that_have_been_through_something_else_answer_as_they_did_then() {
     let place = Place::new();
     place.records(8);
     let _bench = by_hand(&place, "1-8");
-    let guest = place.guest();
+    let test_client = place.test_client();
     for round in 0..2 {
         // Pressed, halted, and in an epoch that comes soon.
         let page = SensorPage::Skin(SkinSensors {
             contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
             ..SkinSensors::default()
         });
-        guest.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
-        guest.sends(&Message::Joints {
+        test_client.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+        test_client.sends(&Message::Joints {
             epoch: protocol::packet::Epoch(3),
             joints: protocol::message::Joints { in_use: 6, ..Default::default() },
         });
-        guest.sends(&Message::Halt);
+        test_client.sends(&Message::Halt);
         // The configuration was changed in the middle of the run, and a restart from there has it again.
         let part = if round == 0 { "--to 1.2" } else { "--from 2" };
         let (ended, replayed) = place.replayed("run.log", &format!("--expect --max {part}"));
@@ -246,8 +246,8 @@ fn is_sum(message: &Message, cell: u8) -> bool {
 #[test]
 fn sums_come_back_less_their_children_whatever_the_tree() {
     let place = Place::new();
-    let wanted = generate::Wanted { cells: 12, reply: generate::Reply::Sum, ..generate::Wanted::default() };
-    place.write("skin.toml", &generate::generate(&wanted).unwrap());
+    let expected = generate::Target { cells: 12, reply: generate::Reply::Sum, ..generate::Target::default() };
+    place.write("skin.toml", &generate::generate(&expected).unwrap());
     place.scenario(TOUCHED);
     place.bench(4.0, "--record run.mcap").end().well();
     place.is_left_clean();
@@ -258,9 +258,9 @@ fn sums_come_back_less_their_children_whatever_the_tree() {
         let lacking = |why| replayed.number(&format!("/expect/lacking/{why}"));
         assert_eq!(lacking("tree_unknown"), 0, "{:#}", replayed.0);
         // Where the machine was away, cells look for other parents; mostly they do not.
-        let left_out = lacking("parent_changing") + lacking("sums_not_taken");
+        let omitted = lacking("parent_changing") + lacking("sums_not_taken");
         let sums = replayed.number("/expect/sums");
-        assert!(sums > 300 && sums > 2 * left_out, "{:#}", replayed.0);
+        assert!(sums > 300 && sums > 2 * omitted, "{:#}", replayed.0);
     }
 
     // The root, which feels nothing, adds something to what it passes on.
@@ -289,7 +289,7 @@ fn a_killed_cell_is_named_and_its_replies_are_missing() {
     let place = Place::new();
     place.records(8);
     let replay = place.replay("run.log", &format!("{FRESH} --lockstep"));
-    place.guest().waits_for_epoch(30);
+    place.test_client().waits_for_epoch(30);
     process::signal(replay.cell(1), Signal::KILL);
     let ended = replay.end();
     place.is_left_clean();
@@ -326,29 +326,29 @@ fn a_cell_that_measures_obeys_for_the_replay_when_it_is_told_to() {
     let place = Place::new();
     place.records(8);
     let _bench = by_hand(&place, "1-8");
-    let guest = place.guest();
+    let test_client = place.test_client();
     let mode = |tag, request| Message::Configure { to: Node::Cell(cell(3)), tag, request };
     let number = Parameter::Mode.number();
-    let answers = |tag: u8, wanted: i16| {
+    let answers = |tag: u8, expected: i16| {
         move |message: &Message| {
             matches!(message, Message::Configured { tag: of, answer: protocol::message::Answer::Value { words, .. }, .. }
-                if *of == tag && words[0] == wanted)
+                if *of == tag && words[0] == expected)
         }
     };
-    guest.waits_for("a cell that has settled", |message| {
+    test_client.waits_for("a cell that has settled", |message| {
         matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
             if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
     });
-    guest.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
-    guest.waits_for("a cell that measures", answers(1, 0));
+    test_client.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
+    test_client.waits_for("a cell that measures", answers(1, 0));
     let ended = place.replay("run.log", "--expect --to 1 --quiet").end();
     let said = "gateway: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
                 obey while the replay lasts";
     assert_eq!(ended.refusal(1), said);
     let (ended, replayed) = place.replayed("run.log", "--expect --max --to 1 --test-mode");
     assert!(replayed.all_came_back(&ended) > 50);
-    guest.sends(&mode(2, Request::Read { number }));
-    guest.waits_for("a cell that measures again", answers(2, 0));
+    test_client.sends(&mode(2, Request::Read { number }));
+    test_client.waits_for("a cell that measures again", answers(2, 0));
 }
 
 /// The whole skin, while it is stroked: a few seconds of it, twice.
@@ -360,8 +360,8 @@ fn two_hundred_and_fifty_three_fresh_cells_answer_as_the_others_did_twice() {
     place.bench(4.0, "").end().well();
     place.is_left_clean();
     let mut counts = Vec::new();
-    for way in ["--lockstep", "--max"] {
-        let replay = place.replay("run.log", &format!("{FRESH} {way}"));
+    for route in ["--lockstep", "--max"] {
+        let replay = place.replay("run.log", &format!("{FRESH} {route}"));
         let ended = replay.end_after(Duration::from_secs(120));
         let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
         counts.push(replayed.all_came_back(&ended));

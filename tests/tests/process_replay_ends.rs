@@ -16,7 +16,7 @@ fn an_interrupted_replay_says_how_far_it_came_and_leaves_nothing() {
     let place = Place::new();
     place.records(8);
     let replay = place.replay("run.log", &format!("{FRESH} --loop 0"));
-    place.guest().waits_for_epoch(30);
+    place.test_client().waits_for_epoch(30);
     replay.signal(Signal::INT);
     let ended = replay.end();
     place.is_left_clean();
@@ -32,7 +32,7 @@ fn a_bus_that_ends_in_mid_replay_is_one_line_and_a_table() {
     place.records(8);
     let [cells, server] = by_hand(&place, "1-8");
     let replay = place.replay("run.log", "--only inputs");
-    place.guest().waits_for_epoch(30);
+    place.test_client().waits_for_epoch(30);
     server.signal(Signal::TERM);
     let ended = replay.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -51,8 +51,8 @@ fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
     let replay = place.replay("many.log", "--patience 1 --loop 3");
-    let guest = place.guest();
-    until("a frame", || guest.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
+    let test_client = place.test_client();
+    until("a frame", || test_client.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
     server.signal(Signal::STOP);
     until("a stopped server", || process::is_stopped(server.pid()).then_some(()));
     let ended = replay.end();
@@ -74,8 +74,8 @@ fn a_gateway_and_a_replay_notice_each_other() {
     // The next run overwrites its log.
     fs::rename(place.path("run.log"), place.path("old.log")).unwrap();
     let bench = place.running_bench(30.0, "");
-    for way in ["", "--expect"] {
-        let ended = place.replay("old.log", &format!("--quiet {way}")).end();
+    for route in ["", "--expect"] {
+        let ended = place.replay("old.log", &format!("--quiet {route}")).end();
         let said =
             "gateway: another gateway is on vcan0: stop it, or send the capture to another bus with --map";
         assert_eq!(ended.refusal(1), said);
@@ -84,9 +84,9 @@ fn a_gateway_and_a_replay_notice_each_other() {
     bench.end().well();
     // One that comes while the replay lasts.
     let replay = place.replay("old.log", FRESH);
-    place.guest().waits_for_epoch(10);
+    place.test_client().waits_for_epoch(10);
     let joints = protocol::message::Joints { in_use: 6, ..Default::default() };
-    place.guest().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
+    place.test_client().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
     let ended = replay.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stderr.contains("gateway: another gateway is on vcan0"), "{ended:#?}");
@@ -162,7 +162,7 @@ fn what_cannot_be_is_refused_in_one_line() {
 }
 
 #[test]
-fn a_line_that_cannot_be_read_is_named_and_left_out_and_times_that_run_backwards_are_said_once() {
+fn a_line_that_cannot_be_read_is_named_and_omitted_and_times_that_run_backwards_are_said_once() {
     let place = Place::new();
     let log = "(5.000000) vcan0 001#\n(1.5) vcan0 123#00\n(5.100000) vcan0 002#00\n(1.000000) vcan0 003#00\n\
                (2.000000) vcan0 004#00\n(5.150000) vcan0 005#00\nDROPCOUNT: dropped 7 CAN frames on 'vcan0' socket (total drops 7)\n";

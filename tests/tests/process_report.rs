@@ -53,9 +53,9 @@ fn found(page: &Page, what: &str) -> f64 {
 /// The first, the least, the greatest and the last.
 fn span(values: impl Iterator<Item = f64>) -> [f64; 4] {
     let values: Vec<_> = values.filter(|value| value.is_finite()).collect();
-    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
-    let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    [values[0], least, greatest, values[values.len() - 1]]
+    let min = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let max = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [values[0], min, max, values[values.len() - 1]]
 }
 
 fn drawn(figure: &Figure, series: usize) -> [f64; 4] {
@@ -217,7 +217,7 @@ fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_sa
     place.start("gateway", "recover cut.mcap -o recovered.mcap").end().well();
     let recovered = Recorded::read(&place.path("recovered.mcap"));
     let ticks = recovered.on("/gateway/timing").count();
-    let (cut, missing) = page(&place, "cut.mcap");
+    let (link_down, missing) = page(&place, "cut.mcap");
     assert!(missing.is_some() && ticks > 0 && ticks < 1_000, "{ticks}");
-    assert_eq!(row(table(&cut, "The control loop"), "tick took")[4], ticks.to_string());
+    assert_eq!(row(table(&link_down, "The control loop"), "tick took")[4], ticks.to_string());
 }

@@ -15,7 +15,7 @@ use rustix::process::Signal;
 fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
     let buses = summary.0["buses"].as_array().unwrap().len();
     let packets = |bus| {
-        ["received", "sent"].map(|way| summary.total(&format!("/buses/{bus}/{way}"))).iter().sum::<u64>()
+        ["received", "sent"].map(|route| summary.total(&format!("/buses/{bus}/{route}"))).iter().sum::<u64>()
     };
     let counted: u64 = (0..buses).map(packets).sum::<u64>() * frames_a_packet;
     let lines = place.read("run.log").lines().count();
@@ -177,7 +177,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
     for interrupt in [false, true, false] {
         let bench = place.running_bench(if interrupt { 30.0 } else { 1.5 }, "--no-spawn");
         if interrupt {
-            place.guest().waits_for_epoch(10);
+            place.test_client().waits_for_epoch(10);
             bench.signal(Signal::INT);
         }
         let ended = bench.end().well();

@@ -40,7 +40,7 @@ fn refusal(place: &Place, words: &str, code: i32) -> String {
 fn a_skin_switches_its_cells_to_events_and_the_summary_has_every_touch() {
     let place = place("sensing = \"event\"", PRESSED);
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for_epoch(40);
+    place.test_client().waits_for_epoch(40);
     ends(bench);
     place.is_left_clean();
     let summary = place.summary();
@@ -60,9 +60,9 @@ fn a_skin_switches_its_cells_to_events_and_the_summary_has_every_touch() {
 fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     let place = place("", PRESSED);
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
+    let test_client = place.test_client();
     let tells = |cell: u8| {
-        guest.waits_for(&format!("a sensors frame of cell {cell}"), |message| {
+        test_client.waits_for(&format!("a sensors frame of cell {cell}"), |message| {
             matches!(message, Message::Sensors { from, page: SensorPage::Skin(skin), .. }
                 if from.get() == cell && contact(skin) > 0)
         });
@@ -84,18 +84,18 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
 }
 
 #[test]
-fn a_cell_that_starts_anew_is_switched_again_to_what_it_was() {
+fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
     let restart = "\n[[fault]]\nat_s = 1.5\nkind = \"restart\"\ncells = [5]\nbus = \"vcan0\"\n";
     let place = place("sensing = \"continuous\"\nsensing_hz = 20.0", &format!("{PRESSED}{restart}"));
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
+    let test_client = place.test_client();
     let fifth = CellId::new(5).unwrap();
     bench.hears("cell 5 on vcan0 started anew");
-    guest.waits_for("its confirmation", |message| {
+    test_client.waits_for("its confirmation", |message| {
         matches!(message, Message::Configured { from, answer: Answer::Value { number: 7, written: true, words }, .. }
             if *from == fifth && words[..2] == [1, 50])
     });
-    guest.waits_for(
+    test_client.waits_for(
         "what it feels",
         |message| matches!(message, Message::Sensors { from, .. } if *from == fifth),
     );
@@ -105,7 +105,7 @@ fn a_cell_that_starts_anew_is_switched_again_to_what_it_was() {
 }
 
 #[test]
-fn what_cannot_be_asked_for_is_said_in_a_line() {
+fn what_cannot_be_requested_is_said_in_a_line() {
     let place = Place::new();
     assert_eq!(
         refusal(&place, "vcan0 continuous", 2),

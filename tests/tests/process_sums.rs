@@ -5,12 +5,12 @@ mod process;
 
 use std::collections::BTreeMap;
 
-use process::guest::Guest;
 use process::log::Log;
 use process::sums::{
     CELLS, ROOTS, end, goes_on_without_a_wire, goes_round_a_cell, grid, holds, keeps_ways_without_a_touch,
     neighbors, unrecorded, wired,
 };
+use process::test_client::TestClient;
 use process::{PRESSED, Place};
 use protocol::can::Format;
 use protocol::id::Kind;
@@ -23,7 +23,7 @@ fn the_gateway_hears_its_roots_and_nobody_else_and_every_cell_is_in_their_sums()
     place.scenario(PRESSED);
     let bench = unrecorded(&place, 60.0, "");
     bench.hears_the_loop();
-    holds(&Guest::on(&place, "vcan0", Format::Fd), CELLS.into());
+    holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     let said = bench.stderr();
     end(&place, bench);
     assert!(said.contains("the cells of vcan0 are a tree, "), "{said}");
@@ -53,7 +53,7 @@ fn a_recording_holds_every_sum_and_no_wire() {
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
     let bench = place.running_bench(60.0, "");
-    holds(&Guest::on(&place, "vcan0", Format::Fd), CELLS.into());
+    holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     end(&place, bench);
     let summary = place.summary();
     let log = Log::read(&place.read("run.log"), Format::Fd);
@@ -88,7 +88,7 @@ fn without_a_touch_hellos_tell_who_is_gone_and_the_rest_finds_another_way() {
 }
 
 #[test]
-fn who_has_no_way_any_more_is_named_and_the_rest_finds_another() {
+fn who_is_unreachable_any_more_is_named_and_the_rest_finds_another() {
     goes_on_without_a_wire(&Place::new(), Format::Fd);
 }
 
@@ -122,7 +122,7 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     let cells = place.start("cell-node", &words);
     let bench = unrecorded(&place, 60.0, "--no-spawn");
     bench.hears_the_loop();
-    holds(&Guest::on(&place, "vcan0", Format::Fd), 12);
+    holds(&TestClient::on(&place, "vcan0", Format::Fd), 12);
     bench.signal(Signal::TERM);
     bench.end().well();
     drop((cells, server));

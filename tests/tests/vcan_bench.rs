@@ -4,7 +4,7 @@
 
 mod process;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use process::Place;
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, frames_of, same_by_sender};
@@ -29,8 +29,8 @@ profile = "half-sine"
 
 /// Twelve cells at a rate that an emulated machine keeps up.
 fn prepare(place: &Place) {
-    let wanted = Wanted { cells: 12, broadcast_hz: 20.0, ..Wanted::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = Target { cells: 12, broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(SCENARIO);
 }
 

@@ -5,9 +5,9 @@
 
 mod process;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use process::buses::{carries, mixed_skin};
-use process::guest::Guest;
+use process::test_client::TestClient;
 use process::vcan::{Vcan, tool};
 use process::{PRESSED, Place, Running, until};
 use protocol::bus::{BusKind, Choice};
@@ -26,8 +26,8 @@ const CELLS: usize = 8;
 /// Eight cells on four buses, all pressed, and an arm that this moves.
 fn prepare() -> (Place, Vcan, Vcan) {
     let place = Place::on_vcan();
-    let wanted = Wanted { cells: CELLS, buses: BUSES.len(), broadcast_hz: 20.0, ..Wanted::default() };
-    place.write("skin.toml", &mixed_skin(&generate(&wanted).unwrap(), &["vcan1"]));
+    let expected = Target { cells: CELLS, buses: BUSES.len(), broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
     (place, Vcan::with_mtu("vcan1", 16), Vcan::make("vcan2"))
 }
@@ -43,7 +43,7 @@ fn run(place: &Place) -> Running {
 
 fn answers(place: &Place, bus: usize) {
     let (bus, format, kind) = BUSES[bus];
-    Guest::on_kind(place, bus, format, Choice::Only(kind)).waits_for_torques(1..=2);
+    TestClient::on_kind(place, bus, format, Choice::Only(kind)).waits_for_torques(1..=2);
 }
 
 fn all_answer(place: &Place) {
@@ -131,7 +131,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
 
 #[test]
 #[ignore = "needs vcan"]
-fn a_bus_that_is_missing_when_a_run_begins_is_refused_with_its_remedy() {
+fn a_bus_that_is_missing_when_a_run_begins_is_refused_with_its_hint() {
     let (place, _vcan1, vcan2) = prepare();
     vcan2.remove();
     let refused = place.bench(1.0, "--quiet --bus-kind vcan3=embedded").end();

@@ -37,7 +37,7 @@ fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
 
 fn all_answer(place: &Place) {
     for cell in 1..=6 {
-        place.guest().waits_for("torques", torque_of(cell));
+        place.test_client().waits_for("torques", torque_of(cell));
     }
 }
 
@@ -61,8 +61,8 @@ fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
 }
 
 /// Waits until a cell says that the robot is halted, lets it go on, and sees that the same cells answer again.
-fn goes_on_when_told(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
-    place.guest().waits_for("the cells to be told", |message| {
+fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
+    place.test_client().waits_for("the cells to be told", |message| {
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
             if heartbeat.state.has(State::HALTED))
     });
@@ -87,9 +87,9 @@ fn ends_well_after_a_pause(place: &Place, bench: Running) {
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
     // Who was told to halt answers nothing before it is told to go on.
     let log = Log::read(&place.read("run.log"), Format::Fd);
-    let after = |index: usize, wanted: &Message| {
+    let after = |index: usize, expected: &Message| {
         let mut rest = log.messages.iter().enumerate().skip(index);
-        rest.find(|(_, (message, _))| message == wanted).unwrap().0
+        rest.find(|(_, (message, _))| message == expected).unwrap().0
     };
     let halt = after(0, &Message::Halt);
     let resume = after(halt, &Message::Resume);
@@ -113,8 +113,8 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     let cells = bench.cells();
     vcan0.down();
     bench.hears(DOWN);
-    let remedy = "`gateway ack vcan0 --bus-kind socketcan` lets it go on";
-    bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {remedy}"));
+    let hint = "`gateway ack vcan0 --bus-kind socketcan` lets it go on";
+    bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
         bench.tells(cell, "fallen silent");
     }
@@ -127,7 +127,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
         bench.tells(cell, "spoken again");
     }
     assert!(!bench.stderr().contains("the robot goes on"), "{}", bench.stderr());
-    goes_on_when_told(&place, &bench, &cells);
+    goes_on_when_reported(&place, &bench, &cells);
     assert_eq!(bench.stderr().matches("works again").count(), 1, "{}", bench.stderr());
     ends_well_after_a_pause(&place, bench);
 }
@@ -150,7 +150,7 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     for cell in 1..=6 {
         bench.tells(cell, "spoken again");
     }
-    goes_on_when_told(&place, &bench, &cells);
+    goes_on_when_reported(&place, &bench, &cells);
     ends_well_after_a_pause(&place, bench);
 }
 
@@ -159,17 +159,17 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
 fn cells_alone_outlive_a_bus_that_goes_down() {
     let (vcan0, place) = (Vcan0, prepare());
     let cells = place.start("cell-node", ON_CELLS);
-    place.guest().waits_for_settled_cells(CELLS);
+    place.test_client().waits_for_settled_cells(CELLS);
     for epoch in 1..=3 {
         vcan0.down();
         // They have to send a heartbeat now and then, and must be met by an error to outlive it.
         std::thread::sleep(std::time::Duration::from_millis(400));
         vcan0.up();
-        place.guest().waits_for_settled_cells(CELLS);
-        let guest = place.guest();
+        place.test_client().waits_for_settled_cells(CELLS);
+        let test_client = place.test_client();
         cansend(&place, "stimulus --node 2 --force 3");
         cansend(&place, &format!("joints --epoch {epoch} --rad 0 -1.2 1.0 -1.4 -1.57 0"));
-        guest.waits_for("a torque", torque_of(2));
+        test_client.waits_for("a torque", torque_of(2));
     }
     cells.signal(Signal::TERM);
     let ended = cells.end();
@@ -209,7 +209,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
 
 #[test]
 #[ignore = "needs vcan"]
-fn a_bus_that_cannot_be_used_is_refused_with_its_remedy() {
+fn a_bus_that_cannot_be_used_is_refused_with_its_hint() {
     let (vcan0, place) = (Vcan0, prepare());
     let run = |bus: &str| {
         place.write("skin.toml", &small_skin(CELLS).replace("vcan0", bus));
@@ -250,7 +250,7 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     let by_hand = place.start("cell-node", "--bus vcan0 --node 3 --skin skin.toml");
     bench.hears("cell 3 on vcan0 started anew");
     // It feels what it did: the touch is as long as the run, and nobody else would tell it.
-    place.guest().waits_for("a torque of the new cell", torque_of(3));
+    place.test_client().waits_for("a torque of the new cell", torque_of(3));
     process::signal(stopped, Signal::CONT);
     bench.tells(5, "spoken again");
     all_answer(&place);
@@ -271,9 +271,9 @@ fn a_gateway_after_one_that_was_killed_goes_on_with_the_next_epoch_on_cells_that
     let place = prepare();
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let cells = place.start("cell-node", ON_CELLS);
-    place.guest().waits_for_settled_cells(CELLS);
+    place.test_client().waits_for_settled_cells(CELLS);
     let first = place.running_bench(60.0, "--no-spawn");
-    place.guest().waits_for_epoch(20);
+    place.test_client().waits_for_epoch(20);
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
     let left = ["candump.log", "run.log", "scenario.toml", "skin.toml"];
@@ -337,7 +337,7 @@ fn of_two_gateways_that_start_at_the_same_time_at_most_one_goes_on() {
     for more in ["", "--no-spawn"] {
         let cells = (!more.is_empty()).then(|| {
             let cells = place.start("cell-node", ON_CELLS);
-            place.guest().waits_for_settled_cells(CELLS);
+            place.test_client().waits_for_settled_cells(CELLS);
             cells
         });
         let run = |name: &str| {

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use process::vcan::{Candump, backlog_drops, frames_of, needs, small_skin, tool};
-use process::{PATIENCE, PRESSED, Place, is_stopped, until};
+use process::{PRESSED, Place, TIMEOUT, is_stopped, until};
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{Line, parse};
@@ -24,7 +24,7 @@ const SMALL: usize = 16 * 1024;
 /// Frames of a round; the buffer has room for a hundredth of them.
 const FRAMES: u32 = 5_000;
 /// What the receiver wants; it is sent beside what it does not want.
-const WANTED: u32 = 0x200;
+const EXPECTED: u32 = 0x200;
 const UNWANTED: u32 = 0x300;
 
 /// One receiver that sleeps and one sender.
@@ -45,7 +45,7 @@ impl Pair {
             filters: filters.to_vec(),
             receive_buffer,
             directory: Some(place.buses()),
-            send_patience: PATIENCE,
+            send_timeout: TIMEOUT,
             ..Options::default()
         };
         let open = |options: &Options| Bus::open("vcan0", Choice::Only(kind), options).unwrap();
@@ -59,9 +59,9 @@ impl Pair {
         let number = self.sent.to_le_bytes();
         self.sent += 1;
         match self.sent % 3 {
-            0 => Frame::classic(WANTED, &number),
-            1 => Frame::fd(WANTED, 1, &number),
-            _ => Frame::fd(WANTED, 0, &[&number[..], &[0xA5; 60]].concat()),
+            0 => Frame::classic(EXPECTED, &number),
+            1 => Frame::fd(EXPECTED, 1, &number),
+            _ => Frame::fd(EXPECTED, 0, &[&number[..], &[0xA5; 60]].concat()),
         }
         .unwrap()
     }
@@ -90,7 +90,7 @@ impl Pair {
             let dropped = self.inbox.dropped();
             let mut last = None;
             for received in self.inbox.frames() {
-                assert_eq!(received.frame.id(), WANTED);
+                assert_eq!(received.frame.id(), EXPECTED);
                 let number = u32::from_le_bytes(*received.frame.data().first_chunk().unwrap());
                 assert!(number >= self.heard && number - self.heard <= dropped, "{number} is out of order");
                 self.heard += 1;
@@ -122,9 +122,9 @@ impl Pair {
 
 /// What was sent and not received is what the bus says it dropped, to the last frame.
 fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
-    let exact = Filter { id: WANTED, mask: Filter::EXACT_MASK };
+    let exact = Filter { id: EXPECTED, mask: Filter::EXACT_MASK };
     // What several filters match comes once and is dropped once; what none matches is no loss.
-    let several = [exact, Filter { id: WANTED, mask: 0x700 }, Filter { id: EXTENDED, mask: EXTENDED }];
+    let several = [exact, Filter { id: EXPECTED, mask: 0x700 }, Filter { id: EXTENDED, mask: EXTENDED }];
     for filters in [&[exact][..], &several, &[Filter { id: UNWANTED, mask: 0x7FF }.inverted()]] {
         let backlog = || if kind == BusKind::SocketCan { backlog_drops() } else { 0 };
         let before = backlog();
@@ -187,7 +187,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let backlog = backlog_drops();
     let bench = place.running_bench(4.0, &format!("--record run.mcap --receive-buffer {SMALL}"));
-    place.guest().waits_for_epoch(10);
+    place.test_client().waits_for_epoch(10);
     bench.signal(Signal::STOP);
     until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
     // For more than a second; cells say what they have to say meanwhile.
@@ -228,8 +228,8 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     let by_cells = |counts: &BTreeMap<u32, usize>| -> usize {
         counts.iter().filter(|(id, _)| (0x200..0x500).contains(*id)).map(|(_, count)| count).sum()
     };
-    let missed = (by_cells(&theirs) - by_cells(&ours)) as u64;
-    assert!(missed > 8, "{missed} missed of the cells");
-    assert_eq!((summary.of_bus("/uplink/dropped"), summary.of_bus("/uplink/surplus")), (missed, 0));
+    let unanswered = (by_cells(&theirs) - by_cells(&ours)) as u64;
+    assert!(unanswered > 8, "{unanswered} missed of the cells");
+    assert_eq!((summary.of_bus("/uplink/dropped"), summary.of_bus("/uplink/surplus")), (unanswered, 0));
     assert_eq!((summary.number("/recording/lost"), backlog_drops()), (0, backlog));
 }

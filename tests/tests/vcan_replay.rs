@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::time::Duration;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use process::Place;
 use process::replay::{Replayed, says_everything};
 use process::vcan::{Candump, Vcan0, tool};
@@ -19,8 +19,8 @@ const FRESH: &str = "--expect --spawn --skin skin.toml";
 
 /// Cells at a rate that an emulated machine keeps up, and touches on some of them.
 fn prepare(place: &Place, cells: usize) {
-    let wanted = Wanted { cells, broadcast_hz: 20.0, ..Wanted::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = Target { cells, broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(process::replay::TOUCHED);
 }
 
@@ -30,13 +30,13 @@ fn a_run_on_vcan_comes_back_bit_for_bit() {
     let place = Place::on_vcan();
     prepare(&place, 8);
     let bench = place.running_bench(7.0, "");
-    says_everything(&place.guest(), &place.path("skin.toml"));
+    says_everything(&place.test_client(), &place.path("skin.toml"));
     bench.end().well();
     let mut counts = Vec::new();
-    for way in ["--lockstep", "--max", "--max", ""] {
-        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {way}"));
+    for route in ["--lockstep", "--max", "--max", ""] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         eprintln!("{}", ended.stdout);
-        counts.push(match way {
+        counts.push(match route {
             "" => replayed.all_came_back_in_time(&ended),
             _ => replayed.all_came_back(&ended),
         });
@@ -123,8 +123,8 @@ fn lateness(log: &str, period_us: i64) -> [i64; 3] {
     }
     assert_eq!(late.len(), 1_000, "{log}");
     late.sort_unstable();
-    let least = late[0];
-    [500, 900, 999].map(|at: usize| late[at] - least)
+    let min = late[0];
+    [500, 900, 999].map(|at: usize| late[at] - min)
 }
 
 #[test]

@@ -34,6 +34,6 @@ fn so_it_is_in_classic_frames() {
 
 #[test]
 #[ignore = "needs vcan"]
-fn who_has_no_way_any_more_is_named_and_the_rest_finds_another() {
+fn who_is_unreachable_any_more_is_named_and_the_rest_finds_another() {
     goes_on_without_a_wire(&Place::on_vcan(), Format::Fd);
 }

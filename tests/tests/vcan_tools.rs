@@ -81,17 +81,17 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     place.write("skin.toml", &text);
     place.scenario(ALONE);
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
+    let test_client = place.test_client();
     cansend(&place, "stimulus --node 2 --force 3");
     let (answers, pressed) = (Cell::new(0), torque_of(2, true));
-    guest.waits_for("twenty torques of cell 2", |message| {
+    test_client.waits_for("twenty torques of cell 2", |message| {
         answers.set(answers.get() + u32::from(pressed(message)));
         answers.get() == 20
     });
     cansend(&place, "stimulus --node 2");
-    guest.waits_for("the end of the contact", torque_of(2, false));
+    test_client.waits_for("the end of the contact", torque_of(2, false));
     let joints = Cell::new(0);
-    guest.waits_for("joints after that", |message| {
+    test_client.waits_for("joints after that", |message| {
         joints.set(joints.get() + u32::from(matches!(message, Message::Joints { .. })));
         joints.get() == 5
     });
@@ -112,8 +112,8 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
         "one torque of zeros, the last one"
     );
     assert!(pressed.len() >= 20, "{}", pressed.len());
-    for (_, (_, _, felt), _) in &pressed {
-        assert_eq!(*felt, [1_024, 1_024, 1_024, 0, 0, 0], "3 N, a newton in each word of Q5.10");
+    for (_, (_, _, contact_state), _) in &pressed {
+        assert_eq!(*contact_state, [1_024, 1_024, 1_024, 0, 0, 0], "3 N, a newton in each word of Q5.10");
     }
     // Every one of them was due, and compared in every joint that the contact loads.
     let answered = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
@@ -130,8 +130,8 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     assert!(summary.figure("/accuracy/single/mean_nm") < 3e-4, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 2e-3, "{:#}", summary.0);
     // And it is not little that is compared.
-    let greatest = pressed.iter().flat_map(|(_, _, packet)| packet.words).map(i16::unsigned_abs).max();
-    assert!(greatest > Some(1_024), "a quarter of a newton metre: {greatest:?}");
+    let max = pressed.iter().flat_map(|(_, _, packet)| packet.words).map(i16::unsigned_abs).max();
+    assert!(max > Some(1_024), "a quarter of a newton metre: {max:?}");
 }
 
 #[test]
@@ -141,23 +141,23 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     place.write("skin.toml", &small_skin(4));
     place.scenario(PRESSED);
     let bench = place.running_bench(60.0, "");
-    let guest = place.guest();
-    guest.waits_for("a torque", torque_of(1, true));
+    let test_client = place.test_client();
+    test_client.waits_for("a torque", torque_of(1, true));
     cansend(&place, "halt");
     bench.hears(
         "the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind socketcan` lets it go on",
     );
-    let guest = place.guest();
+    let test_client = place.test_client();
     let joints = Cell::new(0);
-    guest.waits_for("joints after that", |message| {
+    test_client.waits_for("joints after that", |message| {
         joints.set(joints.get() + u32::from(matches!(message, Message::Joints { .. })));
         joints.get() == 10
     });
     place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
-    let guest = place.guest();
+    let test_client = place.test_client();
     for cell in 1..=4 {
-        guest.waits_for("torques again", torque_of(cell, true));
+        test_client.waits_for("torques again", torque_of(cell, true));
     }
     bench.signal(Signal::TERM);
     bench.end().well();
@@ -222,8 +222,8 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
         let log = Log::of(candump.frames(), Format::Fd);
         let summary = place.summary();
         summary.adds_up();
-        let missed = summary.of_bus("/replies/skipped") + summary.of_bus("/replies/not_heard");
-        (missed == 0).then(|| replies(&log))
+        let unanswered = summary.of_bus("/replies/skipped") + summary.of_bus("/replies/not_heard");
+        (unanswered == 0).then(|| replies(&log))
     });
     assert!(recorded.len() > 150, "{} torques in 4 s", recorded.len());
     let different: BTreeSet<_> = recorded.iter().map(|(_, _, words)| words).collect();
@@ -234,13 +234,13 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     let replayed = undisturbed("replay", || {
         // Fresh ones: what was felt last, and the last epoch, are of the recording.
         let cells = place.start("cell-node", &format!("--bus vcan0 --nodes 1-{CELLS} --skin skin.toml"));
-        place.guest().waits_for_settled_cells(CELLS);
+        place.test_client().waits_for_settled_cells(CELLS);
         let candump = Candump::start("vcan0", &place.path("again.log"));
         tool(&format!("canplayer -I {} vcan0=vcan0", place.path("replay.log").display()));
-        let guest = place.guest();
+        let test_client = place.test_client();
         cansend(&place, "report");
         let skipped = RefCell::new(BTreeMap::new());
-        guest.waits_for("what the cells have heard", |message| {
+        test_client.waits_for("what the cells have heard", |message| {
             if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heard(heard), .. } = message
             {
                 skipped.borrow_mut().insert(cell.get(), heard.joints_late);
@@ -379,7 +379,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     place.scenario(PRESSED);
     let mut candump = Candump::start("vcan0", &place.path("candump.log"));
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for("a torque", torque_of(1, true));
+    place.test_client().waits_for("a torque", torque_of(1, true));
     for noise in NOISE {
         tool(&format!("cangen vcan0 -i {noise}"));
         // On one processor, everybody has to have room for the next ones.
@@ -387,13 +387,13 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     }
     // An error frame, which says that a controller is bus-off.
     tool("cansend vcan0 20000040#0000000000000000");
-    let guest = place.guest();
+    let test_client = place.test_client();
     for cell in 1..=CELLS {
-        guest.waits_for("torques after that", torque_of(cell, true));
+        test_client.waits_for("torques after that", torque_of(cell, true));
     }
     cansend(&place, "report");
     let told = RefCell::new(BTreeMap::new());
-    guest.waits_for("what the cells have refused", |message| {
+    test_client.waits_for("what the cells have refused", |message| {
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Refused(refused), .. } = message
         {
             told.borrow_mut().insert(cell.get(), *refused);
@@ -412,11 +412,11 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     assert_eq!(summary.silent().len(), 0);
     all_are_counted(&frames, &summary);
-    let wanted: u64 =
+    let expected: u64 =
         NOISE.iter().map(|noise| noise.rsplit(' ').next().unwrap().parse::<u64>().unwrap()).sum();
     // That error frame, and a frame of candump's each time.
-    let wanted = wanted + 1 + NOISE.len() as u64;
-    assert_eq!(summary.odd(0), wanted, "each of cangen's frames is odd, and nothing else: {:#}", summary.0);
+    let expected = expected + 1 + NOISE.len() as u64;
+    assert_eq!(summary.odd(0), expected, "each of cangen's frames is odd, and nothing else: {:#}", summary.0);
     for (cell, told) in &*told.borrow() {
         assert_eq!(*told, refused_by(*cell, &frames), "cell {cell}");
     }
@@ -450,7 +450,7 @@ fn the_stock_tools_read_our_log() {
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let bench = place.running_bench(60.0, "");
-    place.guest().waits_for("a torque", torque_of(1, true));
+    place.test_client().waits_for("a torque", torque_of(1, true));
     for noise in ["-I r -m -n 200", "-I r -R -n 20", "-I r -e -n 20", "-I r -f -b -E -n 20"] {
         tool(&format!("cangen vcan0 -i -g 0 {noise}"));
     }

@@ -42,9 +42,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
     }
     let took = began.elapsed().as_secs_f64();
-    let (echo, ask) = ((cpu() - before) / took, (processor_seconds(std::process::id()) - own) / took);
-    println!("{processes} processes, {cycles} cycles: {:.3} cores", echo + ask);
-    println!("the processes {echo:.3}, whoever asks them {ask:.3}");
+    let (echo, query) = ((cpu() - before) / took, (processor_seconds(std::process::id()) - own) / took);
+    println!("{processes} processes, {cycles} cycles: {:.3} cores", echo + query);
+    println!("the processes {echo:.3}, whoever asks them {query:.3}");
     for (child, socket) in &mut echoes {
         rustix::net::shutdown(&*socket, rustix::net::Shutdown::Both)?;
         child.wait()?;

@@ -14,7 +14,7 @@ use protocol::id::CellId;
 use serde::Serialize;
 
 use crate::kernel::Kernel;
-use crate::plan::Wanted;
+use crate::plan::Target;
 
 mod facts;
 mod interface;
@@ -58,30 +58,30 @@ pub struct Finding {
     /// What it is.
     pub text: String,
     /// What mends it: one command each, any of them does.
-    pub remedies: Vec<String>,
+    pub hints: Vec<String>,
 }
 
 impl Finding {
     fn ok(text: impl Into<String>) -> Self {
-        Self { level: Level::Ok, text: text.into(), remedies: Vec::new() }
+        Self { level: Level::Ok, text: text.into(), hints: Vec::new() }
     }
 
     fn note(text: impl Into<String>) -> Self {
-        Self { level: Level::Note, text: text.into(), remedies: Vec::new() }
+        Self { level: Level::Note, text: text.into(), hints: Vec::new() }
     }
 
     fn fault(text: impl Into<String>) -> Self {
-        Self { level: Level::Fault, text: text.into(), remedies: Vec::new() }
+        Self { level: Level::Fault, text: text.into(), hints: Vec::new() }
     }
 
     /// And what mends it.
-    fn remedy(mut self, remedy: impl Into<String>) -> Self {
-        self.remedies.push(remedy.into());
+    fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hints.push(hint.into());
         self
     }
 
-    fn remedies(mut self, remedies: Vec<String>) -> Self {
-        self.remedies.extend(remedies);
+    fn hints(mut self, hints: Vec<String>) -> Self {
+        self.hints.extend(hints);
         self
     }
 }
@@ -94,7 +94,7 @@ pub fn would_run(findings: &[Finding]) -> bool {
 
 /// Judges the facts, the most basic ones first.
 #[must_use]
-pub fn judge(facts: &Facts) -> Vec<Finding> {
+pub fn comparator(facts: &Facts) -> Vec<Finding> {
     let mut findings = vec![facts.kind()];
     match facts.bus_kind() {
         BusKind::SocketCan if facts.kernel.has_can => {
@@ -136,14 +136,14 @@ impl Facts {
     }
 
     /// What `vcan-setup up` is told to mean a bus: its skin, or its name.
-    fn up(&self, wanted: &Wanted) -> String {
-        let what = wanted.skin.as_ref().map_or(&wanted.name, |skin| &skin.file);
+    fn up(&self, target: &Target) -> String {
+        let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
         self.own(&format!("up {what}"))
     }
 
     fn kind(&self) -> Finding {
         let Kernel { release, has_can, can_raw, .. } = &self.kernel;
-        let remedies = || self.kernel.remedies(*can_raw);
+        let hints = || self.kernel.hints(*can_raw);
         match (self.choice, has_can) {
             (Choice::Only(BusKind::Embedded), _) => {
                 Finding::ok("the embedded bus was chosen, which needs nothing of the kernel")
@@ -155,18 +155,18 @@ impl Facts {
                 "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
                  for a kernel with CAN:"
             ))
-            .remedies(remedies()),
+            .hints(hints()),
             (Choice::Only(BusKind::SocketCan), false) => {
                 Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
-                    .remedies(remedies())
-                    .remedy("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
+                    .hints(hints())
+                    .hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
             }
         }
     }
 
     /// Who is on a bus already.
     fn traffic(&self, bus: &Bus, on: &str) -> Vec<Finding> {
-        let name = &bus.wanted.name;
+        let name = &bus.target.name;
         let heard = match &bus.heard {
             Ok(Some(heard)) => heard,
             Ok(None) => return Vec::new(),
@@ -176,7 +176,7 @@ impl Facts {
         let (all, count) = (nodes(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
             Finding::fault(format!("another gateway sends joints on {on}"))
-                .remedy("pgrep -a gateway  # and stop it, or take another bus")
+                .hint("pgrep -a gateway  # and stop it, or take another bus")
         });
         let absent = || {
             let missing = |cells: &BTreeSet<_>| cells.difference(&heard.cells).copied().collect();
@@ -184,14 +184,16 @@ impl Facts {
         };
         let cells = match (self.no_spawn, count) {
             (false, 0) => None,
-            (false, 1..) => Some(Finding::fault(format!("cells are on {on} already: {all}")).remedy(
-                "gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
-            )),
+            (false, 1..) => {
+                Some(Finding::fault(format!("cells are on {on} already: {all}")).hint(
+                    "gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
+                ))
+            }
             (true, 0) => Some(
                 Finding::fault(format!(
                     "no cell is heard on {on}, and with --no-spawn they have to be there"
                 ))
-                .remedy(format!(
+                .hint(format!(
                     "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
                 )),
             ),
@@ -209,11 +211,11 @@ impl Facts {
     fn receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
         let all = usize::from(CellId::MAX.get());
-        let frames = |bus: &Bus| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.wanted);
+        let frames = |bus: &Bus| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.target);
         let frames = self.buses.iter().map(frames).max().unwrap_or(all);
         let needed = TIMES * frames * FRAME;
         let (has, wants) = (granted >> 10, needed >> 10);
-        let remedy = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
+        let hint = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
                 "receive buffers of {has} KiB hold all answers, {frames} frames, {TIMES} times over"
@@ -223,26 +225,26 @@ impl Facts {
                 "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {TIMES} times over \
                  takes {wants} KiB, and a gateway that is held up loses some"
             ))
-            .remedy(remedy)
+            .hint(hint)
         } else {
             Finding::fault(format!(
                 "receive buffers are limited to {has} KiB and do not hold all answers, {frames} frames, even once; \
                  {wants} KiB are right"
             ))
-            .remedy(remedy)
+            .hint(hint)
         })
     }
 
     /// Whether one answer of every cell fits into the kernel's queue between sender and receiver.
     fn backlog(&self) -> Option<Finding> {
-        let frames = |bus: &Bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.wanted);
+        let frames = |bus: &Bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
         if frames == 0 {
             return None;
         }
         Some(match self.backlog {
             None => Finding::note("the kernel's backlog cannot be seen from this network namespace")
-                .remedy("sysctl net.core.netdev_max_backlog  # in the first one"),
+                .hint("sysctl net.core.netdev_max_backlog  # in the first one"),
             Some(backlog) if backlog >= frames => Finding::ok(format!(
                 "the kernel's backlog of {backlog} holds an answer of all cells, {frames} frames"
             )),
@@ -250,7 +252,7 @@ impl Facts {
                 "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
                  be lost without a word"
             ))
-            .remedy(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
+            .hint(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
     }
 
@@ -268,7 +270,7 @@ impl Facts {
         match (self.no_spawn, there) {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
-            (false, false) => Some(Finding::fault(absent).remedy(
+            (false, false) => Some(Finding::fault(absent).hint(
                 "cargo build --release  # in the project's folder; or name it with gateway run --cell-node",
             )),
         }
@@ -276,8 +278,8 @@ impl Facts {
 }
 
 /// Frames that a packet takes.
-const fn frames_of(wanted: &Wanted) -> usize {
-    match wanted.format {
+const fn frames_of(target: &Target) -> usize {
+    match target.format {
         Format::Fd => 1,
         Format::Classic => 2,
     }

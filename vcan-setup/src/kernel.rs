@@ -68,7 +68,7 @@ impl Kernel {
     /// What mends that there is no CAN, or no `vcan`: one command each, with a comment as in a shell, the
     /// nearest first.
     #[must_use]
-    pub fn remedies(&self, module: Module) -> Vec<String> {
+    pub fn hints(&self, module: Module) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
         let here = match module {
             Module::There => None,
@@ -196,11 +196,11 @@ mod tests {
             vcan: module,
             vxcan: module,
         };
-        kernel.remedies(module).remove(0)
+        kernel.hints(module).remove(0)
     }
 
     #[test]
-    fn the_remedy_fits_the_kernel_and_the_distribution() {
+    fn the_hint_fits_the_kernel_and_the_distribution() {
         let debian = "PRETTY_NAME=\"Debian\"\nID=debian\nVERSION_ID=\"12\"\n";
         assert_eq!(
             first("6.1.0-30-cloud-amd64", debian, Module::Missing),

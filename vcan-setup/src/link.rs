@@ -106,14 +106,14 @@ impl Hardware {
 impl Rates {
     /// Whether these are what was wanted, but for half a percent; what was not wanted may be anything.
     #[must_use]
-    pub fn meet(self, wanted: Self) -> bool {
+    pub fn meet(self, target: Self) -> bool {
         // A controller's clock is divided by whole numbers: it may miss what was asked for, by less than the
         // nodes of a bus may differ.
-        let near = |wanted: Option<u32>, has: Option<u32>| {
-            let near = |wanted: u32, has: u32| u64::from(wanted.abs_diff(has)) * 200 <= wanted.into();
-            wanted.is_none_or(|wanted| has.is_some_and(|has| near(wanted, has)))
+        let near = |target: Option<u32>, has: Option<u32>| {
+            let near = |target: u32, has: u32| u64::from(target.abs_diff(has)) * 200 <= target.into();
+            target.is_none_or(|target| has.is_some_and(|has| near(target, has)))
         };
-        near(wanted.bitrate, self.bitrate) && near(wanted.data_bitrate, self.data_bitrate)
+        near(target.bitrate, self.bitrate) && near(target.data_bitrate, self.data_bitrate)
     }
 }
 

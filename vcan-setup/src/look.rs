@@ -18,7 +18,7 @@ use serde::Serialize;
 use crate::doctor::{Bus, Facts, Heard, Program, User};
 use crate::kernel::Kernel;
 use crate::link::Interface;
-use crate::plan::Wanted;
+use crate::plan::Target;
 
 /// How long a bus is listened to: a gateway sends joints much more often, a cell says that it is there at
 /// least every half second.
@@ -29,12 +29,12 @@ const LISTEN: Duration = Duration::from_millis(600);
 pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
     let kind = choice.resolve();
     for bus in &mut buses {
-        bus.interface = present.iter().find(|interface| interface.name == bus.wanted.name).cloned();
+        bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
     thread::scope(|scope| {
-        for Bus { wanted, interface, heard, .. } in &mut buses {
-            if kind == BusKind::Embedded || interface.as_ref().is_some_and(|it| usable(wanted, it)) {
-                scope.spawn(|| *heard = listen(wanted, kind));
+        for Bus { target, interface, heard, .. } in &mut buses {
+            if kind == BusKind::Embedded || interface.as_ref().is_some_and(|it| usable(target, it)) {
+                scope.spawn(|| *heard = listen(target, kind));
             }
         }
     });
@@ -55,19 +55,19 @@ pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Int
     }
 }
 
-fn usable(wanted: &Wanted, interface: &Interface) -> bool {
-    interface.is_can() && interface.up && wanted.carried_by(interface.mtu)
+fn usable(target: &Target, interface: &Interface) -> bool {
+    interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
 /// Listens for other gateways and for cells; nothing when nobody serves the bus.
-fn listen(wanted: &Wanted, kind: BusKind) -> Result<Option<Heard>, String> {
-    let options = Options { fd: wanted.format == Format::Fd, ..Options::default() };
+fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
+    let options = Options { fd: target.format == Format::Fd, ..Options::default() };
     let until = Instant::now() + LISTEN;
     let hear = || {
-        let bus = bus::Bus::open(&wanted.name, Choice::Only(kind), &options)?;
+        let bus = bus::Bus::open(&target.name, Choice::Only(kind), &options)?;
         let (mut inbox, mut heard) = (Inbox::new(), Heard::default());
-        while let Some(left) = until.checked_duration_since(Instant::now()) {
-            if bus.wait(Some(left))? {
+        while let Some(unchanged) = until.checked_duration_since(Instant::now()) {
+            if bus.wait(Some(unchanged))? {
                 bus.receive(&mut inbox)?;
                 let data = inbox.frames().filter(|it| !it.frame.is_extended() && !it.frame.is_error());
                 for id in data.filter_map(|it| u16::try_from(it.frame.id()).ok()).map(Id::from_bits) {

@@ -124,12 +124,12 @@ impl Netlink {
     }
 
     fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
-        let asked = link(index, [LinkAttribute::IfNetnsId(namespace)]);
-        Ok(self.ask(asked)?.map(|interface| interface.name))
+        let queried = link(index, [LinkAttribute::IfNetnsId(namespace)]);
+        Ok(self.query(queried)?.map(|interface| interface.name))
     }
 
     /// The interface that a message is about.
-    fn ask(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
+    fn query(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
         Ok(answers.iter().find_map(|answer| interface(answer)))
     }
@@ -252,9 +252,9 @@ impl Netlink {
     }
 
     /// Sees that a clock comes near enough to what was asked for: a driver takes what is five percent away.
-    fn see_rates(&mut self, index: u32, wanted: Rates) -> io::Result<()> {
-        let nearest = self.ask(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
-        match nearest.filter(|nearest| !nearest.meet(wanted)) {
+    fn see_rates(&mut self, index: u32, target: Rates) -> io::Result<()> {
+        let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
+        match nearest.filter(|nearest| !nearest.meet(target)) {
             Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
             None => Ok(()),
         }

@@ -26,7 +26,7 @@ pub use step::{Action, Step};
 
 /// An interface that somebody wants.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Wanted {
+pub struct Target {
     /// Its name.
     pub name: String,
     /// Which frames it has to carry.
@@ -44,7 +44,7 @@ pub struct SkinBus {
     pub rates: Rates,
 }
 
-impl Wanted {
+impl Target {
     /// An interface that was named, for all frames.
     #[must_use]
     pub fn named(name: &str) -> Self {
@@ -54,7 +54,7 @@ impl Wanted {
     /// The buses of a skin.
     #[must_use]
     pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
-        let wanted = |bus: &protocol::skin::Bus| Self {
+        let target = |bus: &protocol::skin::Bus| Self {
             name: bus.name.clone(),
             format: bus.format,
             skin: Some(SkinBus {
@@ -62,7 +62,7 @@ impl Wanted {
                 rates: Rates { bitrate: bus.bitrate, data_bitrate: bus.data_bitrate },
             }),
         };
-        skin.buses.iter().map(wanted).collect()
+        skin.buses.iter().map(target).collect()
     }
 
     /// Of hardware that was named nobody knows which frames are wanted: those that it carries.
@@ -97,7 +97,7 @@ impl Wanted {
 
 /// A pair that somebody wants, seen from its first end.
 #[derive(Clone, Copy, Debug)]
-pub struct WantedPair<'a> {
+pub struct TargetPair<'a> {
     /// The end in this network namespace.
     pub name: &'a str,
     /// The other end.
@@ -122,7 +122,7 @@ pub struct Plan {
     /// In this order.
     pub steps: Vec<Step>,
     /// One line on each interface that is left as it is.
-    pub left: Vec<String>,
+    pub unchanged: Vec<String>,
 }
 
 fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
@@ -133,26 +133,26 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 ///
 /// # Errors
 /// When that cannot be had without touching something that is not ours. Then nothing is to be done.
-pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
+pub fn up(target: &[Target], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
-    if let Some(refusal) = wanted.iter().enumerate().find_map(|(at, it)| it.at_odds(wanted.get(..at)?)) {
+    if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.at_odds(target.get(..at)?)) {
         return Err(refusal);
     }
-    for wanted in wanted {
-        if plan.changes(&wanted.name) {
+    for target in target {
+        if plan.changes(&target.name) {
             continue;
         }
-        let Some(interface) = find(present, &wanted.name) else {
-            if let Some(SkinBus { file, .. }) = wanted.hardware() {
-                return Err(Refusal::Absent { name: wanted.name.clone(), file: file.clone() });
+        let Some(interface) = find(present, &target.name) else {
+            if let Some(SkinBus { file, .. }) = target.hardware() {
+                return Err(Refusal::Absent { name: target.name.clone(), file: file.clone() });
             }
-            plan.steps.push(Step { name: wanted.name.clone(), action: Action::MakeVcan });
+            plan.steps.push(Step { name: target.name.clone(), action: Action::MakeVcan });
             continue;
         };
-        match (&interface.kind, &wanted.skin) {
-            (Kind::Vcan | Kind::Vxcan(_), _) => plan.fit(wanted, interface)?,
+        match (&interface.kind, &target.skin) {
+            (Kind::Vcan | Kind::Vxcan(_), _) => plan.fit(target, interface)?,
             (Kind::Hardware(hardware), Some(skin)) => {
-                plan.hardware(wanted, skin, interface, hardware, set_bit_rates)?;
+                plan.hardware(target, skin, interface, hardware, set_bit_rates)?;
             }
             (Kind::Hardware(_), None) | (Kind::Other(_), _) => return Err(Refusal::real(interface)),
         }
@@ -164,8 +164,8 @@ pub fn up(wanted: &[Wanted], present: &[Interface], set_bit_rates: bool) -> Resu
 ///
 /// # Errors
 /// When that cannot be had without touching something that is not ours. Then nothing is to be done.
-pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
-    let WantedPair { name, peer, there } = *wanted;
+pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
+    let TargetPair { name, peer, there } = *target;
     if there.is_none() && name == peer {
         return Err(Refusal::OneName(name.to_owned()));
     }
@@ -183,9 +183,9 @@ pub fn up_pair(wanted: &WantedPair<'_>, present: &[Interface]) -> Result<Plan, R
         (Some(in_the_way), _) => return Err(not_a_pair(in_the_way, peer, None)),
         (None, Some(in_the_way)) => return Err(not_a_pair(in_the_way, name, there)),
     };
-    plan.fit(&Wanted::named(name), here)?;
+    plan.fit(&Target::named(name), here)?;
     let Some(there) = there else {
-        plan.fit(&Wanted::named(peer), other)?;
+        plan.fit(&Target::named(peer), other)?;
         return Ok(plan);
     };
     // Steps do not reach into the other namespace, but for making what is not there.
@@ -213,7 +213,7 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refu
     if !in_the_way.is_virtual() {
         return Refusal::real(in_the_way);
     }
-    let remedy = match (in_the_way.ours, there) {
+    let hint = match (in_the_way.ours, there) {
         (true, None) => format!("`sudo vcan-setup down {name}` removes it, or choose another name"),
         (true, Some(there)) => {
             format!("`sudo {} link del {name}` removes it, or choose another name", there.name.ip())
@@ -222,7 +222,7 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refu
     };
     let at = there.map(|there| format!(" in {}", there.name)).unwrap_or_default();
     let what = format!("{}{at}", in_the_way.what());
-    Refusal::OtherPair { name: name.clone(), what, peer: peer.to_owned(), remedy }
+    Refusal::OtherPair { name: name.clone(), what, peer: peer.to_owned(), hint }
 }
 
 impl Plan {
@@ -233,16 +233,16 @@ impl Plan {
 
     /// Says of an interface, once, that it is left as it is.
     fn leave(&mut self, line: String) {
-        if !self.left.contains(&line) {
-            self.left.push(line);
+        if !self.unchanged.contains(&line) {
+            self.unchanged.push(line);
         }
     }
 
     /// Brings a virtual interface that is there into the wanted state, if it is ours.
-    fn fit(&mut self, wanted: &Wanted, interface: &Interface) -> Result<(), Refusal> {
+    fn fit(&mut self, target: &Target, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
-        let wide = wanted.carried_by(mtu);
+        let wide = target.carried_by(mtu);
         let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by somebody else" };
@@ -261,7 +261,7 @@ impl Plan {
     /// Compares hardware with the skin, and sets it when that was asked for.
     fn hardware(
         &mut self,
-        wanted: &Wanted,
+        target: &Target,
         skin: &SkinBus,
         interface: &Interface,
         hardware: &Hardware,
@@ -270,13 +270,13 @@ impl Plan {
         let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.what());
         let (before, rates) = (hardware.rates(), skin.rates);
         let agrees = before.meet(rates);
-        let wide = wanted.carried_by(interface.mtu);
+        let wide = target.carried_by(interface.mtu);
         if agrees && wide && interface.up {
             let checked = if rates.bitrate.is_some() { ", as the skin says" } else { "" };
             self.leave(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }
-        let needs_data = wanted.format == Format::Fd;
+        let needs_data = target.format == Format::Fd;
         let missing = match (rates.bitrate, rates.data_bitrate) {
             (None, _) => Some(("bitrate", 1_000_000)),
             (Some(_), None) if needs_data => Some(("data_bitrate", 5_000_000)),
@@ -309,14 +309,14 @@ impl Plan {
 ///
 /// # Errors
 /// When an interface was named that is not ours. Buses of a skin are left alone instead.
-pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
+pub fn down(target: &[Target], present: &[Interface]) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
-    for wanted in wanted {
-        let name = wanted.name.clone();
+    for target in target {
+        let name = target.name.clone();
         if plan.changes(&name) {
             continue;
         }
-        match (find(present, &name), &wanted.skin) {
+        match (find(present, &name), &target.skin) {
             (None, _) => plan.leave(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 if !removed_with(&plan, interface, present) {
@@ -328,12 +328,12 @@ pub fn down(wanted: &[Wanted], present: &[Interface]) -> Result<Plan, Refusal> {
                 plan.leave(format!("{name} is {what} that vcan-setup has not made, and is left alone"));
             }
             (Some(interface), None) => {
-                let remedy = if interface.is_virtual() {
+                let hint = if interface.is_virtual() {
                     format!(": if it is yours, `sudo ip link del {name}` removes it")
                 } else {
                     String::new()
                 };
-                return Err(Refusal::NotOurs { name, what: interface.what(), remedy });
+                return Err(Refusal::NotOurs { name, what: interface.what(), hint });
             }
         }
     }

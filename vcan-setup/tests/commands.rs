@@ -214,7 +214,7 @@ fn the_doctor_wants_the_cells_program_and_a_private_directory() {
 }
 
 #[test]
-fn the_doctor_judges_the_kernel_by_the_choice() {
+fn the_doctor_rates_the_kernel_by_the_choice() {
     let folder = Folder::new();
     folder.write("cell-node", "");
     let said = folder.run("doctor nosuchcan1 --bus-kind socketcan");
@@ -248,8 +248,8 @@ fn the_doctor_hears_gateways_and_cells() {
     let said = doctor_hears(&folder, "", &[stimulus]);
     assert_eq!(findings(&said, "fault"), Vec::<String>::new(), "somebody at a shell is no gateway");
     let said = doctor_hears(&folder, "", &[joints]);
-    let rival = "another gateway sends joints on the embedded bus nosuchcan1";
-    assert_eq!(findings(&said, "fault"), [rival]);
+    let other_gateway = "another gateway sends joints on the embedded bus nosuchcan1";
+    assert_eq!(findings(&said, "fault"), [other_gateway]);
     let cells = [heartbeat(3), heartbeat(12)];
     let said = doctor_hears(&folder, "", &cells);
     assert_eq!(findings(&said, "fault"), ["cells are on the embedded bus nosuchcan1 already: 3, 12"]);

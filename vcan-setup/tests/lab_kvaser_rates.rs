@@ -81,9 +81,10 @@ fn bit_rates_are_checked_and_set_only_on_request() {
     let said = bench.run("up skin.toml --set-bit-rates");
     assert_eq!(said, (0, "can0 is at 1000 kbit/s, and up\n".to_owned(), String::new()));
     assert_eq!(can0(), (true, 1_000_000.into()));
-    let left = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, as the skin says, and is left as it is\n";
+    let unchanged =
+        "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, as the skin says, and is left as it is\n";
     for again in ["up skin.toml --set-bit-rates", "up skin.toml"] {
-        assert_eq!(bench.run(again), (0, left.to_owned(), String::new()));
+        assert_eq!(bench.run(again), (0, unchanged.to_owned(), String::new()));
     }
     bench.write(HALF);
     assert_eq!(bench.run("up skin.toml --set-bit-rates").0, 0, "from up as well");

@@ -106,15 +106,15 @@ fn while_the_server_is_stopped_a_sender_waits_and_then_says_how_many_went_out() 
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let child = serve(&directory, &[]);
-    let send_patience = Duration::from_millis(50);
-    let options = Options { directory: Some(directory), send_patience, ..Options::default() };
+    let send_timeout = Duration::from_millis(50);
+    let options = Options { directory: Some(directory), send_timeout, ..Options::default() };
     let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
     let frames: Vec<_> = (0..5000_u32).map(|n| Frame::classic(1, &n.to_le_bytes()).unwrap()).collect();
 
     signal(&child, Signal::STOP);
     let before = Instant::now();
     let error = a.send(&frames).unwrap_err();
-    assert!(before.elapsed() >= send_patience);
+    assert!(before.elapsed() >= send_timeout);
     assert!(matches!(error.cause, BusError::Full { .. }) && error.cause.may_pass(), "{error}");
     let sent = &frames[..error.sent];
     assert!(sent.len() >= 253, "{error}");

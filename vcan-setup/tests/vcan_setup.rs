@@ -149,7 +149,7 @@ fn the_commands_of_a_plan_do_the_same() {
 
 #[test]
 #[ignore = "needs vcan"]
-fn what_is_ours_and_was_spoilt_is_mended() {
+fn what_is_ours_and_was_spoilt_is_repaired() {
     let _made = Made(&["vcan20"]);
     done("up vcan20");
     let index = link("vcan20").unwrap()["ifindex"].clone();
@@ -160,9 +160,9 @@ fn what_is_ours_and_was_spoilt_is_mended() {
     ip("link set vcan20 mtu 16");
     ip("link set vcan20 up");
     assert_eq!(done("up vcan20"), "vcan20 has MTU 72, and is up\n");
-    let mended = link("vcan20").unwrap();
-    assert_ours(&mended, "vcan");
-    assert_eq!(mended["ifindex"], index, "not made anew");
+    let repaired = link("vcan20").unwrap();
+    assert_ours(&repaired, "vcan");
+    assert_eq!(repaired["ifindex"], index, "not made anew");
 }
 
 #[test]
@@ -173,11 +173,11 @@ fn what_is_not_ours_is_never_touched() {
     ip("link set vcan20 mtu 16");
     ip("link set vcan20 up");
     let before = links("");
-    let mends = "sudo sh -c 'ip link set vcan20 down && ip link set vcan20 mtu 72 up'";
+    let repairs = "sudo sh -c 'ip link set vcan20 down && ip link set vcan20 mtu 72 up'";
     assert_eq!(
         fails("up vcan21 vcan20", 1),
         format!(
-            "vcan20 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `{mends}` mends it"
+            "vcan20 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `{repairs}` mends it"
         )
     );
     assert_eq!(
@@ -204,7 +204,7 @@ fn what_is_not_ours_is_never_touched() {
     assert_eq!(same(links("")), same(before));
 
     // The remedy is one.
-    assert!(Command::new("sh").args(["-c", &mends["sudo ".len()..]]).status().unwrap().success());
+    assert!(Command::new("sh").args(["-c", &repairs["sudo ".len()..]]).status().unwrap().success());
     assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan, made by somebody else)\n");
 }
 
@@ -443,18 +443,18 @@ fn doctor(arguments: &str) -> (i32, Vec<String>) {
     );
     let faults = json["findings"].as_array().unwrap().iter().filter(|it| it["level"] == "fault");
     let said_of = |it: &Value| {
-        let remedies = it["remedies"].as_array().unwrap().iter().map(|it| it.as_str().unwrap());
-        std::iter::once(it["text"].as_str().unwrap()).chain(remedies).collect::<Vec<_>>().join(" | ")
+        let hints = it["remedies"].as_array().unwrap().iter().map(|it| it.as_str().unwrap());
+        std::iter::once(it["text"].as_str().unwrap()).chain(hints).collect::<Vec<_>>().join(" | ")
     };
     (said.code, faults.map(said_of).collect())
 }
 
 #[test]
 #[ignore = "needs vcan"]
-fn the_doctor_finds_what_is_wrong_and_its_remedies_mend_it() {
+fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
     let _made = Made(&["vcan20"]);
     let program = env!("CARGO_BIN_EXE_vcan-setup");
-    let mend = |fault: &str| {
+    let repair = |fault: &str| {
         let command = fault.split(" | ").nth(1).unwrap();
         assert!(Command::new("sh").args(["-c", command]).output().unwrap().status.success(), "{command}");
     };
@@ -466,13 +466,16 @@ fn the_doctor_finds_what_is_wrong_and_its_remedies_mend_it() {
         (code, faults.as_slice()),
         (1, [format!("there is no interface vcan20 | {program} up vcan20")].as_slice())
     );
-    mend(&faults[0]);
+    repair(&faults[0]);
     assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
-    let rival = while_somebody_says(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
-    assert!(rival.0 == 1 && rival.1[0].starts_with("another gateway sends joints on vcan20"), "{rival:?}");
+    let other_gateway = while_somebody_says(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
+    assert!(
+        other_gateway.0 == 1 && other_gateway.1[0].starts_with("another gateway sends joints on vcan20"),
+        "{other_gateway:?}"
+    );
     assert!(doctor("vcan20").1[0].starts_with("no cell is heard on vcan20"));
 
-    for (narrow, alias, remedy) in [
+    for (narrow, alias, hint) in [
         (false, "skinbus", format!(" | {program} up vcan20")),
         (true, "skinbus", format!(" | {program} up vcan20")),
         (false, "somebody", " | ip link set vcan20 up".to_owned()),
@@ -484,8 +487,8 @@ fn the_doctor_finds_what_is_wrong_and_its_remedies_mend_it() {
             ip("link set vcan20 mtu 16");
         }
         let (code, faults) = doctor("vcan20");
-        assert!(code == 1 && faults[0].ends_with(&remedy), "{faults:?}");
-        mend(&faults[0]);
+        assert!(code == 1 && faults[0].ends_with(&hint), "{faults:?}");
+        repair(&faults[0]);
         assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
     }
     let (code, faults) = doctor("lo");

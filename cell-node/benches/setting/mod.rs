@@ -1,15 +1,15 @@
 //! One cell on the last link of a UR5, for each way to compute its Jacobian.
 
+#[path = "../../tests/oracle/mod.rs"]
+mod oracle;
 mod peer;
-#[path = "../../tests/witness/mod.rs"]
-mod witness;
 
 use cell_node::kernel::{Kernel, Projection, Wrench};
 use protocol::fixed::Q1_14;
 use protocol::parameters::MAX_JOINTS;
 
+use oracle::Case;
 use peer::Peer;
-use witness::Case;
 
 /// A cell that joint 6 moves, and joints.
 pub(crate) struct Setting {
@@ -50,15 +50,15 @@ impl Setting {
     /// # Panics
     /// When one is more than 5e-4 m from the double precision, or f32 more than 1e-6 m.
     pub(crate) fn check(&self) {
-        let wanted = self.double.jacobian(&self.radians);
+        let target = self.double.jacobian(&self.radians);
         let wrench = self.wrench.jacobian(&self.words).map(Q1_14::to_f64);
         let projection = self.projection.jacobian(&self.words).map(Q1_14::to_f64);
         let single = self.single.jacobian(&self.radians_f32).map(f64::from);
         for (name, got, most) in
             [("wrench", wrench, 5e-4), ("projection", projection, 5e-4), ("nalgebra, f32", single, 1e-6)]
         {
-            let near = got.iter().zip(&wanted).all(|(got, wanted)| (got - wanted).abs() < most);
-            assert!(near && wanted.iter().any(|j| j.abs() > 0.05), "{name}: {got:?}, not {wanted:?}");
+            let near = got.iter().zip(&target).all(|(got, target)| (got - target).abs() < most);
+            assert!(near && target.iter().any(|j| j.abs() > 0.05), "{name}: {got:?}, not {target:?}");
         }
     }
 }

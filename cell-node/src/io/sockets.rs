@@ -14,7 +14,7 @@ pub(super) struct Hearing {
     /// What wakes it.
     pub(super) at_once: Vec<Filter>,
     /// What it hears before that.
-    pub(super) aside: Vec<Filter>,
+    pub(super) deferred: Vec<Filter>,
 }
 
 /// The open bus, twice when something is heard aside.
@@ -24,7 +24,7 @@ pub(super) struct Hearing {
 #[derive(Debug)]
 pub struct Sockets {
     bus: Bus,
-    aside: Option<Bus>,
+    deferred: Option<Bus>,
     /// What came aside.
     waited: Inbox,
     /// What woke the process.
@@ -34,18 +34,18 @@ pub struct Sockets {
 }
 
 impl Sockets {
-    /// Opens the bus; `aside` asks for the second socket.
+    /// Opens the bus; `deferred` asks for the second socket.
     ///
     /// # Errors
     /// When it cannot be used as it is asked for.
-    pub(super) fn open(line: &Line, options: &Options, aside: Option<&[Filter]>) -> Result<Self, Stopped> {
+    pub(super) fn open(line: &Line, options: &Options, deferred: Option<&[Filter]>) -> Result<Self, Stopped> {
         let bus = line.open(options)?;
         let open = |filters: &[Filter]| {
             line.open(&Options { filters: filters.to_vec(), own_frames: false, ..options.clone() })
         };
         Ok(Self {
             bus,
-            aside: aside.map(open).transpose()?,
+            deferred: deferred.map(open).transpose()?,
             waited: Inbox::new(),
             woke: Inbox::new(),
             came: Vec::new(),
@@ -59,15 +59,16 @@ impl Sockets {
     /// Puts other filters in force than those that are.
     pub(super) fn set_filters(&self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
         // What moves from one socket to the other comes by both for a moment rather than by none.
-        let (news, old) = (only_in(&hearing.aside, &before.aside), only_in(&before.aside, &hearing.aside));
-        if let (Some(aside), true) = (&self.aside, !news.is_empty()) {
-            aside.set_filters(&[&before.aside[..], &news].concat())?;
+        let (update, old) =
+            (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
+        if let (Some(deferred), true) = (&self.deferred, !update.is_empty()) {
+            deferred.set_filters(&[&before.deferred[..], &update].concat())?;
         }
         if hearing.at_once != before.at_once {
             self.bus.set_filters(&hearing.at_once)?;
         }
-        if let (Some(aside), true) = (&self.aside, !old.is_empty()) {
-            aside.set_filters(&hearing.aside)?;
+        if let (Some(deferred), true) = (&self.deferred, !old.is_empty()) {
+            deferred.set_filters(&hearing.deferred)?;
         }
         Ok(())
     }
@@ -80,7 +81,7 @@ impl Sockets {
     pub(super) fn look(&mut self) -> Result<bool, BusError> {
         self.wait(Duration::ZERO)?;
         if self.came.is_empty() {
-            self.take_aside()?;
+            self.take_deferred()?;
         }
         Ok(!self.came.is_empty())
     }
@@ -90,20 +91,20 @@ impl Sockets {
         self.waited.clear();
         self.woke.clear();
         self.came.clear();
-        if wait >= Bus::PATIENCE {
+        if wait >= Bus::TIMEOUT {
             self.bus.receive_one_patiently(&mut self.woke)?;
         } else if self.bus.wait(Some(wait))? {
             self.bus.receive(&mut self.woke)?;
         }
         if self.woke.frames().len() > 0 {
-            self.take_aside()?;
+            self.take_deferred()?;
         }
         Ok(())
     }
 
-    fn take_aside(&mut self) -> Result<(), BusError> {
-        if let Some(aside) = &self.aside {
-            aside.receive(&mut self.waited)?;
+    fn take_deferred(&mut self) -> Result<(), BusError> {
+        if let Some(deferred) = &self.deferred {
+            deferred.receive(&mut self.waited)?;
         }
         let mut waited = self.waited.frames().peekable();
         for received in self.woke.frames() {

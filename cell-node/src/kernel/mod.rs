@@ -22,7 +22,7 @@
 //! | [`Projection`] | 103 | 56 | 6 | 6 | 1.4e-4 Nm | 1.5e-3 Nm |
 //! | the paper (Eq. 27) | 103 | 57 | 6 | 6 | 5.4e-3 Nm | |
 //!
-//! The operations are counted by running the code on numbers that count (`witness::Counted`). The
+//! The operations are counted by running the code on numbers that count (`oracle::Counted`). The
 //! errors, of Q3.12 words against Eq. 8 in double precision, are bounds over 300 poses with up to 6 N.
 //! For arms of any shape whose lengths a, d and the cell's coordinates are at most 0.15 m, J errs by
 //! less than 5e-4 m. `cargo run -p cell-node --example kernels` prints what was measured.
@@ -32,10 +32,10 @@
 //! twists four for each vector; lengths that are zero cost nothing. Parameters that
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
+#[cfg(any(feature = "witness", test))]
+pub mod oracle;
 mod projection;
 mod scalar;
-#[cfg(any(feature = "witness", test))]
-pub mod witness;
 mod wrench;
 
 pub use projection::Projection;

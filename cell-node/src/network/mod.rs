@@ -6,34 +6,34 @@
 //!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a number for this cell
 //! ```
 //!
-//! Whoever has a way to the gateway says so in its hellos, with a [`Label`]: how far it is, and in which round of
+//! Whoever has a way to the gateway says so in its hellos, with a [`Rank`]: how far it is, and in which round of
 //! exploration. A cell without a parent asks the nearest port whose label is better than every label that it had
 //! itself (join, grant). Labels only improve, and a parent's is better than its child's: so there is never a
 //! circle, whatever is lost or late. While no sums go up, a cell moves to a port that is nearer than its parent, so
 //! that the tree does not stay deeper than it must. Where no label is good enough, the cell asks for a new round
 //! (seek), which goes up to the gateway and comes down as better labels for all.
 
-mod numbers;
+mod node_ids;
 mod port;
-mod way;
+mod route;
 
 use heapless::Deque;
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, Label, PORTS, PortMessage, UPLINK};
+use protocol::wire::{Hello, PORTS, PortMessage, Rank, UPLINK};
 
 use crate::phase;
-use numbers::Numbers;
+use node_ids::NodeIds;
 use port::Port;
 
 /// From one hello to the next.
 const HELLO: Span = Span::from_millis(250);
 /// How long a cell waits for a grant before it asks another one.
-const JOIN_PATIENCE: Span = Span::from_millis(5);
+const JOIN_TIMEOUT: Span = Span::from_millis(5);
 /// From one search for a way to the next, at first and at most.
-const SEEK: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
+const REPAIR: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
 /// From one time that the gateway's side is told that it was left to the next; it takes sums until it knows.
 const AGAIN: Span = Span::from_millis(20);
 /// Ports, and a root's wire to the gateway's side.
@@ -55,12 +55,12 @@ pub(crate) enum Lost {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Parent {
     port: usize,
-    label: Label,
+    rank: Rank,
 }
 
 /// A parent that was left.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-struct LeftBehind {
+struct FormerParent {
     port: usize,
     /// It takes no sum any more.
     heard: bool,
@@ -69,7 +69,7 @@ struct LeftBehind {
     again: Micros,
 }
 
-impl LeftBehind {
+impl FormerParent {
     const fn new(port: usize, heard: bool, now: Micros) -> Self {
         Self { port, heard, since: now, again: Self::next(port, now) }
     }
@@ -85,24 +85,24 @@ pub(crate) struct Network {
     wired: u8,
     /// Ports that hear nothing.
     pub(crate) deaf: u8,
-    numbers: Numbers,
+    node_ids: NodeIds,
     ports: [Port; ALL],
     parent: Option<Parent>,
     /// The best label that this cell ever had: only better ones are followed.
-    best: Option<Label>,
+    best: Option<Rank>,
     /// The label that its ports were told last, or that there is none.
-    offered: Option<Label>,
+    offered: Option<Rank>,
     joining: Option<(usize, Micros)>,
     /// Sums go up: a parent is not left without need.
     pub(crate) busy: bool,
     /// The parent has no way itself.
     deserted: bool,
     /// When a new round is asked for again, and how long after the last time that is.
-    seek: Option<(Micros, Span)>,
+    repair: Option<(Micros, Span)>,
     /// The last round that somebody asked for, whether all were asked for it or the parent only, and when.
     passed_on: Option<(u8, bool, Micros)>,
     /// The parent that was left last.
-    left: Option<LeftBehind>,
+    former_parent: Option<FormerParent>,
     reported: Option<[PortState; PORTS]>,
     /// How often the parent changed.
     pub(crate) changes: u16,
@@ -120,7 +120,7 @@ impl Network {
 
     /// The same cell with wires at the ports `wired`; hellos of many cells are spread by serial number.
     pub(crate) fn wired(mut self, wired: u8, number: Option<CellId>, serial: u32) -> Self {
-        (self.wired, self.numbers.own) = (wired, number);
+        (self.wired, self.node_ids.own) = (wired, number);
         self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
         self
     }
@@ -142,21 +142,21 @@ impl Network {
 
     /// Wires to the root of the tree; 0 is a root.
     pub(crate) fn depth(&self) -> Option<u8> {
-        self.parent.map(|parent| parent.label.depth)
+        self.parent.map(|parent| parent.rank.depth)
     }
 
     /// What those below it are told.
-    fn label(&self) -> Option<Label> {
-        self.parent.map(|parent| parent.label.below())
+    fn rank(&self) -> Option<Rank> {
+        self.parent.map(|parent| parent.rank.below())
     }
 
     /// The round of the label.
     pub(crate) fn round(&self) -> u8 {
-        self.best.map_or(0, |label| label.round)
+        self.best.map_or(0, |rank| rank.round)
     }
 
     /// The parent's number: 0 for the gateway's side.
-    pub(crate) fn parent_number(&self) -> Option<u8> {
+    pub(crate) fn parent_node(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
             port => self.number_at(port).map(CellId::get),
@@ -179,14 +179,15 @@ impl Network {
     }
 
     /// Whether the parent that was left last has heard so, or there was none: then it takes no sum any more.
-    pub(crate) fn is_let_go(&self) -> bool {
-        self.left.is_none_or(|left| left.heard)
+    pub(crate) fn is_released(&self) -> bool {
+        self.former_parent.is_none_or(|former_parent| former_parent.heard)
     }
 
     /// The cell was silent for an epoch: a parent that was left takes no sum any more. The gateway's side needs longer:
     /// it goes by what it hears over the wire.
-    pub(crate) fn forget_left(&mut self, now: Micros) {
-        self.left.take_if(|left| left.port != UPLINK || now.since(left.since) >= HELLO);
+    pub(crate) fn forget_former_parent(&mut self, now: Micros) {
+        self.former_parent
+            .take_if(|former_parent| former_parent.port != UPLINK || now.since(former_parent.since) >= HELLO);
     }
 
     /// Bit p: the cell at port p is a child.
@@ -199,8 +200,8 @@ impl Network {
         self.bits(|port| port.works(now))
     }
 
-    fn bits(&self, wanted: impl Fn(&Port) -> bool) -> u8 {
-        let bit = |(place, port): (usize, &Port)| u8::from(wanted(port)) << place;
+    fn bits(&self, target: impl Fn(&Port) -> bool) -> u8 {
+        let bit = |(place, port): (usize, &Port)| u8::from(target(port)) << place;
         self.ports.iter().take(PORTS).enumerate().map(bit).sum()
     }
 
@@ -217,7 +218,7 @@ impl Network {
 
     /// A number that a walk gave this cell, once.
     pub(crate) const fn given(&mut self) -> Option<CellId> {
-        self.numbers.given.take()
+        self.node_ids.given.take()
     }
 
     /// The next message for a port.
@@ -230,11 +231,11 @@ impl Network {
         if !self.exists() {
             return Micros(u64::MAX);
         }
-        let join = self.joining.map(|(_, asked)| asked + JOIN_PATIENCE);
-        let seek = self.seek.map(|(at, _)| at).filter(|_| self.joining.is_none());
+        let join = self.joining.map(|(_, requested)| requested + JOIN_TIMEOUT);
+        let repair = self.repair.map(|(at, _)| at).filter(|_| self.joining.is_none());
         let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.silent_at());
-        let leave = self.to_be_told().map(|left| left.again);
-        [join, seek, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
+        let leave = self.to_be_reported().map(|former_parent| former_parent.again);
+        [join, repair, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
     /// Says something to the cell at a port.
@@ -249,49 +250,51 @@ impl Network {
         let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
         let hello = Hello {
             version: VERSION,
-            number: self.numbers.own.map_or(0, CellId::get),
+            number: self.node_ids.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
             hears,
             up: self.up() == Some(port),
             unnumbered: self.is_unnumbered(),
-            label: self.label(),
+            rank: self.rank(),
         };
-        if hello.label.is_some() {
+        if hello.rank.is_some() {
             self.ports.get_mut(port).into_iter().for_each(|port| port.sought = false);
         }
         self.say(port, PortMessage::Hello(hello));
     }
 
     fn hello_to_all(&mut self, now: Micros) {
-        self.offered = self.label();
+        self.offered = self.rank();
         for port in 0..ALL {
             self.hello(now, port);
         }
     }
 
-    /// Takes what came in through a port that hears, except what is about sums: `State` and `Missed`.
+    /// Takes what came in through a port that hears, except what is about sums: `State` and `Nack`.
     pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
             PortMessage::Join => self.let_in(now, port),
-            PortMessage::Grant(label) => self.join(now, port, label),
+            PortMessage::Grant(rank) => self.join(now, port, rank),
             PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Done),
-            PortMessage::Refuse if self.joining.is_some_and(|(asked, _)| asked == port) => {
+            PortMessage::Refuse if self.joining.is_some_and(|(requested, _)| requested == port) => {
                 self.distrust(now, port);
                 self.joining = None;
                 self.search(now);
             }
             PortMessage::Leave => {
                 self.ports.get_mut(port).into_iter().for_each(|port| port.child = None);
-                self.say(port, PortMessage::Left);
+                self.say(port, PortMessage::LeaveAck);
             }
-            PortMessage::Left => self.left.iter_mut().for_each(|left| left.heard |= left.port == port),
-            PortMessage::Seek(round) => self.pass_on(now, port, round),
-            PortMessage::Ask => self.hello(now, port),
-            PortMessage::Number(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
+            PortMessage::LeaveAck => self
+                .former_parent
+                .iter_mut()
+                .for_each(|former_parent| former_parent.heard |= former_parent.port == port),
+            PortMessage::Repair(round) => self.pass_on(now, port, round),
+            PortMessage::Probe => self.hello(now, port),
+            PortMessage::NodeId(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
             PortMessage::Return(walk) => self.go_on_walking(port, walk),
-            PortMessage::Refuse | PortMessage::Number(_) | PortMessage::State(_) | PortMessage::Missed(_) => {
-            }
+            PortMessage::Refuse | PortMessage::NodeId(_) | PortMessage::State(_) | PortMessage::Nack(_) => {}
         }
         self.tell_unnumbered(now);
     }
@@ -299,26 +302,26 @@ impl Network {
     fn take_hello(&mut self, now: Micros, port: usize, hello: Hello) {
         let Some(there) = self.ports.get_mut(port) else { return };
         let number = there.number();
-        let anew = there.take(now, hello);
+        let restarted = there.take(now, hello);
         let is_child = there.is_child();
         self.tree_changed |=
             there.number() != number && (is_child || self.parent.is_some_and(|it| it.port == port));
         if hello.version != VERSION {
             return;
         }
-        if anew || !hello.hears {
+        if restarted || !hello.hears {
             self.hello(now, port);
         }
         if hello.up && !is_child {
             self.say(port, PortMessage::Refuse);
         }
         match self.parent {
-            Some(parent) if parent.port == port => match hello.label {
+            Some(parent) if parent.port == port => match hello.rank {
                 _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
                 // It is as near as it was, or nearer, or of a later round.
-                Some(label) if !parent.label.is_better_than(label) => self.follow(now, port, label),
+                Some(rank) if !parent.rank.is_better_than(rank) => self.follow(now, port, rank),
                 // It has no way itself, and looks for one; so do those below, and what they say meanwhile is missed soon.
-                None => self.pass_on(now, port, parent.label.round),
+                None => self.pass_on(now, port, parent.rank.round),
                 // It started anew.
                 Some(_) => self.lose_parent(now, Lost::Unsure),
             },
@@ -339,8 +342,9 @@ impl Network {
     }
 
     /// A parent that was left and may not know it.
-    fn to_be_told(&self) -> Option<LeftBehind> {
-        self.left.filter(|left| !left.heard && self.up() != Some(left.port))
+    fn to_be_reported(&self) -> Option<FormerParent> {
+        self.former_parent
+            .filter(|former_parent| !former_parent.heard && self.up() != Some(former_parent.port))
     }
 
     /// Takes in that time has passed. Harmless when called early.
@@ -349,9 +353,11 @@ impl Network {
             return;
         }
         self.hello_by(now, now);
-        if let Some(left) = self.to_be_told().filter(|left| now >= left.again) {
-            self.left = Some(LeftBehind { again: LeftBehind::next(left.port, now), ..left });
-            self.say(left.port, PortMessage::Leave);
+        if let Some(former_parent) = self.to_be_reported().filter(|former_parent| now >= former_parent.again)
+        {
+            self.former_parent =
+                Some(FormerParent { again: FormerParent::next(former_parent.port, now), ..former_parent });
+            self.say(former_parent.port, PortMessage::Leave);
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
@@ -364,7 +370,7 @@ impl Network {
         if self.parent.is_none() {
             self.search(now);
         } else {
-            self.joining.take_if(|(_, asked)| now.since(*asked) >= JOIN_PATIENCE);
+            self.joining.take_if(|(_, requested)| now.since(*requested) >= JOIN_TIMEOUT);
         }
         self.tell_unnumbered(now);
     }

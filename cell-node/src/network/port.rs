@@ -3,7 +3,7 @@
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, Label};
+use protocol::wire::{Hello, Rank};
 
 /// A port from which nothing came for so long leads nowhere: two hellos and some jitter.
 pub(super) const SILENT: Span = Span::from_millis(600);
@@ -26,14 +26,14 @@ pub(super) struct Port {
 impl Port {
     /// Takes a hello; whether this is the first one for long.
     pub(super) fn take(&mut self, now: Micros, hello: Hello) -> bool {
-        let anew = self.hello(now).is_none();
+        let restarted = self.hello(now).is_none();
         self.heard = Some((hello, now));
         // It has been told, and does not think so: it is a child no longer.
         let forgot = !hello.up && self.child.is_some_and(|since| now.since(since) > KNOWS);
         if forgot {
             self.child = None;
         }
-        anew
+        restarted
     }
 
     /// The last hello, unless it is long ago.
@@ -47,10 +47,10 @@ impl Port {
     }
 
     /// How far the cell at the other end is, if sums could go there.
-    pub(super) fn label(&self, now: Micros) -> Option<Label> {
+    pub(super) fn rank(&self, now: Micros) -> Option<Rank> {
         let at = self.heard.map(|(_, at)| at)?;
         let trusted = self.distrusted.is_none_or(|since| at > since);
-        self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.label)
+        self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
     }
 
     /// The number of the cell at the other end, if it has one.
@@ -65,7 +65,7 @@ impl Port {
 
     /// Whether a later round makes a difference there at once: to a child, and to who looks for a way.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
-        self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.label.is_none())
+        self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }
 
     pub(super) const fn is_child(&self) -> bool {

@@ -150,7 +150,7 @@ impl Node {
     pub fn poll_store(&self) -> Option<Kept> {
         let parameters = match self.storing? {
             Storing::Parameters(parameters, _) => Some(parameters),
-            Storing::Number => self.configuration.in_use.as_ref().map(|in_use| in_use.parameters),
+            Storing::NodeId => self.configuration.in_use.as_ref().map(|in_use| in_use.parameters),
         };
         Some(Kept { number: self.identity.cell, parameters })
     }
@@ -164,7 +164,7 @@ impl Node {
     /// parent's sum, which only tells that the parent is there; and joints while it would only wait for its children's
     /// sums, which come after them.
     #[must_use]
-    pub fn hears_aside(&self, id: Id) -> bool {
+    pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
             return self.summing.waits_for_children;
         }
@@ -258,7 +258,7 @@ impl Node {
             return;
         }
         // All that came before these joints has been heard.
-        self.judge(now);
+        self.comparator(now);
         let in_use = self.configuration.in_use.as_ref();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.receiver.refused.meaning);
@@ -275,7 +275,7 @@ impl Node {
         count(&mut self.heard.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
-        let skin = &self.stimuli.felt.skin;
+        let skin = &self.stimuli.sensed.skin;
         let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
         let torque =
             force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));

@@ -2,7 +2,7 @@
 
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
-use protocol::parameters::{Cuts, Events, Parameter, Parameters, Reply, Sensing};
+use protocol::parameters::{Events, LinksDown, Parameter, Parameters, Reply, Sensing};
 use protocol::time::Micros;
 
 use super::Node;
@@ -17,7 +17,7 @@ pub(super) struct Switches {
     /// Which changes are events.
     pub(super) events: Events,
     /// Which ports hear nothing.
-    cuts: Cuts,
+    links_down: LinksDown,
 }
 
 /// What is being written into flash.
@@ -26,7 +26,7 @@ pub(super) enum Storing {
     /// Parameters that somebody committed, with the request's tag.
     Parameters(Parameters, u8),
     /// The number that the network gave.
-    Number,
+    NodeId,
 }
 
 impl Node {
@@ -85,7 +85,7 @@ impl Node {
             Parameter::Reply => self.switches.reply.words(),
             Parameter::Sensing => self.switches.sensing.words(),
             Parameter::Events => self.switches.events.words(),
-            Parameter::Cuts => self.switches.cuts.words(),
+            Parameter::LinksDown => self.switches.links_down.words(),
             Parameter::Mount
             | Parameter::Pose
             | Parameter::Contact
@@ -102,7 +102,7 @@ impl Node {
             Parameter::Reply => Reply::from_words(words).map(|reply| switches.reply = reply),
             Parameter::Sensing => Sensing::from_words(words).map(|sensing| switches.sensing = sensing),
             Parameter::Events => Events::from_words(words).map(|events| switches.events = events),
-            Parameter::Cuts => test_mode.then(|| switches.cuts = Cuts::from_words(words)),
+            Parameter::LinksDown => test_mode.then(|| switches.links_down = LinksDown::from_words(words)),
             Parameter::Mode => {
                 self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
                 self.stimuli.clear();
@@ -116,7 +116,7 @@ impl Node {
             | Parameter::Row(_)
             | Parameter::Commit => return self.configuration.stage(parameter, words),
         };
-        self.summing.network.deaf = switches.cuts.deaf;
+        self.summing.network.deaf = switches.links_down.deaf;
         self.summing.sum.set_slots(match switches.reply {
             Reply::Torque => None,
             Reply::Sum(slots) => Some(slots),

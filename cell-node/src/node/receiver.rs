@@ -3,7 +3,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::Refused;
-use protocol::packet::{Half, Packet, PacketError, Paired};
+use protocol::packet::{Packet, PacketError, Reassembly, Segment};
 use protocol::time::Micros;
 
 use super::{HEARD, count};
@@ -13,14 +13,14 @@ use super::{HEARD, count};
 pub(super) struct Receiver {
     format: Format,
     /// By slot of the identifier among those that are heard.
-    halves: [Half; HEARD],
+    segments: [Segment; HEARD],
     /// What cannot be used, by its reason.
     pub(super) refused: Refused,
 }
 
 impl Receiver {
     pub(super) fn new(format: Format) -> Self {
-        Self { format, halves: [Half::NONE; HEARD], refused: Refused::default() }
+        Self { format, segments: [Segment::NONE; HEARD], refused: Refused::default() }
     }
 
     /// The packet that this frame, which arrived then, is or completes.
@@ -30,13 +30,13 @@ impl Receiver {
             Format::Classic if frame.format() != Format::Classic => {
                 Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
-            Format::Classic => match self.halves.get_mut(slot)?.push(arrived, id, frame.data()) {
-                Ok(Paired::Waiting) => return None,
-                Ok(Paired::Incomplete) => {
+            Format::Classic => match self.segments.get_mut(slot)?.push(arrived, id, frame.data()) {
+                Ok(Reassembly::Waiting) => return None,
+                Ok(Reassembly::Incomplete) => {
                     count(&mut self.refused.incomplete);
                     return None;
                 }
-                Ok(Paired::Whole(packet)) => Ok(packet),
+                Ok(Reassembly::Complete(packet)) => Ok(packet),
                 Err(error) => Err(error),
             },
         };

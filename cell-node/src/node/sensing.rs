@@ -17,7 +17,7 @@ use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact};
 
-use super::stimuli::Felt;
+use super::stimuli::Sensed;
 use super::{Node, Switches};
 use crate::phase;
 
@@ -43,7 +43,7 @@ pub(super) struct Sensing {
     /// When the next one is due; in continuous mode only.
     due: Option<Micros>,
     /// What was sent last, whoever asked for it.
-    sent: Felt,
+    sent: Sensed,
     /// When page 0 was said last without being asked for.
     said: Option<Micros>,
     contact: Touch,
@@ -54,15 +54,15 @@ pub(super) struct Sensing {
 
 impl Sensing {
     /// Something may have been latched, measured or switched.
-    fn look(&mut self, now: Micros, switches: &Switches, cell: CellId, felt: &Felt) -> Pages {
+    fn look(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
         let Switches { sensing, events, .. } = switches;
         if *sensing != self.mode {
-            return self.switch(now, switches, cell, felt);
+            return self.switch(now, switches, cell, sensed);
         }
         if *sensing != Mode::Event {
             return Pages::NONE;
         }
-        let Felt { skin, acceleration } = felt;
+        let Sensed { skin, acceleration } = sensed;
         let turned = self.follow(skin, events);
         let pages = Pages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
@@ -72,7 +72,7 @@ impl Sensing {
     }
 
     /// Another mode, which begins with what is felt now.
-    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, felt: &Felt) -> Pages {
+    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
         match mode {
@@ -82,7 +82,7 @@ impl Sensing {
                 self.due = Some(now + period + phase::by_number(period, cell));
             }
             Mode::Event => {
-                self.follow(&felt.skin, &switches.events);
+                self.follow(&sensed.skin, &switches.events);
             }
         }
         self.says(now, Pages::BOTH)
@@ -146,7 +146,7 @@ impl Node {
         // Whose number is in doubt says nothing; what is felt is compared with what was sent, so that
         // nothing is forgotten.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
-        let pages = self.sensing.look(now, &self.switches, cell, &self.stimuli.felt);
+        let pages = self.sensing.look(now, &self.switches, cell, &self.stimuli.sensed);
         self.push_sensors(pages);
     }
 
@@ -179,8 +179,8 @@ impl Node {
     /// Says what is felt.
     pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
         let Some(from) = self.identity.cell else { return };
-        let skin = skin.then_some(SensorPage::Skin(self.stimuli.felt.skin));
-        let acceleration = acceleration.then_some(SensorPage::Acceleration(self.stimuli.felt.acceleration));
+        let skin = skin.then_some(SensorPage::Skin(self.stimuli.sensed.skin));
+        let acceleration = acceleration.then_some(SensorPage::Acceleration(self.stimuli.sensed.acceleration));
         for page in skin.into_iter().chain(acceleration) {
             self.sensing.sent.set(&page);
             self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });

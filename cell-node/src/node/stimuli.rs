@@ -24,13 +24,13 @@ pub(super) enum Arrival {
 
 /// All that a cell feels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Felt {
+pub(super) struct Sensed {
     pub(super) skin: SkinSensors,
     /// In g.
     pub(super) acceleration: [Q3_12; 3],
 }
 
-impl Felt {
+impl Sensed {
     /// One page of it is this.
     pub(super) const fn set(&mut self, page: &SensorPage) {
         match *page {
@@ -45,7 +45,7 @@ impl Felt {
 pub(super) struct Stimuli {
     pending: Vec<(From, SensorPage), PENDING>,
     /// What is felt now.
-    pub(super) felt: Felt,
+    pub(super) sensed: Sensed,
 }
 
 impl Stimuli {
@@ -63,7 +63,7 @@ impl Stimuli {
         self.pending.retain(|(from, page)| {
             let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);
             if !waits {
-                self.felt.set(page);
+                self.sensed.set(page);
             }
             waits
         });
@@ -84,8 +84,8 @@ mod tests {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
     }
 
-    fn felt(stimuli: &Stimuli) -> f64 {
-        stimuli.felt.skin.contact[0].to_f64()
+    fn sensed(stimuli: &Stimuli) -> f64 {
+        stimuli.sensed.skin.contact[0].to_f64()
     }
 
     #[test]
@@ -96,7 +96,7 @@ mod tests {
         assert_eq!(stimuli.push(From::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
         let course = [254, 255, 0, 1, 2].map(|epoch| {
             stimuli.latch(Epoch(epoch));
-            felt(&stimuli)
+            sensed(&stimuli)
         });
         assert!(course.iter().eq(&[0.0, 1.0, 1.0, 2.0, 2.0]), "{course:?}");
     }
@@ -106,9 +106,9 @@ mod tests {
         let mut stimuli = Stimuli::default();
         stimuli.latch(Epoch(7));
         assert_eq!(stimuli.push(From::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
-        assert!(felt(&stimuli) < 0.5, "not before the next joints");
+        assert!(sensed(&stimuli) < 0.5, "not before the next joints");
         stimuli.latch(Epoch(40));
-        assert!(felt(&stimuli) > 0.5);
+        assert!(sensed(&stimuli) > 0.5);
     }
 
     #[test]

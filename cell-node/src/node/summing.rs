@@ -13,9 +13,9 @@ use crate::sum::{Begin, Sum, Words};
 
 /// So many more epochs in a row without an answer are borne each time that a parent that was lost that way says that it
 /// was there and heard.
-const PATIENT: u16 = 2 * FORGETS;
+const TOLERANCE_STEP: u16 = 2 * FORGETS;
 /// So many at most.
-const PATIENCE: u16 = 12 * FORGETS;
+const TOLERANCE: u16 = 12 * FORGETS;
 /// One less after so many epochs with a sum of the parent.
 const FORGETS: u16 = 16;
 /// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
@@ -64,7 +64,7 @@ pub(super) struct Summing {
     unanswered: Option<u16>,
     /// How many of them are borne, in sixteenths: who lost parents that were there all the time is on a machine that is
     /// late, and would only lose the next one too.
-    patience: u16,
+    tolerance: u16,
     /// The port of a parent that was lost and may have been there all the time.
     suspected: Option<usize>,
     /// Epochs in a row in which a child was waited for and nothing was amiss.
@@ -119,9 +119,9 @@ impl Summing {
             }
             return;
         }
-        if let PortMessage::Missed(epoch) = message {
+        if let PortMessage::Nack(epoch) = message {
             if is_parent {
-                self.was_missed(epoch);
+                self.was_nack(epoch);
             }
             return;
         }
@@ -129,8 +129,10 @@ impl Summing {
             self.unanswered = None;
             self.sum.held = false;
         }
-        if message == PortMessage::Left && self.suspected.take_if(|suspected| *suspected == port).is_some() {
-            self.patience = (self.patience + PATIENT).min(PATIENCE);
+        if message == PortMessage::LeaveAck
+            && self.suspected.take_if(|suspected| *suspected == port).is_some()
+        {
+            self.tolerance = (self.tolerance + TOLERANCE_STEP).min(TOLERANCE);
         }
         self.network.handle(now, port, message);
     }
@@ -170,7 +172,7 @@ impl Summing {
         self.said_before = self.sum.said_in(epoch.before());
         // A parent that was left and may not know it takes no sum from who was silent for an epoch.
         if !self.said_before {
-            self.network.forget_left(at);
+            self.network.forget_former_parent(at);
         }
         self.parent = match up {
             None => Parent::None,
@@ -182,7 +184,7 @@ impl Summing {
             at,
             period,
             depth: self.network.depth(),
-            speaks: up.is_some() && self.network.is_let_go(),
+            speaks: up.is_some() && self.network.is_released(),
             children: self.network.children(),
         };
         self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
@@ -192,10 +194,10 @@ impl Summing {
         }
         if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and what was not said is free for another.
-            if unanswered >= self.borne() {
+            if unanswered >= self.tolerated() {
                 self.sum.held = true;
             }
-            self.ask_parent();
+            self.probe_parent();
         }
     }
 
@@ -218,21 +220,21 @@ impl Summing {
     }
 
     /// Looks whose sums did not come in this epoch, once; whether the parent is lost.
-    fn judge(&mut self, now: Micros) -> bool {
-        let Some((epoch, missed)) = self.sum.judge() else { return false };
-        for port in (0..PORTS).filter(|port| missed >> port & 1 == 1) {
-            self.network.say(port, PortMessage::Missed(epoch));
+    fn comparator(&mut self, now: Micros) -> bool {
+        let Some((epoch, nack)) = self.sum.comparator() else { return false };
+        for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
+            self.network.say(port, PortMessage::Nack(epoch));
         }
         let said = self.sum.said_in(epoch);
-        let borne = self.borne();
+        let tolerated = self.tolerated();
         let mut lost = None;
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
                 *unanswered += 1;
                 // Of who was silent all this epoch it takes no more.
-                lost = (*unanswered > borne).then_some(if said { Lost::Unsure } else { Lost::Done });
+                lost = (*unanswered > tolerated).then_some(if said { Lost::Unsure } else { Lost::Done });
             }
-            (None, Parent::Cell { heard: true, .. }) => self.patience = self.patience.saturating_sub(1),
+            (None, Parent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
             (None, Parent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
             (None, Parent::Gateway | Parent::None) => {}
         }
@@ -244,32 +246,32 @@ impl Summing {
             self.network.lose_parent(now, how);
             self.follow_network();
         }
-        let well = said && missed == 0 && self.unanswered.is_none() && self.sum.awaits_children();
+        let well = said && nack == 0 && self.unanswered.is_none() && self.sum.awaits_children();
         self.steady = if well { (self.steady + 1).min(STEADY) } else { 0 };
         lost.is_some()
     }
 
     /// The parent says that it did not take a sum: it has to be told anew whom they are for, and asked whether it hears
     /// this cell at all.
-    fn was_missed(&mut self, epoch: Epoch) {
+    fn was_nack(&mut self, epoch: Epoch) {
         self.sum.restate = true;
         let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
         if (self.sum.epoch == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
             // It was thought to be taken.
             self.unanswered = self.unanswered.or(Some(0));
-            self.ask_parent();
+            self.probe_parent();
         }
     }
 
     /// Epochs in a row without an answer that are borne.
-    const fn borne(&self) -> u16 {
-        self.patience.div_ceil(FORGETS)
+    const fn tolerated(&self) -> u16 {
+        self.tolerance.div_ceil(FORGETS)
     }
 
     /// Asks the parent whether it is there; it is looked for the answer before the next joints.
-    fn ask_parent(&mut self) {
+    fn probe_parent(&mut self) {
         if let Some(up) = self.network.up() {
-            self.network.say(up, PortMessage::Ask);
+            self.network.say(up, PortMessage::Probe);
         }
         self.sum.watch();
     }
@@ -292,7 +294,7 @@ impl Node {
         if let Some(cell) = self.summing.network.given() {
             self.identity.cell = Some(cell);
             self.claim = AddressClaim::new(self.identity, now);
-            self.storing = Some(Storing::Number);
+            self.storing = Some(Storing::NodeId);
             self.summing.hears_changed = true;
         }
         self.summing.follow_network();
@@ -303,8 +305,8 @@ impl Node {
     pub(super) fn handle_sums(&mut self, now: Micros) {
         let Some(from) = self.identity.cell else { return };
         let summing = &mut self.summing;
-        if let Some((epoch, Words { torque, count }, anew)) = summing.sum.say(now) {
-            if anew {
+        if let Some((epoch, Words { torque, count }, restarted)) = summing.sum.say(now) {
+            if restarted {
                 summing.network.state(epoch);
             }
             self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
@@ -313,9 +315,9 @@ impl Node {
         let Some(late) = self.summing.sum.check(now) else { return };
         // Who looks late looks at the next joints, when all that came before them has been heard.
         if late <= PUNCTUAL {
-            self.judge(now);
+            self.comparator(now);
             if self.summing.unanswered.is_some() {
-                self.summing.ask_parent();
+                self.summing.probe_parent();
             }
         }
         if core::mem::take(&mut self.claim.sync_waits) {
@@ -324,8 +326,8 @@ impl Node {
     }
 
     /// Looks whose sums did not come in this epoch, once.
-    pub(super) fn judge(&mut self, now: Micros) {
-        if self.summing.judge(now) {
+    pub(super) fn comparator(&mut self, now: Micros) {
+        if self.summing.comparator(now) {
             self.after_network(now);
         }
     }
@@ -344,7 +346,7 @@ impl Node {
         let Summing { network, sum, report, .. } = &mut self.summing;
         report.round = network.round();
         let tree = Tree {
-            parent: network.parent_number(),
+            parent: network.parent_node(),
             up: network.up().map_or(0, |up| up.to_le_bytes()[0]),
             depth: network.depth().unwrap_or(0),
             round: report.round,

@@ -3,7 +3,7 @@ use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
-use protocol::packet::Half;
+use protocol::packet::Segment;
 use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};
 
 /// A wheel: one joint about z, a cell on its rim that looks along the direction of motion.
@@ -239,8 +239,8 @@ fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
 fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
     let (mut node, _) = claiming(identity());
     let to = Address::Everyone;
-    let ask = Message::Configure { to, tag: 0, request: Request::Read { number: 0 } };
-    for message in [Message::Sync, Message::Report, ask, press(4.0, From::Next), joints(0)] {
+    let request = Message::Configure { to, tag: 0, request: Request::Read { number: 0 } };
+    for message in [Message::Sync, Message::Report, request, press(4.0, From::Next), joints(0)] {
         assert_eq!(tell(&mut node, &message), []);
     }
     node.handle_timeout(node.poll_timeout());
@@ -262,7 +262,7 @@ fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
 fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     let mut node = settled(Flash::Damaged);
     let to = Address::Cell(cell());
-    let ask = |node: &mut Node, request| {
+    let request = |node: &mut Node, request| {
         let answer = tell(node, &Message::Configure { to, tag: 77, request });
         match answer.as_slice() {
             [Message::Configured { tag: 77, answer, .. }] => Some(*answer),
@@ -272,26 +272,26 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     };
     for parameter in Parameter::STORED {
         let (number, words) = (parameter.number(), wheel().words(parameter));
-        let answer = ask(&mut node, Request::Write { number, words });
+        let answer = request(&mut node, Request::Write { number, words });
         assert_eq!(answer, Some(Answer::Value { number, written: true, words }));
         assert_eq!(
-            ask(&mut node, Request::Read { number }),
+            request(&mut node, Request::Read { number }),
             Some(Answer::Value { number, written: false, words })
         );
     }
     let commit = |hash: u16| Request::Write { number: 127, words: padded([hash.cast_signed()]) };
     let refused = |reason| Some(Answer::Refused { number: 127, reason });
-    assert_eq!(ask(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
+    assert_eq!(request(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
     assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");
 
-    assert_eq!(ask(&mut node, commit(wheel().hash())), None, "flash first");
+    assert_eq!(request(&mut node, commit(wheel().hash())), None, "flash first");
     assert_eq!(node.poll_store(), Some(Kept { number: Some(cell()), parameters: Some(wheel()) }));
     node.handle_stored(false);
     let failed =
         Message::Configured { from: cell(), tag: 77, answer: refused(Answer::FLASH_FAILED).unwrap() };
     assert_eq!(drain(&mut node), [failed]);
 
-    ask(&mut node, commit(wheel().hash()));
+    request(&mut node, commit(wheel().hash()));
     node.handle_stored(true);
     assert_eq!(drain(&mut node).len(), 1);
     assert_eq!(node.poll_store(), None);
@@ -303,12 +303,12 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     // What cannot be is refused, and what was in use stays in use.
     let mut words = wheel().words(Parameter::Mount);
     words[0] = 2;
-    ask(&mut node, Request::Write { number: 1, words });
+    request(&mut node, Request::Write { number: 1, words });
     let hash = Parameters { joint: 2, ..wheel() }.hash();
-    assert_eq!(ask(&mut node, commit(hash)), refused(3));
+    assert_eq!(request(&mut node, commit(hash)), refused(3));
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
     assert_eq!(
-        ask(&mut node, Request::Read { number: 99 }),
+        request(&mut node, Request::Read { number: 99 }),
         Some(Answer::Refused { number: 99, reason: Answer::UNKNOWN })
     );
 }
@@ -355,7 +355,7 @@ fn a_torque_that_does_not_fit_is_marked_as_saturated() {
 }
 
 #[test]
-fn the_classic_format_works_in_halves() {
+fn the_classic_format_works_in_segments() {
     let flash = Flash::Sound(wheel());
     let mut node = settle(Node::new(identity(), Format::Classic, &flash, true, Micros(0)));
     let hear = |node: &mut Node, message: &Message| {
@@ -371,11 +371,11 @@ fn the_classic_format_works_in_halves() {
     node.handle_frame(NOW, Span(0), &first);
     assert_eq!(hear(&mut node, &joints(2)), [torque(2, -2.0)]);
     // How far apart they are is a matter of when they arrived, not of when the cell came to hear them.
-    let within = Half::within(Id::command(Command::Joints));
+    let within = Segment::within(Id::command(Command::Joints));
     let mut apart = |epoch, second: Micros, age| {
-        let mut halves = joints(epoch).encode().frames(Format::Classic);
-        node.handle_frame(NOW, Span(0), &halves.next().unwrap());
-        node.handle_frame(second, age, &halves.next().unwrap());
+        let mut segments = joints(epoch).encode().frames(Format::Classic);
+        node.handle_frame(NOW, Span(0), &segments.next().unwrap());
+        node.handle_frame(second, age, &segments.next().unwrap());
         drain(&mut node)
     };
     assert_eq!(apart(3, NOW + within + Span(7), Span(7)), [torque(3, -2.0)]);

@@ -30,9 +30,9 @@ fn at(epoch: u8, micros: u64) -> Micros {
 fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     let mut said = Vec::new();
     for micros in (0..PERIOD.0).step_by(100) {
-        if let Some((of, words, anew)) = sum.say(at(epoch, micros)) {
+        if let Some((of, words, restarted)) = sum.say(at(epoch, micros)) {
             assert_eq!(of, Epoch(epoch));
-            said.push((micros, words.torque[0].to_bits(), words.count, anew));
+            said.push((micros, words.torque[0].to_bits(), words.count, restarted));
         }
     }
     said
@@ -55,14 +55,14 @@ fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
 
 #[test]
 fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
-    for (carry, wanted) in [(true, [0, 1, 0, 1, 0]), (false, [0; 5])] {
+    for (carry, target) in [(true, [0, 1, 0, 1, 0]), (false, [0; 5])] {
         let mut sum = sum(carry);
         let mut got = Vec::new();
         for epoch in 0..5 {
             sum.begin(&begin(epoch, 0), Some(&own(400)));
             got.extend(says(&mut sum, epoch).first().map(|said| said.1));
         }
-        assert_eq!(got, wanted);
+        assert_eq!(got, target);
     }
     let mut sum = sum(true);
     sum.begin(&begin(0, 0), Some(&own(400)));
@@ -97,7 +97,7 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     sum.take(at(2, 500), 1, Epoch(2), words(10, 1));
     assert_eq!(sum.taken, 2);
     sum.begin(&begin(3, 2), None);
-    assert_eq!(sum.judge(), Some((Epoch(3), 0b10)), "it did not come");
+    assert_eq!(sum.comparator(), Some((Epoch(3), 0b10)), "it did not come");
     sum.begin(&begin(4, 2), None);
     assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "it is looked in time");
     assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (None, Some(Span(0))));
@@ -122,7 +122,7 @@ fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
     assert_eq!((sum.taken, sum.dropped), (1, 1));
     sum.take(at(3, 200), 1, Epoch(3), words(10, 1));
     assert_eq!((sum.taken, sum.dropped), (2, 1));
-    assert_eq!(sum.judge(), Some((Epoch(3), 0)));
+    assert_eq!(sum.comparator(), Some((Epoch(3), 0)));
 }
 
 #[test]
@@ -132,7 +132,7 @@ fn an_end_closes_the_lease_without_a_word() {
     sum.state(at(1, 0), 1, Epoch(1));
     sum.take(at(1, 100), 1, Epoch(1), Words::END);
     sum.begin(&begin(2, 2), None);
-    assert_eq!((sum.poll_timeout(), sum.judge()), (None, Some((Epoch(2), 0))), "nobody is missed");
+    assert_eq!((sum.poll_timeout(), sum.comparator()), (None, Some((Epoch(2), 0))), "nobody is missed");
 }
 
 #[test]
@@ -145,9 +145,9 @@ fn saturation_passes_upwards_word_by_word() {
     saturated.torque[2] = Q7_8::MIN;
     sum.take(at(1, 0), 0, Epoch(1), saturated);
     let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
-    let mut wanted = [-995; WORDS];
-    wanted[1..3].copy_from_slice(&[i16::MAX, i16::MIN]);
-    assert_eq!(said.torque.map(Q7_8::to_bits), wanted);
+    let mut target = [-995; WORDS];
+    target[1..3].copy_from_slice(&[i16::MAX, i16::MIN]);
+    assert_eq!(said.torque.map(Q7_8::to_bits), target);
     sum.begin(&begin(2, 2), Some(&own(i64::from(i16::MAX) * 1_000)));
     sum.take(at(2, 0), 0, Epoch(2), words(1, 1));
     let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
@@ -156,7 +156,7 @@ fn saturation_passes_upwards_word_by_word() {
 
 #[test]
 fn a_machine_that_hears_late_blames_nobody() {
-    for (age, judged) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
+    for (age, rated) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
         let mut sum = sum(false);
         sum.begin(&begin(1, 1), Some(&own(1_000)));
         sum.state(at(1, 10), 0, Epoch(1));
@@ -164,6 +164,6 @@ fn a_machine_that_hears_late_blames_nobody() {
         sum.begin(&begin(2, 1), Some(&own(1_000)));
         sum.watch();
         sum.heard_after(Span(age));
-        assert_eq!(sum.judge(), judged, "{age} µs");
+        assert_eq!(sum.comparator(), rated, "{age} µs");
     }
 }

@@ -31,12 +31,12 @@ pub struct Stats {
     last: u64,
     /// What grows as frames come.
     counts: Report,
-    lanes: Vec<Lane>,
+    bus_stats: Vec<LinkId>,
 }
 
 /// One bus.
 #[derive(Debug)]
-struct Lane {
+struct LinkId {
     /// What grows as frames come.
     counts: BusReport,
     kinds: [Count; NAMES.len()],
@@ -232,7 +232,7 @@ pub struct CellReport {
     /// The epoch that its last torque answers.
     pub last_epoch: Option<u8>,
     /// Joints within a contact that it did not answer.
-    pub missed: u64,
+    pub unanswered: u64,
     /// Torques of the epoch of the one before.
     pub repeated: u64,
     /// Torques and sums with a saturated word.
@@ -258,16 +258,16 @@ impl Stats {
         self.last = nanos;
         let (earliest, latest) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((earliest.min(nanos), latest.max(nanos)));
-        match self.lane(record.interface) {
-            Some(lane) => lane.take(record, decoded),
+        match self.bus_stats(record.interface) {
+            Some(bus_stats) => bus_stats.take(record, decoded),
             None => self.counts.frames_of_other_buses += 1,
         }
     }
 
     /// Frames were lost before this point; the bus is empty where nobody says which.
     pub fn dropped(&mut self, bus: &str, frames: u64) {
-        let lane = if bus.is_empty() { None } else { self.lane(bus) };
-        let dropped = lane.map(|lane| &mut lane.counts.dropped);
+        let bus_stats = if bus.is_empty() { None } else { self.bus_stats(bus) };
+        let dropped = bus_stats.map(|bus_stats| &mut bus_stats.counts.dropped);
         let dropped = match dropped {
             Some(dropped) => dropped,
             None => &mut self.counts.dropped,
@@ -275,14 +275,14 @@ impl Stats {
         *dropped = dropped.saturating_add(frames);
     }
 
-    fn lane(&mut self, bus: &str) -> Option<&mut Lane> {
-        let at = self.lanes.iter().position(|lane| lane.counts.bus == bus).or_else(|| {
-            (self.lanes.len() < BUSES).then(|| {
-                self.lanes.push(Lane::new(bus));
-                self.lanes.len() - 1
+    fn bus_stats(&mut self, bus: &str) -> Option<&mut LinkId> {
+        let at = self.bus_stats.iter().position(|bus_stats| bus_stats.counts.bus == bus).or_else(|| {
+            (self.bus_stats.len() < BUSES).then(|| {
+                self.bus_stats.push(LinkId::new(bus));
+                self.bus_stats.len() - 1
             })
         });
-        self.lanes.get_mut(at?)
+        self.bus_stats.get_mut(at?)
     }
 
     /// What it comes to so far.
@@ -291,7 +291,7 @@ impl Stats {
         let span @ (earliest, latest) = self.span.unwrap_or_default();
         Report {
             duration_s: seconds(latest - earliest),
-            buses: self.lanes.iter().map(|lane| lane.report(span)).collect(),
+            buses: self.bus_stats.iter().map(|bus_stats| bus_stats.report(span)).collect(),
             ..self.counts.clone()
         }
     }
@@ -308,7 +308,7 @@ fn rate(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)
 }
 
-impl Lane {
+impl LinkId {
     fn new(bus: &str) -> Self {
         Self {
             counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
@@ -329,7 +329,7 @@ impl Lane {
         self.counts.frames += 1;
         let refused = &mut self.counts.refused;
         match decoded {
-            Decoded::Wire(..) | Decoded::Half { .. } => {}
+            Decoded::Wire(..) | Decoded::Segment { .. } => {}
             Decoded::Message(message) => self.message(nanos, message),
             Decoded::Meaningless { .. } => refused.meaning += 1,
             Decoded::Foreign(foreign) => self.foreign.take(nanos, &record.frame, *foreign),
@@ -429,7 +429,7 @@ impl Cell {
         self.torque_span = Some([first, (nanos, epoch)]);
         let number = joints.and_then(|joints| joints.of(epoch));
         if let (Some(before), Some(number)) = (self.touching, number) {
-            self.counts.missed += number.saturating_sub(before + 1);
+            self.counts.unanswered += number.saturating_sub(before + 1);
         }
         self.touching = if still { number } else { None };
     }

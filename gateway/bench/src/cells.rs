@@ -17,7 +17,7 @@ use crate::setup::since;
 /// Cells say a heartbeat four times a second, from which their frames' format is seen.
 const FORMAT: Duration = Duration::from_millis(300);
 /// How often all are asked anew.
-const ASK: Duration = Duration::from_secs(2);
+const REQUEST: Duration = Duration::from_secs(2);
 /// How long one look at the bus takes, when nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -30,7 +30,7 @@ pub struct Watch {
     others: u64,
     /// What packets travel in, where that is known before anybody is heard.
     format: Option<Format>,
-    asked: Option<Instant>,
+    requested: Option<Instant>,
 }
 
 impl Watch {
@@ -47,7 +47,7 @@ impl Watch {
         let options = Options { filters, receive_buffer, ..Options::default() };
         let listener = Listener::new(listen::open(name, kind, None, options)?, None);
         let listing = Listing::new();
-        Ok(Self { listener, began: Instant::now(), listing, others: 0, format, asked: None })
+        Ok(Self { listener, began: Instant::now(), listing, others: 0, format, requested: None })
     }
 
     /// The bus.
@@ -84,18 +84,19 @@ impl Watch {
     ///
     /// # Errors
     /// When the bus is gone or closed.
-    pub fn ask(&mut self, again: bool) -> Result<(), BusError> {
-        let due = self.asked.is_none_or(|asked| again && asked.elapsed() >= ASK);
+    pub fn request(&mut self, again: bool) -> Result<(), BusError> {
+        let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= REQUEST);
         let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
         let Some(format) = self.format.or_else(|| self.listing.format()).or(waited).filter(|_| due) else {
             return Ok(());
         };
-        self.asked = Some(Instant::now());
-        let asked = [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
-        match asked {
+        self.requested = Some(Instant::now());
+        let requested =
+            [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
+        match requested {
             // Who cannot be asked may be heard all the same.
             Err(BusError::FdFrame { .. }) => Ok(()),
-            asked => passing(asked, Duration::ZERO).map(|_| ()),
+            requested => passing(requested, Duration::ZERO).map(|_| ()),
         }
     }
 

@@ -156,7 +156,7 @@ impl Bench {
                 passing(send(listener.bus(), &message, *format), DOWN)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
-            let quiet = roots.as_ref().filter(|_| commission.speaks()).map_or(LOOK, Roots::patience);
+            let quiet = roots.as_ref().filter(|_| commission.speaks()).map_or(LOOK, Roots::timeout);
             let wait = Duration::from_micros(next.since(clock()).0).min(quiet).min(LOOK);
             passing(listener.hear(wait), DOWN)?;
             for (received, decoded) in listener.decoded() {

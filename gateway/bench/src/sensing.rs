@@ -21,7 +21,7 @@ const LISTEN: Duration = Duration::from_millis(600);
 /// From one word to a cell that does not answer to the next.
 const AGAIN: Span = Span::from_millis(250);
 /// Who has not answered by then will not.
-const PATIENCE: Duration = Duration::from_secs(3);
+const TIMEOUT: Duration = Duration::from_secs(3);
 /// Comes back in the answers, so that they are not taken for those to somebody else.
 const TAG: u8 = 0x57;
 
@@ -88,7 +88,7 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     let began = Instant::now();
     let mut told = Repeats::new(AGAIN);
     told.said_to_all(since(began));
-    while began.elapsed() < PATIENCE && !answers.are_complete(began.elapsed() >= LISTEN) {
+    while began.elapsed() < TIMEOUT && !answers.are_complete(began.elapsed() >= LISTEN) {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
             if let Decoded::Message(message) = decoded {
@@ -114,16 +114,16 @@ struct Answers {
 
 impl Answers {
     fn take(&mut self, message: &Message) {
-        let wanted = |cell: CellId| self.only.is_none_or(|only| only == cell);
+        let target = |cell: CellId| self.only.is_none_or(|only| only == cell);
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
-            && wanted(cell)
+            && target(cell)
             && !heartbeat.state.has(State::CLAIMING)
         {
             self.heard.insert(cell);
         }
         if let Message::Configured { from, tag: TAG, answer } = *message
-            && wanted(from)
+            && target(from)
         {
             match answer {
                 Answer::Value { .. } => _ = self.confirmed.insert(from),
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn one_cell_is_asked_and_waited_for_alone() {
+    fn one_cell_is_requested_and_waited_for_alone() {
         let mut answers = Answers { only: Some(cell(7)), ..Answers::default() };
         answers.take(&confirms(1, TAG));
         assert_eq!(answers.missing(), [cell(7)]);

@@ -10,13 +10,13 @@ use crate::run::RunError;
 
 /// How long it is waited for something that is getting on.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Patience {
+pub(crate) struct Timeout {
     length: Duration,
     most: usize,
     since: Instant,
 }
 
-impl Patience {
+impl Timeout {
     /// So long without progress.
     pub(crate) fn new(length: Duration) -> Self {
         Self { length, most: 0, since: Instant::now() }

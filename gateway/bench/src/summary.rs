@@ -74,12 +74,12 @@ impl Summary {
     /// Of a run that failed before any bus was opened.
     #[must_use]
     pub fn of_no_run(skin: &Skin, why: String) -> Self {
-        Self::empty(skin).judged(Some(why))
+        Self::empty(skin).rated(Some(why))
     }
 
     /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
     #[must_use]
-    pub fn judged(mut self, failure: Option<String>) -> Self {
+    pub fn rated(mut self, failure: Option<String>) -> Self {
         // A bus that was lost may be why the robot was halted, and the halt says more.
         let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
         self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
@@ -262,15 +262,15 @@ pub struct OutagesSummary {
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct NetworkSummary {
     /// From the time when all cells were ready until all had a way to a root, in s; none when some never had.
-    pub organised_s: Option<f64>,
+    pub tree_ready_s: Option<f64>,
     /// The depth of the deepest cell that there was a slot for; a root's is 0.
     pub deepest: u8,
     /// What was different from the description at the start.
     pub differences: Vec<String>,
     /// Cells that spoke and had no way to a root at the end.
-    pub without_way: Vec<u8>,
+    pub unreachable: Vec<u8>,
     /// The longest time that a cell spoke and had none while the loop ran, in s.
-    pub longest_without_way_s: f64,
+    pub longest_unreachable_s: f64,
     /// How often a cell's parent changed, by the cells' own count.
     pub parent_changes: u64,
 }
@@ -285,11 +285,11 @@ pub struct SensorsSummary {
     /// Releases in them.
     pub releases: u64,
     /// Frames a second of the cell with the fewest, of those that sent at least two.
-    pub least_hz: Option<f64>,
+    pub min_hz: Option<f64>,
     /// The mean over these cells.
     pub mean_hz: Option<f64>,
     /// Of the cell with the most.
-    pub greatest_hz: Option<f64>,
+    pub max_hz: Option<f64>,
 }
 
 /// One bus.
@@ -392,9 +392,9 @@ fn sensors(table: &Table) -> SensorsSummary {
         frames: told().map(|sensed| sensed.frames).sum(),
         touches: told().map(|sensed| sensed.touches).sum(),
         releases: told().map(|sensed| sensed.releases).sum(),
-        least_hz: rates.iter().copied().reduce(f64::min),
+        min_hz: rates.iter().copied().reduce(f64::min),
         mean_hz: cells.map(|cells| rates.iter().sum::<f64>() / f64::from(cells)),
-        greatest_hz: rates.iter().copied().reduce(f64::max),
+        max_hz: rates.iter().copied().reduce(f64::max),
     }
 }
 

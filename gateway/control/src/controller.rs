@@ -278,12 +278,12 @@ mod tests {
         let mut controller = kinesthetic();
         let arm = run(&mut controller, [0.0; 6], 250, [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]);
         // M = 1, D = 4, so after half a second v = tau/D (1 - e^-2).
-        let wanted = 0.5 * (1.0 - (-2.0_f64).exp());
+        let target = 0.5 * (1.0 - (-2.0_f64).exp());
         let [v1, v2, v3, ..] = arm.velocities();
-        assert!((v1 - wanted).abs() < 1e-12 && (v2 + wanted / 2.0).abs() < 1e-12 && v3.abs() < 1e-12);
+        assert!((v1 - target).abs() < 1e-12 && (v2 + target / 2.0).abs() < 1e-12 && v3.abs() < 1e-12);
         // The position is a sum of the velocities at the ticks' ends: at most a tick ahead.
         let exact = 0.5 * (0.5 - 0.25 * (1.0 - (-2.0_f64).exp()));
-        assert!((arm.positions()[0] - exact).abs() < wanted * TICK);
+        assert!((arm.positions()[0] - exact).abs() < target * TICK);
     }
 
     #[test]
@@ -311,8 +311,8 @@ mod tests {
         assert_eq!(moved(hold.step(&Input { q: at, ..Input::default() })), [0.0; 6]);
         assert_eq!(moved(hold.step(&Input::default()))[..3], [2.0, -2.0, 2.0]);
         let arm = run(&mut hold, [0.0; 6], 200, [50.0; 6]);
-        for (got, wanted) in arm.positions().iter().zip(at) {
-            assert!((got - wanted).abs() < 1e-12, "torques do not move it");
+        for (got, target) in arm.positions().iter().zip(at) {
+            assert!((got - target).abs() < 1e-12, "torques do not move it");
         }
     }
 
@@ -322,9 +322,9 @@ mod tests {
         let mut sine = Sine::new(&skin(), start, [0.2, 0.1, 0.0, 0.0, 0.0, 0.3], 4.0);
         for ticks in [1_u32, 7, 500, 4_321] {
             let arm = run(&mut sine, start, ticks.into(), [0.0; 6]);
-            let wanted = sine.at(f64::from(ticks) * TICK);
-            for (got, wanted) in arm.positions().iter().zip(wanted) {
-                assert!((got - wanted).abs() < 1e-9, "after {ticks} ticks {got} is not {wanted}");
+            let target = sine.at(f64::from(ticks) * TICK);
+            for (got, target) in arm.positions().iter().zip(target) {
+                assert!((got - target).abs() < 1e-9, "after {ticks} ticks {got} is not {target}");
             }
         }
     }

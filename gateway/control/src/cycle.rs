@@ -26,7 +26,7 @@ use protocol::time::Micros;
 use crate::controller::{BadCycle, Controller, Input, Step};
 use crate::robot::{Moved, Robot};
 use carried::{Carried, Heard, bit};
-use model::central::{Central, Felt};
+use model::central::{Central, ReferenceTorque};
 use model::table::Snapshot;
 
 /// When a tick is.
@@ -195,13 +195,13 @@ impl Cycle {
         for (index, (Heard { sums: bus, works }, carried)) in
             buses.into_iter().zip(&mut self.carried).enumerate()
         {
-            let missed = carried.missed(bus.read_back, self.epoch, self.broadcasts);
-            if works && !carried::is_lost(missed, &self.safety) {
+            let unanswered = carried.unanswered(bus.read_back, self.epoch, self.broadcasts);
+            if works && !carried::is_lost(unanswered, &self.safety) {
                 some_bus_works = true;
             } else {
                 input.missing |= bit(index);
             }
-            let part = carried::part(missed, &self.safety);
+            let part = carried::part(unanswered, &self.safety);
             if part > 0.0 {
                 for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
                     *sum += part * torque;
@@ -209,7 +209,7 @@ impl Cycle {
                 input.contributing += bus.contributing;
                 stale += bus.stale;
                 if bus.contributing > 0 {
-                    let more = u32::try_from(missed).unwrap_or(u32::MAX);
+                    let more = u32::try_from(unanswered).unwrap_or(u32::MAX);
                     input.age = input.age.max(bus.age.saturating_add(more));
                 }
             }
@@ -228,7 +228,7 @@ impl Cycle {
             Step::Move(_) => None,
             Step::Bad(why) => Some(why),
         };
-        let command = if self.judge(bad) { Some(Command::Halt) } else { heard };
+        let command = if self.comparator(bad) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             Step::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer the robot goes on as it was for a while; halted, it stands.
@@ -262,16 +262,16 @@ impl Cycle {
     /// What the central computation makes of the last broadcast's words and what the cells then felt:
     /// the work that distributed computation takes out of the tick. It grows with the cells.
     #[must_use]
-    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Felt {
-        let mut felt = Felt::default();
+    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> ReferenceTorque {
+        let mut reference_torque = ReferenceTorque::default();
         for (central, bus) in self.central.iter().zip(buses) {
-            let part = central.feel(&central.frames(&self.joints.positions), &bus.felt);
-            for (sum, torque) in felt.torque.iter_mut().zip(part.torque) {
+            let part = central.feel(&central.frames(&self.joints.positions), &bus.reference_torque);
+            for (sum, torque) in reference_torque.torque.iter_mut().zip(part.torque) {
                 *sum += torque;
             }
-            felt.active += part.active;
+            reference_torque.active += part.active;
         }
-        felt
+        reference_torque
     }
 
     /// Halts and resumes that others sent; a halt outdoes a resume. Returns what the other buses have to
@@ -293,7 +293,7 @@ impl Cycle {
     }
 
     /// Counts bad cycles; returns whether this one was one too many.
-    fn judge(&mut self, bad: Option<BadCycle>) -> bool {
+    fn comparator(&mut self, bad: Option<BadCycle>) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
             return false;

@@ -44,8 +44,8 @@ impl SimulatedArm {
     pub fn new(skin: &Skin, start: [f64; MAX_JOINTS]) -> Self {
         let limits = padded(&skin.robot.limits_rad);
         let mut arm = Self { positions: start, velocities: [0.0; MAX_JOINTS], limits };
-        for (position, [least, greatest]) in arm.positions.iter_mut().zip(arm.limits) {
-            *position = position.clamp(least, greatest);
+        for (position, [min, max]) in arm.positions.iter_mut().zip(arm.limits) {
+            *position = position.clamp(min, max);
         }
         arm
     }
@@ -55,14 +55,13 @@ impl Robot for SimulatedArm {
     fn step(&mut self, velocity: &[f64; MAX_JOINTS], seconds: f64) -> Moved {
         let mut moved = Moved::default();
         let joints = self.positions.iter_mut().zip(&mut self.velocities).zip(&self.limits);
-        for (joint, (((position, velocity), &[least, greatest]), &wanted)) in joints.zip(velocity).enumerate()
-        {
-            let finite = wanted.is_finite();
+        for (joint, (((position, velocity), &[min, max]), &target)) in joints.zip(velocity).enumerate() {
+            let finite = target.is_finite();
             moved.refused |= !finite;
-            *velocity = if finite { wanted } else { 0.0 };
+            *velocity = if finite { target } else { 0.0 };
             let goal = *position + *velocity * seconds;
-            *position = goal.clamp(least, greatest);
-            if goal < least || goal > greatest {
+            *position = goal.clamp(min, max);
+            if goal < min || goal > max {
                 *velocity = 0.0;
                 moved.at_limit |= 1 << joint;
             }
@@ -123,8 +122,8 @@ mod tests {
             let mut arm = SimulatedArm::new(&skin, [0.0; 6]);
             for step in steps {
                 arm.step(&step, 0.002);
-                for (position, [least, greatest]) in arm.positions().iter().zip(&skin.robot.limits_rad) {
-                    prop_assert!(least <= position && position <= greatest);
+                for (position, [min, max]) in arm.positions().iter().zip(&skin.robot.limits_rad) {
+                    prop_assert!(min <= position && position <= max);
                 }
             }
         }

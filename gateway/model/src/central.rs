@@ -54,7 +54,7 @@ pub struct Frames([IsometryMatrix3<f64>; MAX_JOINTS + 1]);
 
 /// What the whole skin feels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Felt {
+pub struct ReferenceTorque {
     /// The sum of all cells' torques in Nm (paper, Eq. 1).
     pub torque: [f64; MAX_JOINTS],
     /// Cells with a force above zero.
@@ -145,16 +145,16 @@ impl Central {
     /// gateway without computing cells has to do in every tick. Work grows with the cells and again
     /// with the active ones; no allocation.
     #[must_use]
-    pub fn feel(&self, frames: &Frames, sensors: &[SkinSensors]) -> Felt {
-        let mut felt = Felt::default();
+    pub fn feel(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
+        let mut reference_torque = ReferenceTorque::default();
         for (place, sensors) in self.cells.iter().zip(sensors) {
             let f_z = force(&place.contact, sensors);
             if f_z > 0.0 {
-                frames.add_torque(place, f_z, &mut felt.torque);
-                felt.active += 1;
+                frames.add_torque(place, f_z, &mut reference_torque.torque);
+                reference_torque.active += 1;
             }
         }
-        felt
+        reference_torque
     }
 }
 

@@ -1,6 +1,6 @@
 //! The cells' arithmetic: the sine's error over the whole circle, and what one Jacobian costs.
 
-use cell_node::kernel::witness::Counted;
+use cell_node::kernel::oracle::Counted;
 use cell_node::kernel::{Kernel, Operations, Projection, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
@@ -23,7 +23,7 @@ pub struct SineError {
     /// Mean absolute error.
     pub mean: f64,
     /// Greatest absolute error.
-    pub greatest: f64,
+    pub max: f64,
     /// Angle in quarter turns, signed error.
     pub points: Vec<(f64, f64)>,
     /// The middle of each part of the circle in quarter turns, the greatest absolute error there.
@@ -34,22 +34,22 @@ impl SineError {
     /// Over all 65 536 words.
     #[must_use]
     pub fn of(function: impl Fn(Q1_14) -> Q1_14) -> Self {
-        let (mut sum, mut greatest) = (0.0, 0.0_f64);
+        let (mut sum, mut max) = (0.0, 0.0_f64);
         let (mut points, mut parts) = (Vec::new(), vec![(0.0, 0.0_f64); 65_536 / PART]);
         for (place, bits) in (i16::MIN..=i16::MAX).enumerate() {
             let angle = Q1_14::from_bits(bits);
             let error = function(angle).to_f64() - angle.to_radians().sin();
             sum += error.abs();
-            greatest = greatest.max(error.abs());
+            max = max.max(error.abs());
             if place % DRAWN == 0 {
                 points.push((angle.to_f64(), error));
             }
-            if let Some((middle, greatest)) = parts.get_mut(place / PART) {
+            if let Some((middle, max)) = parts.get_mut(place / PART) {
                 *middle += angle.to_f64() / count(PART);
-                *greatest = greatest.max(error.abs());
+                *max = max.max(error.abs());
             }
         }
-        Self { mean: sum / 65_536.0, greatest, points, parts }
+        Self { mean: sum / 65_536.0, max, points, parts }
     }
 }
 
@@ -68,7 +68,7 @@ pub fn sine_section() -> Section {
     let mean = |what: &str, error: &SineError, bar: f64| {
         Finding::less_is_better(what, paper::SINE, error.mean).at_most(bar)
     };
-    let greatest = |what: &str, error: &SineError, bar: f64| Finding::told(what, error.greatest).at_most(bar);
+    let max = |what: &str, error: &SineError, bar: f64| Finding::stated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
         .text(
             "The difference to the sine in double precision, over all 65 536 angles that a word can say. Of the \
@@ -88,10 +88,10 @@ pub fn sine_section() -> Section {
         ])
         .findings([
             mean("sine of fifth order, mean error", &fifth, 1.9e-4),
-            greatest("sine of fifth order, greatest error", &fifth, 4.6e-4),
+            max("sine of fifth order, greatest error", &fifth, 4.6e-4),
             mean("sine of seventh order, mean error", &seventh, 2e-5),
-            greatest("sine of seventh order, greatest error", &seventh, 1e-4),
-            Finding::told("rounding to Q1.14 alone, mean error", rounded.mean),
+            max("sine of seventh order, greatest error", &seventh, 1e-4),
+            Finding::stated("rounding to Q1.14 alone, mean error", rounded.mean),
         ])
 }
 
@@ -194,8 +194,8 @@ mod tests {
             section.figures.iter().flat_map(|figure| &figure.series).map(|series| series.points.len());
         assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN, 256, 256, 256]);
         let error = SineError::of(sine);
-        let greatest = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
-        assert!((greatest - error.greatest).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
+        let max = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
+        assert!((max - error.max).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
         assert!(section.findings[0].ours.value > 1e-4 && section.findings[2].ours.value > 1e-5);
         let wrong = SineError::of(|angle| sine(angle.wrapping_add(Q1_14::from_bits(100))));
         assert!(wrong.mean > 1e-3, "a phase of 100 words is seen");

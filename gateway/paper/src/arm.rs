@@ -3,7 +3,7 @@
 use protocol::skin::Skin;
 
 use super::Effort;
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 
 pub use model::generate::Reply;
 
@@ -58,7 +58,7 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
         Effort::Quick => FEW,
         Effort::Full => CELLS,
     };
-    generate(&Wanted { cells, reply, ..Wanted::default() }).expect("so many cells fit on the arm")
+    generate(&Target { cells, reply, ..Target::default() }).expect("so many cells fit on the arm")
 }
 
 /// The paper's arm, whose cells answer with torques.

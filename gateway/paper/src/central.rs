@@ -56,12 +56,12 @@ pub struct OverActive {
 }
 
 /// One computation of so many in a row, in ns.
-fn timed(central: &Central, felt: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
+fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
     let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
     for _ in 0..IN_A_ROW {
         let frames = central.frames(black_box(&joints));
-        black_box(central.feel(&frames, black_box(felt)));
+        black_box(central.feel(&frames, black_box(reference_torque)));
     }
     nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
 }
@@ -70,11 +70,12 @@ fn timed(central: &Central, felt: &[SkinSensors], now: &impl Fn() -> u64) -> f64
 #[must_use]
 pub fn over_cells(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverCells> {
     let central = Central::new(skin);
-    let felt = vec![SkinSensors::default(); skin.cells.len()];
+    let reference_torque = vec![SkinSensors::default(); skin.cells.len()];
     let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
     let measured = samples::interleaved(cells.len(), extent.rounds, 9, |place| {
-        let felt = cells.get(place).and_then(|&cells| felt.get(..cells)).unwrap_or_default();
-        timed(&central, felt, &now)
+        let reference_torque =
+            cells.get(place).and_then(|&cells| reference_torque.get(..cells)).unwrap_or_default();
+        timed(&central, reference_torque, &now)
     });
     let points = cells.iter().zip(&measured).map(|(&cells, values)| {
         let at = |part| quantile(&mut values.clone(), part);
@@ -95,12 +96,12 @@ pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option
     let mut by_active = vec![Vec::new(); cells + 1];
     for _ in 0..extent.touches {
         let (active, first) = (dice.random_range(0..=cells), dice.random_range(0..cells.max(1)));
-        let mut felt = vec![SkinSensors::default(); cells];
-        felt.iter_mut().take(active).for_each(|felt| *felt = touch());
-        felt.rotate_right(first);
-        let least = (0..LOOKS).map(|_| timed(&central, &felt, &now)).fold(f64::INFINITY, f64::min);
+        let mut reference_torque = vec![SkinSensors::default(); cells];
+        reference_torque.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
+        reference_torque.rotate_right(first);
+        let min = (0..LOOKS).map(|_| timed(&central, &reference_torque, &now)).fold(f64::INFINITY, f64::min);
         if let Some(values) = by_active.get_mut(active) {
-            values.push(least);
+            values.push(min);
         }
     }
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
@@ -122,7 +123,7 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ratio = ours.value / (paper_s * 1e9);
     [
         Finding::less_is_better(what, paper_s * 1e9, ours),
-        Finding::told(format!("{what}: ours by the paper's"), ratio),
+        Finding::stated(format!("{what}: ours by the paper's"), ratio),
     ]
 }
 
@@ -215,7 +216,7 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
         .draw("least squares", Shape::Line, law(line, most));
     let papers =
         beside(&fig10, "Eq. 30", micros, most, |active| paper::ACTIVE_S * active + paper::NONE_ACTIVE_S);
-    let all = Finding::told(
+    let all = Finding::stated(
         format!("T_skin of {of} cells, all active (Eq. 31)"),
         ((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
     );

@@ -70,8 +70,8 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
     // A bus without cells has no robot to compute, so that there is one cell at least on each.
-    let least = skin.buses.len().min(most);
-    let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(least)).collect();
+    let min = skin.buses.len().min(most);
+    let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(min)).collect();
     let active: Vec<usize> = (0..=extent.steps).map(step).collect();
     let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
     let over = |numbers: &[usize], ticks: &dyn Fn(usize, Mode) -> Ticks, seed| {
@@ -163,9 +163,9 @@ const SHARE: f64 = 0.01;
 fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     let Over { distributed, central, .. } = over;
     [
-        Finding::told(format!("central T_skin for each {what}"), central.slope_in("ns")),
-        Finding::told(format!("distributed tick for each {what}"), distributed.slope_in("ns")).beside(0.0),
-        Finding::told(
+        Finding::stated(format!("central T_skin for each {what}"), central.slope_in("ns")),
+        Finding::stated(format!("distributed tick for each {what}"), distributed.slope_in("ns")).beside(0.0),
+        Finding::stated(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
             (over.share() * 100.0, "%"),
         )
@@ -190,13 +190,13 @@ pub fn section(measured: &Distributed) -> Section {
             .draw("", Shape::Line, law(&over.distributed))
     };
     let findings = [
-        Finding::told("distributed tick for each further bus", buses.slope_in("ns")),
-        Finding::told("the same by the most cells that a bus has numbers for", (buses.slope / 254.0, "ns")),
-        Finding::told(
+        Finding::stated("distributed tick for each further bus", buses.slope_in("ns")),
+        Finding::stated("the same by the most cells that a bus has numbers for", (buses.slope / 254.0, "ns")),
+        Finding::stated(
             "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
             (*receiving, "ns"),
         ),
-        Finding::told(
+        Finding::stated(
             "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
             receiving / (8.0 * active.central.slope),
         ),
@@ -239,12 +239,12 @@ mod tests {
             clock.get()
         };
         let measured = measure(&skin, Extent { steps: 4, rounds: 3 }, now).unwrap();
-        for (over, wanted) in [
+        for (over, target) in [
             (&measured.cells, ["12", "12", "24", "36", "48"]),
             (&measured.active, ["0", "12", "24", "36", "48"]),
         ] {
             let numbers: Vec<_> = over.points.iter().map(|point| point[0].to_string()).collect();
-            assert_eq!(numbers, wanted);
+            assert_eq!(numbers, target);
             assert!(
                 over.points
                     .iter()

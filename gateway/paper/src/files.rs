@@ -26,8 +26,9 @@ pub fn csv(figure: &Figure) -> String {
         }
     }
     let mut text = quoted(&figure.x.to_string());
-    for (label, _) in &columns {
-        let axis = Axis::new(if label.is_empty() { figure.y.label.as_str() } else { label }, &figure.y.unit);
+    for (caption, _) in &columns {
+        let axis =
+            Axis::new(if caption.is_empty() { figure.y.caption.as_str() } else { caption }, &figure.y.unit);
         let _ = write!(text, ",{}", quoted(&axis.to_string()));
     }
     text.push('\n');
@@ -47,10 +48,10 @@ pub fn csv(figure: &Figure) -> String {
 /// A series' columns: there and, of a band, back.
 fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
     if series.shape != Shape::Band {
-        return vec![(series.label.clone(), &series.points)];
+        return vec![(series.caption.clone(), &series.points)];
     }
     let (lower, upper) = series.points.split_at(series.points.len().div_ceil(2));
-    vec![(format!("{}, lower", series.label), lower), (format!("{}, upper", series.label), upper)]
+    vec![(format!("{}, lower", series.caption), lower), (format!("{}, upper", series.caption), upper)]
 }
 
 /// A number as one that is ordered as it is.
@@ -100,9 +101,9 @@ mod tests {
             ],
             ..Figure::default()
         };
-        let wanted = "time (s),\"central, f64 (Nm)\",torque (Nm),\"half, lower (Nm)\",\"half, upper (Nm)\"\n\
+        let target = "time (s),\"central, f64 (Nm)\",torque (Nm),\"half, lower (Nm)\",\"half, upper (Nm)\"\n\
                       -1,1,,,\n0.5,,7,1,3\n0.5,,8,,\n2,3,,2,4\n";
-        assert_eq!(csv(&figure), wanted);
+        assert_eq!(csv(&figure), target);
     }
 
     #[test]

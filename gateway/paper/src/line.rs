@@ -165,11 +165,11 @@ mod tests {
 
     #[test]
     fn students_t_is_that_of_the_tables() {
-        for (freedom, wanted, within) in
+        for (freedom, target, within) in
             [(3.0, 3.182, 0.02), (10.0, 2.228, 1e-3), (29.0, 2.045, 1e-3), (100.0, 1.984, 1e-3)]
         {
             let t = student(freedom);
-            assert!((t / wanted - 1.0).abs() < within, "{freedom}: {t}");
+            assert!((t / target - 1.0).abs() < within, "{freedom}: {t}");
         }
     }
 

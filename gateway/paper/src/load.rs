@@ -17,16 +17,16 @@ pub fn section() -> Section {
     let rows = fit::table(&skin, None, COMPUTATION_NS);
     let cells = skin.cells.len();
     let series = |row: &Row| {
-        let judged = &row.fullest.judged;
-        let load = |cells| (f64::from(cells), 100.0 * judged.case.with_cells(cells).load().total());
+        let rated = &row.fullest.rated;
+        let load = |cells| (f64::from(cells), 100.0 * rated.case.with_cells(cells).load().total());
         let points = (0..=MOST).step_by(10).map(load).collect();
-        Series::new(Answer::worst_case(judged).rates, Shape::Line, points)
+        Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
     };
     // Nobody has chosen any of these rates, so none is judged.
     let finding = |row: &Row| {
-        let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.judged);
+        let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
-        Finding::told(what, (100.0 * load, "%"))
+        Finding::stated(what, (100.0 * load, "%"))
     };
     let figure = Figure::new(
         "load",
@@ -57,12 +57,12 @@ pub fn section() -> Section {
 
 fn table(rows: &[Row], cells: usize) -> Table {
     let row = |row: &Row| {
-        let judged = &row.fullest.judged;
-        let Answer { load, rates, .. } = Answer::worst_case(judged);
+        let rated = &row.fullest.rated;
+        let Answer { load, rates, .. } = Answer::worst_case(rated);
         [
             rates,
-            format!("{:.1}", judged.case.packet_ns() as f64 / 1e3),
-            format!("{:.1}", 100.0 * (load - judged.load.heartbeats)),
+            format!("{:.1}", rated.case.packet_ns() as f64 / 1e3),
+            format!("{:.1}", 100.0 * (load - rated.load.heartbeats)),
             format!("{:.1}", 100.0 * load),
             row.fullest.most.in_time().to_string(),
             row.need.in_time().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),

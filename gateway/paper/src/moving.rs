@@ -53,7 +53,7 @@ impl Run {
     fn replies(&self) -> Finding {
         let due = self.figure(&["buses", "0", "replies", "due"]);
         let in_time = self.figure(&["buses", "0", "replies", "in_time"]);
-        Finding::told(format!("replies in time, of {due}"), in_time)
+        Finding::stated(format!("replies in time, of {due}"), in_time)
     }
 }
 
@@ -75,9 +75,8 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
     let [summed_due, summed_in] =
         ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
     let row = |name: &str, run: &Run, kind: &str| {
-        let [mean, greatest, torques] =
-            ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
-        [name.to_owned(), mean, greatest, torques]
+        let [mean, max, torques] = ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
+        [name.to_owned(), mean, max, torques]
     };
     let title = "Fig. 6: torques of the moving arm, computed in the loop and on the cells";
     let cell = Finding::less_is_better(
@@ -115,7 +114,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
             cell.must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
             single.replies(),
-            Finding::told(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
+            Finding::stated(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
         ])
         .tables([Table::new(
             "Errors against the central computation, Nm",
@@ -144,8 +143,8 @@ fn at(values: &[f64], joint: usize) -> f64 {
 #[must_use]
 pub fn fig7(run: &Run) -> Section {
     let velocity = |joint: usize| {
-        let label = format!("joint {}", joint + 1);
-        Series::new(label, Shape::Line, run.over_time(|row| at(&row.velocity, joint)))
+        let caption = format!("joint {}", joint + 1);
+        Series::new(caption, Shape::Line, run.over_time(|row| at(&row.velocity, joint)))
     };
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
@@ -159,8 +158,8 @@ pub fn fig7(run: &Run) -> Section {
             cells.draw("active cells", Shape::Steps, contributing),
         ])
         .findings([
-            Finding::told("most cells active at once", (f64::from(active), "cells")),
-            Finding::told("greatest joint velocity", (fastest, "rad/s")),
+            Finding::stated("most cells active at once", (f64::from(active), "cells")),
+            Finding::stated("greatest joint velocity", (fastest, "rad/s")),
         ])
 }
 
@@ -213,7 +212,7 @@ pub fn fig8(run: &Run) -> Section {
         Finding::less_is_better("T_total after the switch, median", paper::REST_S * 1e6, us(total[1]));
     let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
-        Finding::told("T_total after the switch for each active cell", slope)
+        Finding::stated("T_total after the switch for each active cell", slope)
     });
     let took = |row: &Row| row.took_us;
     let central = |row: &Row| row.central_us;
@@ -237,14 +236,14 @@ pub fn fig8(run: &Run) -> Section {
         ])
         .findings([
             none,
-            Finding::told("T_skin after the switch, greatest", us(off)).beside(0.0).must("0", off <= 0.0),
-            Finding::told("T_total before the switch, median", us(total[0])),
+            Finding::stated("T_skin after the switch, greatest", us(off)).beside(0.0).must("0", off <= 0.0),
+            Finding::stated("T_total before the switch, median", us(total[0])),
             after_switch.must("less than before", total[1] < total[0]),
         ])
         .findings(of_active)
         .findings([
-            Finding::told("ticks above 2 ms", count(over)),
-            Finding::told(
+            Finding::stated("ticks above 2 ms", count(over)),
+            Finding::stated(
                 "all of the gateway's processor time by frames that came: socket, loop, recorder",
                 us(per_frame),
             ),

@@ -53,11 +53,11 @@ pub struct Errors {
 fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
-    let felt = |place| {
+    let reference_torque = |place| {
         let contact = [0; 3].map(|_| Q5_10::nearest(dice.random_range(0.2..2.0)));
         (place, SkinSensors { contact, ..SkinSensors::default() })
     };
-    places.into_iter().take(active).map(felt).collect()
+    places.into_iter().take(active).map(reference_torque).collect()
 }
 
 /// The mean of absolute errors.
@@ -69,10 +69,10 @@ struct Mean {
 
 impl Mean {
     /// Adds the errors of loaded joints.
-    fn add(&mut self, loaded: usize, got: &[f64; WORDS], wanted: &[f64; WORDS]) {
-        for (got, wanted) in got.iter().zip(wanted).take(loaded).filter(|(_, wanted)| wanted.abs() < MOST_NM)
+    fn add(&mut self, loaded: usize, got: &[f64; WORDS], target: &[f64; WORDS]) {
+        for (got, target) in got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MOST_NM)
         {
-            self.sum += (got - wanted).abs();
+            self.sum += (got - target).abs();
             self.count += 1;
         }
     }
@@ -157,23 +157,23 @@ pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
         Axis::new("active cells", "").log().between(0.9, 300.0),
         Axis::new("mean absolute error", "Nm").log().between(1e-5, 1.0),
     );
-    let series = WAYS.map(|(label, _, error)| {
+    let series = WAYS.map(|(caption, _, error)| {
         let points = errors.iter().map(|errors| (count(errors.active), error(errors))).collect();
-        Series::new(label, Shape::Line, points)
+        Series::new(caption, Shape::Line, points)
     });
     let at = errors.iter().filter(|errors| errors.active == FOUND_AT).take(1);
     let findings = at.flat_map(|at| {
-        WAYS.map(|(label, what, error)| {
+        WAYS.map(|(caption, what, error)| {
             let what = format!("sum of {FOUND_AT} active cells of {of}, {what}");
             let found = Finding::less_is_better(what, paper::SUMMED_NM, (error(at), "Nm"));
-            if label == "rounded" { found.at_most(0.005) } else { found }
+            if caption == "rounded" { found.at_most(0.005) } else { found }
         })
     });
     let rows = errors.iter().map(|at| {
         let errors = WAYS.map(|(_, _, error)| number(error(at)));
         core::iter::once(at.active.to_string()).chain(errors).collect::<Vec<_>>()
     });
-    let [a, b, c, d, e] = WAYS.map(|(label, ..)| label);
+    let [a, b, c, d, e] = WAYS.map(|(caption, ..)| caption);
     Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
         .text(
             "Random cells feel 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
@@ -196,7 +196,7 @@ mod tests {
     use crate::ticks;
 
     #[test]
-    fn cut_off_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
+    fn truncated_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
         let skin = ticks::skin(64, 1).unwrap();
         let measure = || -> Vec<_> {
             numbers(&skin).map(|active| errors(&skin, active, Extent { touches: 6, epochs: 4 })).collect()

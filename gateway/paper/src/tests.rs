@@ -28,7 +28,7 @@ impl Lab for Bare {
 
 fn is_drawable(figure: &Figure) {
     assert!(
-        !figure.title.is_empty() && !figure.x.label.is_empty() && !figure.y.label.is_empty(),
+        !figure.title.is_empty() && !figure.x.caption.is_empty() && !figure.y.caption.is_empty(),
         "{}",
         figure.name
     );
@@ -41,7 +41,7 @@ fn is_drawable(figure: &Figure) {
             rises || matches!(series.shape, Shape::Band | Shape::Points),
             "{}: {}",
             figure.name,
-            series.label
+            series.caption
         );
     }
 }
@@ -61,8 +61,8 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
         for finding in &section.findings {
             assert!(finding.ours.value.is_finite(), "{finding:?}");
             assert_eq!(
-                finding.verdict == Verdict::Told,
-                finding.bar.is_none() && is_told(finding),
+                finding.verdict == Verdict::Stated,
+                finding.bar.is_none() && is_stated(finding),
                 "{finding:?}"
             );
         }
@@ -79,8 +79,8 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
 }
 
 /// Whether a finding without a bar is told only: by its verdict, which another comparison comes to as well.
-fn is_told(finding: &analysis::report::figure::Finding) -> bool {
-    finding.paper.is_none() || finding.verdict == Verdict::Told
+fn is_stated(finding: &analysis::report::figure::Finding) -> bool {
+    finding.paper.is_none() || finding.verdict == Verdict::Stated
 }
 
 #[test]

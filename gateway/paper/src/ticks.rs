@@ -14,7 +14,7 @@ use control::controller::{Controller, Input, Kinesthetic, Step};
 use control::cycle::turn::{Line, Shared, Timed, Turn};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
-use model::generate::{GenerateError, Wanted, generate};
+use model::generate::{GenerateError, Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario, contact_words};
 use model::table::{Snapshot, Table};
 
@@ -36,7 +36,7 @@ const QUEUE: usize = 64;
 /// # Errors
 /// When they do not fit on the buses.
 pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
-    let text = generate(&Wanted { cells, buses, ..Wanted::default() })?;
+    let text = generate(&Target { cells, buses, ..Target::default() })?;
     Ok(Skin::parse("generated skin", &text)?)
 }
 
@@ -56,7 +56,7 @@ pub fn touch() -> SkinSensors {
 }
 
 /// What each cell of a skin feels when the first `active` of them in the order of `spread` are touched.
-fn felt(cells: usize, active: usize) -> Vec<SkinSensors> {
+fn reference_torque(cells: usize, active: usize) -> Vec<SkinSensors> {
     (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
 }
 
@@ -76,7 +76,7 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
         // Some torque: what it is costs the same.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
     }
-    Snapshot { sums: table.snapshot().sums, felt: felt(cells.len(), active) }
+    Snapshot { sums: table.snapshot().sums, reference_torque: reference_torque(cells.len(), active) }
 }
 
 /// Holds the arm, and computes all that the kinesthetic controller computes: a robot that moved to its limits would make
@@ -185,7 +185,11 @@ impl Ticks {
         self.number += 1;
         let timed = self.records.pop().ok();
         timed.map_or((0, None, true), |Timed { record, central, .. }| {
-            (record.contributing, central.map(|(_, felt)| felt.active), record.halted.is_some())
+            (
+                record.contributing,
+                central.map(|(_, reference_torque)| reference_torque.active),
+                record.halted.is_some(),
+            )
         })
     }
 }
@@ -207,15 +211,15 @@ mod tests {
             assert_eq!(part.cells.len(), cells);
             let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_of(bus).count()).collect();
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
-            let wanted = u32::try_from(active).unwrap();
+            let target = u32::try_from(active).unwrap();
             let mut compared = Ticks::new(&part, active, Mode::Compare);
             // More than a hundred ticks: nobody is halted for want of what the buses carry.
             for _ in 0..20 {
                 compared.epoch(|| 0);
             }
-            assert_eq!(compared.known(|| 0), (wanted, Some(wanted), false));
+            assert_eq!(compared.known(|| 0), (target, Some(target), false));
             let mut distributed = Ticks::new(&part, active, Mode::Distributed);
-            assert_eq!(distributed.known(|| 0), (wanted, None, false));
+            assert_eq!(distributed.known(|| 0), (target, None, false));
         }
     }
 

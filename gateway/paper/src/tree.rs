@@ -104,15 +104,19 @@ impl Tree {
         let frames = self.central.frames(&words);
         let mut came = Came::default();
         let mut own = vec![None; self.sums.len()];
-        for (place, felt) in touch {
+        for (place, reference_torque) in touch {
             let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else {
                 continue;
             };
-            let force = self.central.force(*place, felt);
+            let force = self.central.force(*place, reference_torque);
             add(&mut came.central, self.central.torque(*place, &frames, force));
-            let force = Force::fuse(felt.contact, felt.proximity, &self.skin.parameters(cell).contact);
+            let force = Force::fuse(
+                reference_torque.contact,
+                reference_torque.proximity,
+                &self.skin.parameters(cell).contact,
+            );
             let exact = Torque::new(&kernel.jacobian(&words), force).exact();
-            add(&mut came.truncated, exact.map(cut_off));
+            add(&mut came.truncated, exact.map(truncated));
             came.loaded = came.loaded.max(cell.joint.into());
             if let Some(own) = own.get_mut(*place) {
                 *own = Some(exact);
@@ -132,8 +136,8 @@ impl Tree {
             };
             sum.begin(&begin, own.get(*cell).and_then(Option::as_ref));
             for (port, child) in children {
-                if let Some((epoch, words, anew)) = said.get(*child).copied().flatten() {
-                    if anew {
+                if let Some((epoch, words, restarted)) = said.get(*child).copied().flatten() {
+                    if restarted {
                         sum.state(Micros(0), *port, epoch);
                     }
                     sum.take(Micros(0), *port, epoch, words);
@@ -160,6 +164,6 @@ fn add(sum: &mut [f64; WORDS], more: [f64; WORDS]) {
 
 /// What a cell would say that drops the bits that Q7.8 has no room for, in Nm.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
-fn cut_off(exact: Acc<30>) -> f64 {
+fn truncated(exact: Acc<30>) -> f64 {
     (exact.steps() >> SHORTENED) as f64 / 256.0
 }

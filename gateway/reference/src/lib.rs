@@ -29,8 +29,8 @@ impl Reference {
 
     /// The torques in Nm that it would send, when it feels this at joint positions in quarter turns.
     #[must_use]
-    pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], felt: &SkinSensors) -> [Q3_12; MAX_JOINTS] {
-        let force = Force::fuse(felt.contact, felt.proximity, &self.contact);
+    pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], contact_state: &SkinSensors) -> [Q3_12; MAX_JOINTS] {
+        let force = Force::fuse(contact_state.contact, contact_state.proximity, &self.contact);
         Torque::new(&self.jacobian(joints), force).words()
     }
 }

@@ -71,7 +71,7 @@ fn torques() -> Vec<Value> {
             "pose": case.parameters.words(Parameter::Pose),
             "contact": case.parameters.words(Parameter::Contact),
             "q": case.q.map(|word| word.to_bits()),
-            "felt": case.felt(),
+            "felt": case.contact_state(),
             "jacobian": jacobian.map(|word| word.to_bits()),
             "torque": torque.map(|word| word.to_bits()),
         })

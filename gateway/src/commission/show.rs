@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use bench::commission::Done;
-use model::commission::{CellReport, Outcome, Report, Stranger};
+use model::commission::{CellReport, Outcome, Report, UnknownNode};
 use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
@@ -41,12 +41,12 @@ pub(super) struct BusShown<'a> {
     frames_dropped: u32,
     failure: Option<&'a str>,
     cells: &'a [CellReport],
-    strangers: &'a [Stranger],
+    unknown_nodes: &'a [UnknownNode],
 }
 
 impl<'a> BusShown<'a> {
     pub(super) fn of(Done { name, kind, report, failure, dropped }: &'a Done) -> Self {
-        let Report { cells, strangers, requests, repeated, trouble: _ } = report;
+        let Report { cells, unknown_nodes, requests, repeated, trouble: _ } = report;
         let count = |is: fn(&Outcome) -> bool| cells.iter().filter(|cell| is(&cell.outcome)).count();
         Self {
             name,
@@ -61,7 +61,7 @@ impl<'a> BusShown<'a> {
             frames_dropped: *dropped,
             failure: failure.as_deref(),
             cells,
-            strangers,
+            unknown_nodes,
         }
     }
 
@@ -72,7 +72,7 @@ impl<'a> BusShown<'a> {
 
     fn rows(&self, rows: &mut Rows) {
         let cells = format!("{} cells described", self.cells.len());
-        let others = match self.strangers.len() {
+        let others = match self.unknown_nodes.len() {
             0 => String::new(),
             1 => "1 other, left alone".to_owned(),
             count => format!("{count} others, left alone"),
@@ -111,18 +111,18 @@ impl Whole<'_> {
         let mut notes = Vec::new();
         for bus in &self.buses {
             let name = bus.name;
-            let [mut strangers, mut elsewhere] = [Vec::new(), Vec::new()];
-            for Stranger { number: node, serial, belongs } in bus.strangers {
+            let [mut unknown_nodes, mut elsewhere] = [Vec::new(), Vec::new()];
+            for UnknownNode { number: node, serial, belongs } in bus.unknown_nodes {
                 match belongs {
-                    None => strangers.push(format!("{node} (serial number {serial})")),
+                    None => unknown_nodes.push(format!("{node} (serial number {serial})")),
                     Some(other) => elsewhere.push(format!(
                         "cell {node} on {name} (serial number {serial}) belongs to {other} by {file}; left alone"
                     )),
                 }
             }
-            if !strangers.is_empty() {
-                let strangers = some(&strangers);
-                notes.push(format!("cells on {name} that {file} does not have, left alone: {strangers}"));
+            if !unknown_nodes.is_empty() {
+                let unknown_nodes = some(&unknown_nodes);
+                notes.push(format!("cells on {name} that {file} does not have, left alone: {unknown_nodes}"));
             }
             notes.extend(elsewhere);
             let moved = bus.moved().count();

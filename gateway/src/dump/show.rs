@@ -172,7 +172,7 @@ impl<W: Write> Show<W> {
 /// The colour of what a frame says.
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
-        Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Half { .. } => DIM,
+        Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Segment { .. } => DIM,
         Decoded::Damaged { .. } | Decoded::Meaningless { .. } => RED,
         Decoded::Message(_) if decoded.is_saturated() => YELLOW,
         Decoded::Message(message) => match message.id().kind {

@@ -87,8 +87,8 @@ const FOREIGN: usize = 40;
 fn foreign(bus: &BusReport) -> Table {
     let head = [&format!("{} foreign", bus.bus), "frames", "per s", "first s", "last s", "bytes", ""];
     let line = |id: &ForeignId| {
-        let (least, most) = (id.bytes_min, id.bytes_max);
-        let bytes = if least == most { least.to_string() } else { format!("{least}..{most}") };
+        let (min, most) = (id.bytes_min, id.bytes_max);
+        let bytes = if min == most { min.to_string() } else { format!("{min}..{most}") };
         let what = match id.of {
             FrameType::Data if id.wrong_crc > 0 => format!("{} wrong CRC", id.wrong_crc),
             FrameType::Data => String::new(),
@@ -125,7 +125,7 @@ fn cells(bus: &BusReport) -> Table {
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
-        ("missed", |cell| some(cell.missed)),
+        ("missed", |cell| some(cell.unanswered)),
         ("twice", |cell| some(cell.repeated)),
         ("sums", |cell| some(cell.sums)),
         ("again", |cell| some(cell.resent)),

@@ -88,10 +88,10 @@ impl Benches {
     /// Waits for the bench's end, which comes early when somebody says so.
     fn wait(&self, mut command: Command) -> io::Result<Output> {
         let mut child = command.spawn()?;
-        let mut told = false;
+        let mut stated = false;
         while child.try_wait()?.is_none() {
-            if !told && self.stop.load(Ordering::Relaxed) {
-                told = true;
+            if !stated && self.stop.load(Ordering::Relaxed) {
+                stated = true;
                 // If it has just ended there is nobody to tell.
                 let _ = kill_process(Pid::from_child(&child), Signal::INT);
             }

@@ -3,7 +3,7 @@
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};
 use analysis::fit::verdict::{Answer, percent};
-use analysis::fit::{BusFit, Judged, Row, Spread, Whole, name};
+use analysis::fit::{BusFit, Rated, Row, Spread, Whole, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 
@@ -25,13 +25,13 @@ const HEAD: [&str; 8] = [
 pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let lines = rows.iter().map(|row| {
-        let BusFit { judged, most, answers, .. } = &row.fullest;
+        let BusFit { rated, most, answers, .. } = &row.fullest;
         let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
         vec![
-            name(judged.case.format, judged.case.rates),
-            micros(judged.case.packet_ns()),
-            tenths(judged.load.total()),
-            ms(judged),
+            name(rated.case.format, rated.case.rates),
+            micros(rated.case.packet_ns()),
+            tenths(rated.load.total()),
+            ms(rated),
             most.in_time().to_string(),
             row.need.in_short(),
             or(roots.map(|it| tenths(it.load.total())), ""),
@@ -39,7 +39,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
         ]
     });
     let table = print::table(HEAD, lines, |column| column > 0);
-    let case = &first.fullest.judged.case;
+    let case = &first.fullest.rated.case;
     let cells = skin.cells.len();
     let bus = match skin.buses.len() {
         1 => format!("{cells} cells on one bus"),
@@ -64,7 +64,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
 /// Buses at their bit rates: a section for each, and one for all cells of the skin.
 pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> String {
     let Some(first) = buses.first() else { return String::new() };
-    let case = &first.judged.case;
+    let case = &first.rated.case;
     let period = format!("joints every {} ms", millis(case.period_ns));
     let computation = format!("a cell computes {} µs", micros(case.computation_ns));
     let mut rows = Rows::new(&skin.name, period, computation).names_in_one_line();
@@ -84,10 +84,10 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
 }
 
 fn section(rows: &mut Rows, bus: &BusFit) {
-    let BusFit { name: bus_name, judged, most, need, answers, remedies } = bus;
-    let Judged { case, load, times, .. } = judged;
+    let BusFit { name: bus_name, rated, most, need, answers, hints } = bus;
+    let Rated { case, load, times, .. } = rated;
     let cells = case.answers.cells();
-    let worst = Answer::worst_case(judged);
+    let worst = Answer::worst_case(rated);
     rows.section(format!("{bus_name} at {}", worst.rates), format!("{cells} cells, {}", what(case)), "");
     rows.row(worst.case(), worst.value(), worst.cells);
     let parts = [
@@ -101,21 +101,21 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let due = format!("due after {} ms", millis(case.deadline_ns()));
-    rows.row("last answer", last(judged), list([due].into_iter().chain(bounds)));
+    rows.row("last answer", last(rated), list([due].into_iter().chain(bounds)));
     let heartbeat = or(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
     rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.row("cells that fit", most.in_time().min(most.nodes), others);
     rows.row("buses needed", needed(need), each_need(need));
-    if !remedies.is_empty() {
+    if !hints.is_empty() {
         rows.section("  what to change", "", "");
-        for remedy in remedies {
-            rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
+        for hint in hints {
+            rows.row(format!("  {}", hint.change), figures(&hint.after), hint.after.verdict());
         }
     }
     rows.section("  instead of these answers", "", "");
-    for remedy in answers {
-        rows.row(format!("  {}", remedy.change), figures(&remedy.after), remedy.after.verdict());
+    for hint in answers {
+        rows.row(format!("  {}", hint.change), figures(&hint.after), hint.after.verdict());
     }
     if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
         rows.row("  sums", "not possible", "a cell has no way to a root");
@@ -142,12 +142,12 @@ const fn sensors(case: &Case) -> &'static str {
 }
 
 /// Load and last answer.
-fn figures(judged: &Judged) -> String {
-    format!("{}, {}", percent(judged.load.total()), last(judged))
+fn figures(rated: &Rated) -> String {
+    format!("{}, {}", percent(rated.load.total()), last(rated))
 }
 
-fn last(judged: &Judged) -> String {
-    let Judged { case, load, times, .. } = judged;
+fn last(rated: &Rated) -> String {
+    let Rated { case, load, times, .. } = rated;
     match times.last_ns() {
         Some(last_ns) => format!("{} ms", millis(last_ns)),
         None if load.total() > 1.0 => "no bound".to_owned(),
@@ -157,8 +157,8 @@ fn last(judged: &Judged) -> String {
 
 /// The last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
-fn ms(judged: &Judged) -> String {
-    decimals(judged.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
+fn ms(rated: &Rated) -> String {
+    decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 
 fn needed(need: &Need) -> String {

@@ -120,12 +120,12 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
             format!("the gateway took {}: the tree spares it frames, and a shared bus none", counts.received);
         rows.row("sums on the bus, of all cells", on_the_bus, plainly);
         if let Some(network) = &bus.network {
-            let organised =
-                network.organised_s.map_or_else(|| "never whole".to_owned(), |s| format!("in {s:.2} s"));
-            let changes = format!("{organised}, {} changes of parents", network.parent_changes);
+            let tree_ready =
+                network.tree_ready_s.map_or_else(|| "never whole".to_owned(), |s| format!("in {s:.2} s"));
+            let changes = format!("{tree_ready}, {} changes of parents", network.parent_changes);
             rows.row("tree, wires deep", network.deepest, changes);
-            if !network.without_way.is_empty() {
-                let without = words(&network.without_way);
+            if !network.unreachable.is_empty() {
+                let without = words(&network.unreachable);
                 rows.row("cells without a way to a root", without, "no sum holds them");
             }
             for difference in &network.differences {
@@ -179,11 +179,9 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     rows.row("received", each(&bus.received), "");
     let sensors = &bus.sensors;
     // A frame or two are answers to reports.
-    if let (Some(least), Some(mean), Some(greatest @ 1.0..)) =
-        (sensors.least_hz, sensors.mean_hz, sensors.greatest_hz)
-    {
+    if let (Some(min), Some(mean), Some(max @ 1.0..)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
         let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
-        rows.row("  sensors of a cell, Hz", format!("{least:.1} / {mean:.1} / {greatest:.1}"), touches);
+        rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }
     rows.row("sent", each(&bus.sent), "");
     if !bus.events.is_empty() {

@@ -151,7 +151,7 @@ fn bench(rows: &mut Rows, bus: &BusShadow) {
     if bus.counts.bench.total() == 0 {
         return;
     }
-    let name = if bus.counts.bench_left_out { "left out: bench traffic" } else { "counted: bench traffic" };
+    let name = if bus.counts.bench_omitted { "left out: bench traffic" } else { "counted: bench traffic" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
     rows.row(name, format!("{} frames", bus.counts.bench.total()), list(parts));

@@ -57,8 +57,8 @@ impl Bench {
     }
 
     fn open(&self) -> Bus {
-        let (directory, send_patience) = (Some(self.directory()), Duration::from_secs(10));
-        let options = Options { directory, send_patience, ..Options::default() };
+        let (directory, send_timeout) = (Some(self.directory()), Duration::from_secs(10));
+        let options = Options { directory, send_timeout, ..Options::default() };
         Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap()
     }
 }
@@ -141,7 +141,7 @@ fn a_signal_ends_a_dump_cleanly() {
 }
 
 #[test]
-fn a_live_bus_is_counted_until_the_end_that_was_asked_for_or_a_signal() {
+fn a_live_bus_is_counted_until_the_end_that_was_requested_or_a_signal() {
     let bench = Bench::new();
     let counted = |child: Child| {
         let Output { status, stdout, stderr } = child.wait_with_output().unwrap();

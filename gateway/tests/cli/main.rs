@@ -10,7 +10,7 @@ use std::process::{Command, Output, Stdio};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::message::Message;
-use protocol::packet::{Half, Packet, Paired, data_id};
+use protocol::packet::{Packet, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
@@ -179,7 +179,7 @@ fn frames_are_those_of_the_document() {
 }
 
 #[test]
-fn frames_mean_what_was_asked_for() {
+fn frames_mean_what_was_requested() {
     for (arguments, meaning) in [
         ("report", "report"),
         (
@@ -216,11 +216,11 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
     match (format, frames) {
         (Format::Fd, [frame]) => Packet::from_fd(frame).unwrap(),
         (Format::Classic, [first, second]) => {
-            let mut half = Half::NONE;
+            let mut segment = Segment::NONE;
             let mut push =
-                |frame: &Frame| half.push(Micros(0), data_id(frame).unwrap(), frame.data()).unwrap();
-            assert_eq!(push(first), Paired::Waiting);
-            let Paired::Whole(packet) = push(second) else { panic!("{frames:?}") };
+                |frame: &Frame| segment.push(Micros(0), data_id(frame).unwrap(), frame.data()).unwrap();
+            assert_eq!(push(first), Reassembly::Waiting);
+            let Reassembly::Complete(packet) = push(second) else { panic!("{frames:?}") };
             packet
         }
         (Format::Fd | Format::Classic, _) => panic!("{frames:?}"),

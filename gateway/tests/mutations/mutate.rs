@@ -137,9 +137,9 @@ pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
         }
         kind => {
             let mut all = records(&seed[8..]);
-            let places = |all: &[(u8, Vec<u8>)], wanted: Option<u8>| -> Vec<usize> {
+            let places = |all: &[(u8, Vec<u8>)], target: Option<u8>| -> Vec<usize> {
                 let of = all.iter().enumerate();
-                of.filter(|(_, (code, _))| wanted.is_none_or(|wanted| wanted == *code))
+                of.filter(|(_, (code, _))| target.is_none_or(|target| target == *code))
                     .map(|(at, _)| at)
                     .collect()
             };

@@ -55,9 +55,9 @@ impl<T> Order<T> {
         if self.buses.len() <= bus {
             self.buses.resize(bus + 1, 0);
         }
-        let key = self.buses.get_mut(bus).map_or(nanos, |greatest| {
-            *greatest = nanos.max(*greatest);
-            *greatest
+        let key = self.buses.get_mut(bus).map_or(nanos, |max| {
+            *max = nanos.max(*max);
+            *max
         });
         self.waiting.insert((key, self.places), (nanos, item));
         self.places += 1;
@@ -153,7 +153,7 @@ mod tests {
         }
 
         #[test]
-        fn disorder_within_the_window_is_mended(
+        fn disorder_within_the_window_is_repaired(
             steps in proptest::collection::vec((0_usize..3, 1_u64..50, 0_u64..900), 1..200),
         ) {
             // Each bus by itself is in order; it is read up to 0.9 s late.

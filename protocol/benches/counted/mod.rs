@@ -19,14 +19,14 @@ pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
     let version = MANIFEST.lines().find_map(|line| line.strip_prefix("gungraun = \"="));
     let version = version.map_or("*", |version| version.trim_end_matches('"'));
     let runner = std::env::var("GUNGRAUN_RUNNER").unwrap_or_else(|_| "gungraun-runner".to_owned());
-    for (program, remedy) in [
+    for (program, hint) in [
         ("valgrind", "apt-get install valgrind".to_owned()),
         (&runner, format!("cargo install gungraun-runner --version {version}")),
     ] {
         let mut command = Command::new(program);
         command.arg("--version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         if command.status().is_err() {
-            eprintln!("instructions are not counted, for there is no {program} here: {remedy}");
+            eprintln!("instructions are not counted, for there is no {program} here: {hint}");
             exit(1);
         }
     }

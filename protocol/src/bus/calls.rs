@@ -60,20 +60,20 @@ pub(super) fn send<'a>(
     let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; BATCH];
     // SAFETY: an `mmsghdr` of zeros is a valid one: null pointers with zero lengths.
     let mut headers: [libc::mmsghdr; BATCH] = unsafe { mem::zeroed() };
-    let wanted = datagrams.len().min(BATCH);
+    let target = datagrams.len().min(BATCH);
     for ((datagram, vector), header) in datagrams.zip(&mut vectors).zip(&mut headers) {
         vector.iov_base = datagram.as_ptr().cast_mut().cast();
         vector.iov_len = datagram.len();
         header.msg_hdr.msg_iov = vector;
         header.msg_hdr.msg_iovlen = 1;
     }
-    // SAFETY: the first `wanted` of the BATCH headers point to buffers of the lengths given, borrowed for
+    // SAFETY: the first `target` of the BATCH headers point to buffers of the lengths given, borrowed for
     // longer than the call, which only reads them.
     let count = unsafe {
         libc::sendmmsg(
             fd.as_raw_fd(),
             headers.as_mut_ptr(),
-            libc::c_uint::try_from(wanted).unwrap_or(0),
+            libc::c_uint::try_from(target).unwrap_or(0),
             libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL,
         )
     };

@@ -168,12 +168,12 @@ impl BusError {
 
 /// Not all frames were sent; those before were.
 #[derive(Debug, Error)]
-#[error("{cause} ({sent} of {wanted} frames sent)")]
+#[error("{cause} ({sent} of {target} frames sent)")]
 pub struct SendError {
     /// How many frames were sent, from the first one on.
     pub sent: usize,
     /// How many there were.
-    pub wanted: usize,
+    pub target: usize,
     /// What happened.
     #[source]
     pub cause: BusError,

@@ -2,7 +2,7 @@
 
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use crate::id::{Id, Kind};
-use crate::wire::Lane;
+use crate::wire::LinkId;
 
 /// A frame passes when `identifier & mask == id & mask`; with [`Filter::INVERTED`] in `id`, when not.
 ///
@@ -41,8 +41,8 @@ impl Filter {
 
     /// Exactly the data frames of one direction of a simulated wire.
     #[must_use]
-    pub const fn lane(lane: Lane) -> Self {
-        Self { id: lane.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
+    pub const fn link_id(link_id: LinkId) -> Self {
+        Self { id: link_id.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
     }
 
     /// What this one does not let pass, and only that.
@@ -63,7 +63,7 @@ mod tests {
         assert_eq!(filter, Filter { id: 0x001, mask: 0xC000_07FF });
         assert_eq!(filter.inverted().inverted(), filter);
         assert_eq!(Filter::kind(Kind::Network), Filter { id: 0x400, mask: 0xC000_0700 });
-        let lane = Lane { wire: 3, back: true };
-        assert_eq!(Filter::lane(lane), Filter { id: 0x9000_0007, mask: 0xDFFF_FFFF });
+        let link_id = LinkId { wire: 3, back: true };
+        assert_eq!(Filter::link_id(link_id), Filter { id: 0x9000_0007, mask: 0xDFFF_FFFF });
     }
 }

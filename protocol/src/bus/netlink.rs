@@ -15,7 +15,7 @@ use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 
 /// How long the kernel may take to answer; it answers at once.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 /// How often a list that changed while it was read is read again.
 const RETRIES: usize = 8;
 /// Bytes of `struct ifinfomsg`, after which the attributes begin.
@@ -41,7 +41,7 @@ impl Exchange {
             // NETLINK_ROUTE is protocol 0.
             None,
         )?;
-        set_socket_timeout(&socket, Timeout::Recv, Some(PATIENCE))?;
+        set_socket_timeout(&socket, Timeout::Recv, Some(TIMEOUT))?;
         rustix::net::connect(&socket, &SocketAddrNetlink::new(0, 0))?;
         Ok(Self { socket, sequence: 0 })
     }
@@ -52,7 +52,7 @@ impl Exchange {
     /// What the kernel says, or that it does not answer.
     pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
         for _ in 0..RETRIES {
-            let (answers, interrupted) = self.ask(payload.clone(), flags)?;
+            let (answers, interrupted) = self.query(payload.clone(), flags)?;
             if !interrupted {
                 return Ok(answers);
             }
@@ -60,7 +60,7 @@ impl Exchange {
         Err(io::Error::other("the interfaces change faster than they can be read"))
     }
 
-    fn ask(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {
+    fn query(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<(Vec<Vec<u8>>, bool)> {
         self.sequence += 1;
         let mut header = NetlinkHeader::default();
         header.flags = NLM_F_REQUEST | NLM_F_ACK | flags;

@@ -40,10 +40,10 @@ pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
     // '1' is 31, 'A' is 41 and 'a' is 61: a letter's value is 9 more than its lower half.
     let values = (text & all(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
     // The upper half of a digit is 3, of a letter 4, or 6, which is made 4.
-    let halves = (text & all(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(all(0x30));
+    let segments = (text & all(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(all(0x30));
     // A value has 4 bits, and is 10 or more when it is a letter's.
     let tens = (values.wrapping_add(all(6)) ^ (letters >> 2)) & all(0x10);
-    if halves | values & all(0xF0) | tens != 0 {
+    if segments | values & all(0xF0) | tens != 0 {
         return None;
     }
     // Neighbours are put together: into a byte, into two, into four.

@@ -119,7 +119,7 @@ impl<const N: usize> Text<N> {
     }
 
     /// A number in so many decimal digits or more.
-    fn decimal(&mut self, value: u64, least: usize) {
+    fn decimal(&mut self, value: u64, min: usize) {
         let mut digits = [b'0'; 20];
         let (mut rest, mut from) = (value, digits.len());
         for digit in digits.iter_mut().rev() {
@@ -130,7 +130,7 @@ impl<const N: usize> Text<N> {
             rest /= 10;
             from -= 1;
         }
-        for &digit in digits.get(from.min(digits.len() - least)..).unwrap_or_default() {
+        for &digit in digits.get(from.min(digits.len() - min)..).unwrap_or_default() {
             self.push(digit);
         }
     }

@@ -197,8 +197,8 @@ impl NetworkPage {
         let (page, words) = match self {
             Self::Heartbeat(Heartbeat { serial, configuration, sent, rejected, state }) => {
                 let [a, b, c, d] = serial.to_le_bytes();
-                let halves = [u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])];
-                (0, [halves[0], halves[1], configuration, sent, rejected, state.0])
+                let segments = [u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])];
+                (0, [segments[0], segments[1], configuration, sent, rejected, state.0])
             }
             Self::Heard(Heard { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }) => {
                 (1, [joints, joints_late, joints_repeated, stimuli, stimuli_late, torques])

@@ -23,7 +23,7 @@
 
 mod switches;
 
-pub use switches::{Cuts, Events, Reply, Sensing, Slots};
+pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
 
 use thiserror::Error;
 
@@ -55,7 +55,7 @@ pub enum Parameter {
     /// 8: which changes are events.
     Events,
     /// 9: which ports are cut, for tests.
-    Cuts,
+    LinksDown,
     /// 16 to 21: one row of the robot's table, counted from 0.
     Row(u8),
     /// 127: take what was written into use.
@@ -87,7 +87,7 @@ const NUMBERS: [(Parameter, u8); 17] = [
     (Parameter::Reply, 6),
     (Parameter::Sensing, 7),
     (Parameter::Events, 8),
-    (Parameter::Cuts, 9),
+    (Parameter::LinksDown, 9),
     (Parameter::Row(0), 16),
     (Parameter::Row(1), 17),
     (Parameter::Row(2), 18),
@@ -116,7 +116,7 @@ impl Parameter {
     /// Whether it is in force as soon as it is written, is not stored, and is forgotten by a start.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
-        matches!(self, Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::Cuts)
+        matches!(self, Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::LinksDown)
     }
 
     /// Whether a cell can have these words; those of stored parameters it checks at the commit.
@@ -132,7 +132,7 @@ impl Parameter {
             | Self::Contact
             | Self::Timing
             | Self::Mode
-            | Self::Cuts
+            | Self::LinksDown
             | Self::Row(_)
             | Self::Commit => true,
         }
@@ -278,7 +278,7 @@ impl Parameters {
             | Parameter::Reply
             | Parameter::Sensing
             | Parameter::Events
-            | Parameter::Cuts
+            | Parameter::LinksDown
             | Parameter::Commit => [0; WORDS],
         }
     }
@@ -324,7 +324,7 @@ impl Parameters {
             | Parameter::Reply
             | Parameter::Sensing
             | Parameter::Events
-            | Parameter::Cuts
+            | Parameter::LinksDown
             | Parameter::Commit => {
                 return Err(ParameterError::NotWritable(parameter.number()));
             }
@@ -464,11 +464,11 @@ mod tests {
     proptest! {
         #[test]
         fn an_image_comes_back(k in 1_u8..=6, words in any::<[[i16; 4]; 6]>(), period_us in 1_u16..) {
-            let mut wanted = Parameters { joint: k, joints: 6, period_us, ..sound() };
-            for (row, [a, d, alpha, offset]) in wanted.rows.iter_mut().zip(words) {
+            let mut target = Parameters { joint: k, joints: 6, period_us, ..sound() };
+            for (row, [a, d, alpha, offset]) in target.rows.iter_mut().zip(words) {
                 *row = Row { a: Q1_14::from_bits(a), d: Q1_14::from_bits(d), alpha: Q1_14::from_bits(alpha), theta_offset: Q1_14::from_bits(offset) };
             }
-            prop_assert_eq!(Parameters::from_image(&wanted.image()), Ok(wanted));
+            prop_assert_eq!(Parameters::from_image(&target.image()), Ok(target));
         }
 
         #[test]

@@ -150,7 +150,7 @@ impl Events {
     }
 }
 
-impl Cuts {
+impl LinksDown {
     /// The words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
@@ -168,7 +168,7 @@ impl Cuts {
 /// Which ports of a cell hear nothing, neither messages nor sums, parameter 9: how a bench cuts a wire, in one
 /// direction at each end. Obeyed in test mode only.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Cuts {
+pub struct LinksDown {
     /// Bit p: port p hears nothing; bit 4 is the wire to the gateway's side.
     pub deaf: u8,
 }

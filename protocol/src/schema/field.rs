@@ -223,8 +223,8 @@ impl Field {
     /// Whether it is there when the first field of its layout is this.
     #[must_use]
     pub fn follows(&self, first: Option<i64>) -> bool {
-        let within = |[least, greatest]: [u16; 2]| {
-            first.is_some_and(|first| (i64::from(least)..=i64::from(greatest)).contains(&first))
+        let within = |[min, max]: [u16; 2]| {
+            first.is_some_and(|first| (i64::from(min)..=i64::from(max)).contains(&first))
         };
         self.when.is_none_or(within)
     }

@@ -124,7 +124,7 @@ impl<'de> Deserialize<'de> for Part {
         }
         let (when, text) = match Either::deserialize(deserializer)? {
             Either::Always(text) => (ALWAYS, text),
-            Either::Within(least, greatest, text) => ([least, greatest], text),
+            Either::Within(min, max, text) => ([min, max], text),
         };
         Ok(Self { when, pieces: Piece::all(&text) })
     }

@@ -57,9 +57,9 @@ fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
 
 /// The bit rates of hardware, which need not be said.
 fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
-    let within = |key, got, least, greatest| at.key(key).within(got, least..=greatest, " bit/s");
-    let (least, greatest) = (BitRates::LEAST_NOMINAL, BitRates::GREATEST_NOMINAL);
-    let bitrate = bus.bitrate.map(|got| within("bitrate", got, least, greatest)).transpose()?;
+    let within = |key, got, min, max| at.key(key).within(got, min..=max, " bit/s");
+    let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);
+    let bitrate = bus.bitrate.map(|got| within("bitrate", got, min, max)).transpose()?;
     let data_bitrate = match (bus.data_bitrate, format, bitrate) {
         (None, _, _) => None,
         (Some(got), Format::Classic, _) => {
@@ -68,9 +68,7 @@ fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>
         (Some(got), Format::Fd, None) => {
             return Err(at.key("data_bitrate").fault(got, "only together with bitrate"));
         }
-        (Some(got), Format::Fd, Some(least)) => {
-            Some(within("data_bitrate", got, least, BitRates::GREATEST_DATA)?)
-        }
+        (Some(got), Format::Fd, Some(min)) => Some(within("data_bitrate", got, min, BitRates::MAX_DATA)?),
     };
     Ok((bitrate, data_bitrate))
 }

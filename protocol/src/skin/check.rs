@@ -49,10 +49,10 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     }
     let depths = skin.wires(index).depths();
     let depth = |cell: &Cell| depths.get(cell.node.index()).copied().flatten();
-    let is_cut_off = |cell: &Cell| cell.bus == index && depth(cell).is_none();
-    if let Some(first) = skin.cells.iter().position(is_cut_off) {
+    let is_truncated = |cell: &Cell| cell.bus == index && depth(cell).is_none();
+    if let Some(first) = skin.cells.iter().position(is_truncated) {
         let node = skin.cells.get(first).map_or(0, |cell| cell.node.get());
-        let others = match skin.cells.iter().filter(|cell| is_cut_off(cell)).count() - 1 {
+        let others = match skin.cells.iter().filter(|cell| is_truncated(cell)).count() - 1 {
             0 => String::new(),
             1 => " (nor does another cell)".to_owned(),
             count => format!(" (nor do {count} other cells)"),
@@ -67,14 +67,13 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     if u64::from(slots) * u64::from(slot_us) <= u64::from(period_us) {
         return Ok(());
     }
-    let greatest = u32::from(period_us).checked_div(slots).unwrap_or(0);
-    let remedy = if greatest > 0 {
-        format!("at most {greatest} us fit")
+    let max = u32::from(period_us).checked_div(slots).unwrap_or(0);
+    let hint = if max > 0 {
+        format!("at most {max} us fit")
     } else {
         "no slots fit: send joints less often, or use more roots or buses".to_owned()
     };
-    let why =
-        format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {remedy}");
+    let why = format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {hint}");
     Err(at.key("slot_us").fault(slot_us, why))
 }
 
@@ -95,10 +94,10 @@ fn robot(raw: raw::Robot) -> Checked<Robot> {
     }
     let limits_rad = raw.limits_rad.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
     same_length(&at.key("limits_rad"), limits_rad.len(), count)?;
-    for (index, [least, greatest]) in limits_rad.iter().enumerate() {
+    for (index, [min, max]) in limits_rad.iter().enumerate() {
         // Written so that NaN is refused too.
-        if !(least.is_finite() && greatest.is_finite() && least < greatest) {
-            let (got, why) = (format!("[{least}, {greatest}]"), "the least position comes first");
+        if !(min.is_finite() && max.is_finite() && min < max) {
+            let (got, why) = (format!("[{min}, {max}]"), "the least position comes first");
             return Err(at.key("limits_rad").nth(index).fault(got, why));
         }
     }

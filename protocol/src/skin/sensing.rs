@@ -53,7 +53,7 @@ pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
 pub(super) fn events(raw: raw::Events) -> Result<Events, Fault> {
     /// As an error says it, a threshold's range begins with 0.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
-        Q::try_nearest(value).map_err(|error| OutOfRange { least: 0.0, ..error })
+        Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }
     let at = Place::named("events");
     let mut events = Events::default();

@@ -204,7 +204,7 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
         "skin.toml:21: bus[0].reply = \"sum\": sums need a way to the gateway, and no cell of this bus has \
          root = true: give it to one"
     );
-    let cut = |cells: &[_]| fault(without, cells).split_once(": no wire").unwrap().1.to_owned();
+    let link_down = |cells: &[_]| fault(without, cells).split_once(": no wire").unwrap().1.to_owned();
     cells = CHAIN;
     (cells[1].0, cells[2].0) = ([1, 0, 0, 0], [0, 4, 0, 0]);
     assert_eq!(
@@ -217,10 +217,13 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
         [Some(0), Some(1), None, None]
     );
     assert!(
-        cut(&[([0; 4], true), ([0; 4], false)]).starts_with(" leads from here to a root of its bus, which")
+        link_down(&[([0; 4], true), ([0; 4], false)])
+            .starts_with(" leads from here to a root of its bus, which")
     );
     let three = [([0; 4], true), ([0; 4], false), ([0; 4], false), ([0; 4], false)];
-    assert!(cut(&three).starts_with(" leads from here to a root of its bus (nor do 2 other cells), which"));
+    assert!(
+        link_down(&three).starts_with(" leads from here to a root of its bus (nor do 2 other cells), which")
+    );
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //!
 //! Wires are numbered in the order of their first mention: cells in the file's order, ports 0 to 3. After them
 //! comes one wire for each root, to the gateway's side, in the file's order. Two wires between the same two
-//! cells pair in the order of their ports. Whoever is mentioned first speaks on [`Lane::back`] = false, the
+//! cells pair in the order of their ports. Whoever is mentioned first speaks on [`LinkId::back`] = false, the
 //! other end on true; of a root's wire the cell is the first end.
 //!
 //! ```text
@@ -16,7 +16,7 @@ use std::collections::VecDeque;
 
 use super::{Cell, Skin};
 use crate::id::CellId;
-use crate::wire::{Lane, MAX, PORTS, UPLINK};
+use crate::wire::{LinkId, MAX, PORTS, UPLINK};
 
 /// A port of a cell; [`UPLINK`] is where a root is wired to the gateway's side.
 type End = (CellId, usize);
@@ -28,7 +28,7 @@ const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX);
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Wires {
     /// By cell ([`CellId::index`]) and port, the lane on which it sends.
-    lanes: Vec<[Option<Lane>; PORTS + 1]>,
+    link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
     /// By wire, the end mentioned first and the other one, which is none at the gateway's side.
     ends: Vec<(End, Option<End>)>,
 }
@@ -46,18 +46,18 @@ impl Wires {
     /// The wires of these cells, all of one bus. A mention that has no other end, which no checked skin has,
     /// is no wire.
     pub(super) fn new(cells: &[&Cell]) -> Self {
-        let mut wires = Self { lanes: vec![[None; PORTS + 1]; CellId::COUNT], ends: Vec::new() };
+        let mut wires = Self { link_ids: vec![[None; PORTS + 1]; CellId::COUNT], ends: Vec::new() };
         for cell in cells {
             for (port, neighbor) in cell.neighbors.iter().enumerate() {
                 let Some(neighbor) = *neighbor else { continue };
-                if wires.lane(cell.node, port).is_some() {
+                if wires.link_id(cell.node, port).is_some() {
                     continue;
                 }
                 let other = cells.iter().find(|other| other.node == neighbor);
                 let back = other.and_then(|other| {
                     let mut ports = (0..PORTS).zip(&other.neighbors);
                     let names_us = |&(port, back): &(usize, &Option<CellId>)| {
-                        *back == Some(cell.node) && wires.lane(neighbor, port).is_none()
+                        *back == Some(cell.node) && wires.link_id(neighbor, port).is_none()
                     };
                     ports.find(names_us).map(|(port, _)| port)
                 });
@@ -77,38 +77,38 @@ impl Wires {
         self.ends.push((first, second));
         for (end, back) in [(Some(first), false), (second, true)] {
             let slot = end.and_then(|(cell, port)| {
-                self.lanes.get_mut(cell.index()).and_then(|lanes| lanes.get_mut(port))
+                self.link_ids.get_mut(cell.index()).and_then(|link_ids| link_ids.get_mut(port))
             });
             if let Some(slot) = slot {
-                *slot = Some(Lane { wire, back });
+                *slot = Some(LinkId { wire, back });
             }
         }
     }
 
-    fn lane(&self, cell: CellId, port: usize) -> Option<Lane> {
-        *self.lanes.get(cell.index())?.get(port)?
+    fn link_id(&self, cell: CellId, port: usize) -> Option<LinkId> {
+        *self.link_ids.get(cell.index())?.get(port)?
     }
 
     /// The lanes that a cell sends on, by port, with [`UPLINK`] for a root's wire to the gateway's side. What
     /// it hears there comes on the reversed lane.
     #[must_use]
-    pub fn of_cell(&self, cell: CellId) -> [Option<Lane>; PORTS + 1] {
-        self.lanes.get(cell.index()).copied().unwrap_or_default()
+    pub fn of_cell(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
+        self.link_ids.get(cell.index()).copied().unwrap_or_default()
     }
 
     /// The roots in the file's order, each with the lane on which the gateway's side speaks to it.
-    pub fn roots(&self) -> impl Iterator<Item = (CellId, Lane)> {
+    pub fn roots(&self) -> impl Iterator<Item = (CellId, LinkId)> {
         let uplinks = self.ends.iter().filter(|(_, second)| second.is_none());
-        uplinks.filter_map(|&((cell, port), _)| Some((cell, self.lane(cell, port)?.reversed())))
+        uplinks.filter_map(|&((cell, port), _)| Some((cell, self.link_id(cell, port)?.reversed())))
     }
 
     /// Where a port leads: to a port of another cell; `None` for a free one, and for an uplink, which leads to
     /// the gateway's side.
     #[must_use]
     pub fn other_end(&self, cell: CellId, port: usize) -> Option<(CellId, usize)> {
-        let lane = self.lane(cell, port)?;
-        let &(first, second) = self.ends.get(usize::from(lane.wire))?;
-        if lane.back { Some(first) } else { second }
+        let link_id = self.link_id(cell, port)?;
+        let &(first, second) = self.ends.get(usize::from(link_id.wire))?;
+        if link_id.back { Some(first) } else { second }
     }
 
     /// How many wires there are, those of the roots among them.
@@ -146,8 +146,8 @@ mod tests {
         CellId::new(i64::try_from(number).unwrap()).unwrap()
     }
 
-    fn lane(wire: u16, back: bool) -> Option<Lane> {
-        Some(Lane { wire, back })
+    fn link_id(wire: u16, back: bool) -> Option<LinkId> {
+        Some(LinkId { wire, back })
     }
 
     #[test]
@@ -156,11 +156,14 @@ mod tests {
         let wires = skin.wires(0);
         assert_eq!(wires.count(), 5);
         let none = None;
-        assert_eq!(wires.of_cell(id(1)), [lane(0, false), lane(1, false), none, none, lane(3, false)]);
-        assert_eq!(wires.of_cell(id(2)), [lane(2, false), lane(0, true), lane(1, true), none, none]);
-        assert_eq!(wires.of_cell(id(3)), [none, none, none, lane(2, true), lane(4, false)]);
+        assert_eq!(
+            wires.of_cell(id(1)),
+            [link_id(0, false), link_id(1, false), none, none, link_id(3, false)]
+        );
+        assert_eq!(wires.of_cell(id(2)), [link_id(2, false), link_id(0, true), link_id(1, true), none, none]);
+        assert_eq!(wires.of_cell(id(3)), [none, none, none, link_id(2, true), link_id(4, false)]);
         let roots: Vec<_> = wires.roots().collect();
-        assert_eq!(roots, [(id(1), Lane { wire: 3, back: true }), (id(3), Lane { wire: 4, back: true })]);
+        assert_eq!(roots, [(id(1), LinkId { wire: 3, back: true }), (id(3), LinkId { wire: 4, back: true })]);
         assert_eq!(wires.other_end(id(1), 1), Some((id(2), 2)));
         assert_eq!(wires.other_end(id(1), 2), None, "a free port");
         assert_eq!(wires.other_end(id(1), UPLINK), None, "the gateway's side");
@@ -198,31 +201,31 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_wire_has_two_ends_with_opposite_lanes(cells in wiring()) {
+        fn every_wire_has_two_ends_with_opposite_link_ids(cells in wiring()) {
             let wires = wired(&cells).wires(0);
             let mut speakers = HashMap::new();
             for (at, (neighbors, root)) in cells.iter().enumerate() {
                 let cell = id(at + 1);
-                let lanes = wires.of_cell(cell);
-                prop_assert_eq!(lanes[UPLINK].is_some(), *root);
-                for (port, lane) in lanes.into_iter().enumerate().filter_map(|(port, lane)| Some((port, lane?))) {
-                    prop_assert_eq!(speakers.insert(lane, cell), None, "one speaker a lane");
+                let link_ids = wires.of_cell(cell);
+                prop_assert_eq!(link_ids[UPLINK].is_some(), *root);
+                for (port, link_id) in link_ids.into_iter().enumerate().filter_map(|(port, link_id)| Some((port, link_id?))) {
+                    prop_assert_eq!(speakers.insert(link_id, cell), None, "one speaker a lane");
                     if port == UPLINK {
                         continue;
                     }
                     let (other, back) = wires.other_end(cell, port).unwrap();
                     prop_assert_eq!(i64::from(other.get()), neighbors[port]);
                     prop_assert_eq!(wires.other_end(other, back), Some((cell, port)));
-                    prop_assert_eq!(wires.of_cell(other)[back], Some(lane.reversed()));
+                    prop_assert_eq!(wires.of_cell(other)[back], Some(link_id.reversed()));
                 }
                 let wired = neighbors.iter().filter(|&&neighbor| neighbor != 0).count();
-                prop_assert_eq!(lanes[..PORTS].iter().flatten().count(), wired, "no end is left out");
+                prop_assert_eq!(link_ids[..PORTS].iter().flatten().count(), wired, "no end is left out");
             }
-            for (root, lane) in wires.roots() {
-                prop_assert_eq!(speakers.insert(lane, root), None, "the gateway's side has its own lanes");
+            for (root, link_id) in wires.roots() {
+                prop_assert_eq!(speakers.insert(link_id, root), None, "the gateway's side has its own lanes");
             }
             prop_assert_eq!(speakers.len(), 2 * wires.count());
-            prop_assert!(speakers.keys().all(|lane| usize::from(lane.wire) < wires.count()), "dense");
+            prop_assert!(speakers.keys().all(|link_id| usize::from(link_id.wire) < wires.count()), "dense");
         }
 
         #[test]

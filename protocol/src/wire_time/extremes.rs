@@ -93,7 +93,7 @@ impl Shape {
         // Behind BRS there is one state only, whatever the identifier was: what follows can be taken by itself.
         let head = head + pick(ways.stuffed());
         let dlc = u64::from(fd_dlc(len));
-        let ways = ways.anew().free(1);
+        let ways = ways.restarted().free(1);
         // What the last bit makes is a fixed stuff bit.
         let ways = match u32::try_from(len) {
             Ok(0) | Err(_) => ways.fixed(dlc >> 1, 3),
@@ -139,7 +139,7 @@ impl Ways {
     }
 
     /// The same states, and no stuff bits yet.
-    fn anew(self) -> Self {
+    fn restarted(self) -> Self {
         Self(self.0.map(|range| range.map(|_| (0, 0))))
     }
 
@@ -153,7 +153,7 @@ impl Ways {
         for (state, range) in (0..).zip(self.0) {
             for (bit, _) in [(0, zero), (1, one)].into_iter().filter(|&(_, may)| may) {
                 let (next, more) = stuffing::next(state, bit);
-                let range = range.map(|(least, most)| (least + u32::from(more), most + u32::from(more)));
+                let range = range.map(|(min, most)| (min + u32::from(more), most + u32::from(more)));
                 if let Some(slot) = then.get_mut(usize::from(next)) {
                     *slot = slot.map_or(range, |old| Some(range.map_or(old, |new| wider(old, new))));
                 }

@@ -24,8 +24,8 @@ pub enum BitRatesError {
     /// Outside what a nominal bit rate may be.
     #[error(
         "nominal bit rate {got} bit/s: CAN allows {} to {} (10k to 1M)",
-        BitRates::LEAST_NOMINAL,
-        BitRates::GREATEST_NOMINAL
+        BitRates::MIN_NOMINAL,
+        BitRates::MAX_NOMINAL
     )]
     Nominal {
         /// Bits in a second.
@@ -33,35 +33,35 @@ pub enum BitRatesError {
     },
     /// Outside what a data bit rate may be.
     #[error(
-        "data bit rate {got} bit/s: CAN FD allows {least} (the nominal one) to {} (8M)",
-        BitRates::GREATEST_DATA
+        "data bit rate {got} bit/s: CAN FD allows {min} (the nominal one) to {} (8M)",
+        BitRates::MAX_DATA
     )]
     Data {
         /// Bits in a second.
         got: u32,
         /// The nominal bit rate beside it.
-        least: u32,
+        min: u32,
     },
 }
 
 impl BitRates {
     /// The least nominal bit rate, in bit/s; so has a skin's description.
-    pub const LEAST_NOMINAL: u32 = 10_000;
+    pub const MIN_NOMINAL: u32 = 10_000;
     /// The greatest nominal bit rate, in bit/s.
-    pub const GREATEST_NOMINAL: u32 = 1_000_000;
+    pub const MAX_NOMINAL: u32 = 1_000_000;
     /// The greatest data bit rate, in bit/s.
-    pub const GREATEST_DATA: u32 = 8_000_000;
+    pub const MAX_DATA: u32 = 8_000_000;
 
     /// Both rates, in bit/s.
     ///
     /// # Errors
     /// When the nominal one is not in [10 000, 1 000 000], or the data one not between it and 8 000 000.
     pub const fn new(nominal: u32, data: u32) -> Result<Self, BitRatesError> {
-        if nominal < Self::LEAST_NOMINAL || nominal > Self::GREATEST_NOMINAL {
+        if nominal < Self::MIN_NOMINAL || nominal > Self::MAX_NOMINAL {
             return Err(BitRatesError::Nominal { got: nominal });
         }
-        if data < nominal || data > Self::GREATEST_DATA {
-            return Err(BitRatesError::Data { got: data, least: nominal });
+        if data < nominal || data > Self::MAX_DATA {
+            return Err(BitRatesError::Data { got: data, min: nominal });
         }
         Ok(Self { nominal, data })
     }
@@ -187,7 +187,7 @@ mod tests {
         for text in ["1M/5M", "500k/2M", "1M", "83333/83k"] {
             let rates: Result<BitRates, _> = text.parse();
             if text == "83333/83k" {
-                assert_eq!(rates, Err(BitRatesError::Data { got: 83_000, least: 83_333 }));
+                assert_eq!(rates, Err(BitRatesError::Data { got: 83_000, min: 83_333 }));
             } else {
                 assert_eq!(rates.unwrap().to_string(), text);
             }

@@ -10,8 +10,10 @@ use protocol::message::{
     Request, SensorPage, SkinSensors, State, Tree,
 };
 use protocol::packet::{Epoch, PacketError, WORDS};
-use protocol::parameters::{Contact, Cuts, Events, Parameter, Parameters, Pose, Reply, Row, Sensing, Slots};
-use protocol::wire::{Hello, Label, Lane, PortMessage, Walk};
+use protocol::parameters::{
+    Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, Sensing, Slots,
+};
+use protocol::wire::{Hello, LinkId, PortMessage, Rank, Walk};
 
 /// A comment: a word, and `key=value` fields that must all be used.
 pub(crate) struct Meaning<'a> {
@@ -127,17 +129,17 @@ impl<'a> Meaning<'a> {
         }
     }
 
-    fn label(&mut self) -> Option<Label> {
+    fn rank(&mut self) -> Option<Rank> {
         let (round, depth) = self.take("label").split_once('/')?;
-        Some(Label { round: round.parse().unwrap(), depth: depth.parse().unwrap() })
+        Some(Rank { round: round.parse().unwrap(), depth: depth.parse().unwrap() })
     }
 
     fn walk(&mut self) -> Walk {
         Walk { walk: self.number("walk"), first: self.number("first"), last: self.number("last") }
     }
 
-    pub(crate) fn wire(mut self) -> (Lane, PortMessage) {
-        let lane = Lane { wire: self.number("wire"), back: self.number::<u8>("back") == 1 };
+    pub(crate) fn wire(mut self) -> (LinkId, PortMessage) {
+        let link_id = LinkId { wire: self.number("wire"), back: self.number::<u8>("back") == 1 };
         let message = match self.what {
             "hello" => {
                 let flags = self.take("flags");
@@ -149,24 +151,24 @@ impl<'a> Meaning<'a> {
                     hears,
                     up,
                     unnumbered,
-                    label: self.label(),
+                    rank: self.rank(),
                 })
             }
             "join" => PortMessage::Join,
-            "grant" => PortMessage::Grant(self.label().expect(self.text)),
+            "grant" => PortMessage::Grant(self.rank().expect(self.text)),
             "refuse" => PortMessage::Refuse,
             "leave" => PortMessage::Leave,
-            "left" => PortMessage::Left,
-            "ask" => PortMessage::Ask,
+            "left" => PortMessage::LeaveAck,
+            "ask" => PortMessage::Probe,
             "state" => PortMessage::State(self.epoch()),
-            "missed" => PortMessage::Missed(self.epoch()),
-            "seek" => PortMessage::Seek(self.number("round")),
-            "number" => PortMessage::Number(self.walk()),
+            "missed" => PortMessage::Nack(self.epoch()),
+            "seek" => PortMessage::Repair(self.number("round")),
+            "number" => PortMessage::NodeId(self.walk()),
             "return" => PortMessage::Return(self.walk()),
             _ => panic!("{}: not understood", self.text),
         };
         assert!(self.fields.is_empty(), "{}: {:?} left over", self.text, self.fields);
-        (lane, message)
+        (link_id, message)
     }
 
     fn reply(&mut self) -> Reply {
@@ -238,7 +240,7 @@ impl<'a> Meaning<'a> {
             Parameter::Reply => return self.reply().words(),
             Parameter::Sensing => return self.sensing().words(),
             Parameter::Events => return self.events().words(),
-            Parameter::Cuts => return Cuts { deaf: self.bits("deaf") }.words(),
+            Parameter::LinksDown => return LinksDown { deaf: self.bits("deaf") }.words(),
             Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
             Parameter::Identity => panic!("{}: identity is given in words", self.text),
         }

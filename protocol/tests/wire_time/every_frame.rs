@@ -50,8 +50,8 @@ impl Steps {
         for &[(zero, if_zero), (one, if_one)] in &self.0 {
             let ([least_zero, most_zero], [least_one, most_one]) =
                 (after[zero as usize], after[one as usize]);
-            let least = (least_zero + if_zero).min(least_one + if_one);
-            counts.push([least, (most_zero + if_zero).max(most_one + if_one)]);
+            let min = (least_zero + if_zero).min(least_one + if_one);
+            counts.push([min, (most_zero + if_zero).max(most_one + if_one)]);
         }
         counts
     }
@@ -92,24 +92,24 @@ impl Steps {
     /// Over all identifiers and all that follows the DLC.
     fn over_all(&self, heads: &Counts, dlc: usize, rest: &Counts) -> [u32; 2] {
         let mut over_all = NEVER;
-        for (pair, &[least, most]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
+        for (pair, &[min, most]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
             let (pair, stuffed) = (0..4).rev().fold((pair, 0), |(pair, sum), place| {
                 let (pair, stuffed) = self.follow(pair, dlc >> place & 1);
                 (pair, sum + stuffed)
             });
             let [rest_least, rest_most] = rest[pair];
-            over_all = wider(over_all, [least + stuffed + rest_least, most + stuffed + rest_most]);
+            over_all = wider(over_all, [min + stuffed + rest_least, most + stuffed + rest_most]);
         }
         over_all.map(u32::from)
     }
 }
 
-fn wider([least, most]: [u8; 2], [other_least, other_most]: [u8; 2]) -> [u8; 2] {
-    [least.min(other_least), most.max(other_most)]
+fn wider([min, most]: [u8; 2], [other_least, other_most]: [u8; 2]) -> [u8; 2] {
+    [min.min(other_least), most.max(other_most)]
 }
 
-fn plus([least, most]: [u8; 2], stuffed: u8) -> [u8; 2] {
-    [least + stuffed, most + stuffed]
+fn plus([min, most]: [u8; 2], stuffed: u8) -> [u8; 2] {
+    [min + stuffed, most + stuffed]
 }
 
 /// What the 15 bits of the CRC add.
@@ -134,16 +134,16 @@ fn plain(extended: bool, bytes: usize) -> u32 {
 fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     let steps = Steps::all();
     let heads = [steps.heads(false), steps.heads(true)];
-    let compare = |coding, extended, len: usize, bytes, [least, most]: [u32; 2]| {
+    let compare = |coding, extended, len: usize, bytes, [min, most]: [u32; 2]| {
         let shape = Shape { coding, extended, len: u8::try_from(len).unwrap() };
         let plain = plain(extended, bytes);
-        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + least, plain + most), "{shape:?}");
+        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + min, plain + most), "{shape:?}");
         assert_eq!((shape.best().data, shape.worst().data), (0, 0));
     };
     let mut rest = of_the_crc();
     for ([remote, _], extended) in heads.iter().zip([false, true]) {
-        for asked in 0..=8 {
-            compare(Coding::Remote, extended, asked, 0, steps.over_all(remote, asked, &rest));
+        for requested in 0..=8 {
+            compare(Coding::Remote, extended, requested, 0, steps.over_all(remote, requested, &rest));
         }
     }
     for len in 0..=8 {

@@ -7,7 +7,7 @@ use rand::RngExt;
 
 use super::{Bench, Event};
 use crate::fault::Party;
-use crate::witness::Truth;
+use crate::oracle::Truth;
 
 /// From one frame on the wire to the next: about what vcan needs.
 const FRAME: Span = Span(5);
@@ -65,9 +65,9 @@ impl Bench {
     pub(super) fn packets(&mut self, from: Party, life: u32, at: Micros, packets: &[Packet]) {
         for packet in packets {
             self.packets += 1;
-            for (half, frame) in packet.frames(self.format).enumerate() {
+            for (segment, frame) in packet.frames(self.format).enumerate() {
                 let truth =
-                    Truth { from, life, packet: Some(*packet), number: self.packets, half, damage: None };
+                    Truth { from, life, packet: Some(*packet), number: self.packets, segment, damage: None };
                 self.agenda.enter(at, Event::Send(Sent { frame, truth }, true));
             }
         }
@@ -76,15 +76,16 @@ impl Bench {
     /// A frame wants a place on the wire.
     pub(super) fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
         if may_be_hit {
-            let fate = self.faults.fate(self.agenda.now, sent.truth.from, None, sent.frame);
-            sent.frame = fate.frame;
-            sent.truth = sent.truth.and(fate.damage);
-            if fate.after_next && fate.times > 0 && self.held.is_none() {
+            let broadcast_status =
+                self.faults.broadcast_status(self.agenda.now, sent.truth.from, None, sent.frame);
+            sent.frame = broadcast_status.frame;
+            sent.truth = sent.truth.and(broadcast_status.damage);
+            if broadcast_status.after_next && broadcast_status.times > 0 && self.held.is_none() {
                 self.held = Some(sent);
                 return;
             }
-            for _ in 0..fate.times {
-                self.agenda.enter_in(fate.delay, Event::Send(sent, false));
+            for _ in 0..broadcast_status.times {
+                self.agenda.enter_in(broadcast_status.delay, Event::Send(sent, false));
             }
             return;
         }
@@ -97,7 +98,7 @@ impl Bench {
     /// A frame has its place in the order, or waits for it.
     fn stand(&mut self, sent: &Sent) {
         if let Some(real) = &mut self.real {
-            real.ask(self.agenda.now, &sent.frame, *sent);
+            real.probe(self.agenda.now, &sent.frame, *sent);
             self.look_at_the_bus();
             return;
         }
@@ -112,16 +113,17 @@ impl Bench {
         self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
         self.pass(Party::Gateway, stood, sent);
         let hearers = self.hearers.get(&sent.frame.raw_id()).cloned().unwrap_or_default();
-        for seat in hearers {
-            if from != Party::Seat(seat) {
-                self.pass(Party::Seat(seat), stood, sent);
+        for cell_slot in hearers {
+            if from != Party::CellSlot(cell_slot) {
+                self.pass(Party::CellSlot(cell_slot), stood, sent);
             }
         }
     }
 
     /// From the wire to one receiver.
     fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
-        let fate = self.faults.fate(self.agenda.now, sent.truth.from, Some(to), sent.frame);
+        let broadcast_status =
+            self.faults.broadcast_status(self.agenda.now, sent.truth.from, Some(to), sent.frame);
         // A real bus is everywhere at once.
         let latency = match self.real {
             Some(_) => Span(0),
@@ -130,22 +132,22 @@ impl Bench {
         let mut at = stood + latency;
         if let Some(inlet) = self.inlet(to) {
             at = at.max(inlet.newest);
-            if fate.delay == Span(0) {
+            if broadcast_status.delay == Span(0) {
                 inlet.newest = at;
             }
         }
-        let sent = Sent { frame: fate.frame, truth: sent.truth.and(fate.damage) };
-        for _ in 0..fate.times {
-            let delivery = Delivery { to, stood, sent, after_next: fate.after_next };
-            self.agenda.enter(at + fate.delay, Event::Deliver(delivery));
+        let sent = Sent { frame: broadcast_status.frame, truth: sent.truth.and(broadcast_status.damage) };
+        for _ in 0..broadcast_status.times {
+            let delivery = Delivery { to, stood, sent, after_next: broadcast_status.after_next };
+            self.agenda.enter(at + broadcast_status.delay, Event::Deliver(delivery));
         }
     }
 
     fn inlet(&mut self, party: Party) -> Option<&mut Inlet> {
         match party {
             Party::Gateway => Some(&mut self.gateway_inlet),
-            Party::Seat(seat) => self.inlets.get_mut(seat),
-            Party::Stranger => None,
+            Party::CellSlot(cell_slot) => self.inlets.get_mut(cell_slot),
+            Party::UnknownNode => None,
         }
     }
 
@@ -162,15 +164,15 @@ impl Bench {
                 Party::Gateway => {
                     let own = truth.from == Party::Gateway;
                     self.gateway.hear(stood, own, &frame);
-                    self.witness.hear(stood, &truth, &frame);
+                    self.oracle.hear(stood, &truth, &frame);
                 }
-                Party::Seat(seat) => {
+                Party::CellSlot(cell_slot) => {
                     let now = self.agenda.now;
-                    let Some(there) = self.seats.get_mut(seat) else { return };
+                    let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
                     let packets = there.hear(now, stood, frame);
-                    self.sends(seat, &packets);
+                    self.sends(cell_slot, &packets);
                 }
-                Party::Stranger => {}
+                Party::UnknownNode => {}
             }
         }
     }

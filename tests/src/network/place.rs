@@ -47,7 +47,7 @@ pub struct Place {
     pub(super) life: Life<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
     /// What it hears aside, and when that stood on the bus: it does not wake it.
-    pub(super) aside: VecDeque<(Micros, Frame)>,
+    pub(super) deferred: VecDeque<(Micros, Frame)>,
     pub(super) newest: Micros,
     /// What it said in each of the last epochs: words, and who is in it.
     pub(super) said: HashMap<u8, Vec<(Words, u128)>>,
@@ -104,7 +104,7 @@ impl Place {
             force,
             life: Life::Off,
             wake: None,
-            aside: VecDeque::new(),
+            deferred: VecDeque::new(),
             newest: Micros(0),
             said: HashMap::new(),
         }

@@ -73,11 +73,11 @@ impl Wiring {
                 heard.push(said.clone());
             }
         }
-        let wanted = words.torque.map(|word| i32::from(word.to_bits()));
+        let expected = words.torque.map(|word| i32::from(word.to_bits()));
         let mut found = None;
         for own in [1_u32, 0] {
             let sum = if own == 1 { place.own } else { [0; WORDS] };
-            choose(&heard, sum, own, u128::from(own) << cell, (&wanted, words.count.into()), &mut found);
+            choose(&heard, sum, own, u128::from(own) << cell, (&expected, words.count.into()), &mut found);
         }
         // The end of a contact: zeros of its own, and no torque.
         if words.is_end() {
@@ -108,14 +108,14 @@ fn choose(
     sum: [i32; WORDS],
     count: u32,
     cells: u128,
-    wanted: (&[i32; WORDS], u32),
+    expected: (&[i32; WORDS], u32),
     found: &mut Option<u128>,
 ) {
-    if count == wanted.1 && sum == *wanted.0 && found.is_none_or(|before| before == TWICE) {
+    if count == expected.1 && sum == *expected.0 && found.is_none_or(|before| before == TWICE) {
         *found = Some(cells);
     }
     let Some((first, rest)) = heard.split_first() else { return };
-    if count > wanted.1 {
+    if count > expected.1 {
         return;
     }
     for (words, of) in first {
@@ -125,7 +125,7 @@ fn choose(
         }
         // Where a cell is in it twice, all the bits are set that nobody has.
         let both = if cells & of == 0 { cells | of } else { TWICE };
-        choose(rest, with, count + u32::from(words.count), both, wanted, found);
+        choose(rest, with, count + u32::from(words.count), both, expected, found);
     }
-    choose(rest, sum, count, cells, wanted, found);
+    choose(rest, sum, count, cells, expected, found);
 }

@@ -18,7 +18,7 @@ impl Wiring {
     #[must_use]
     pub fn waits_for_children(&self, cell: usize) -> bool {
         let joints = Id::command(Command::Joints);
-        matches!(&self.cells[cell].life, Life::Runs(node) if node.hears_aside(joints))
+        matches!(&self.cells[cell].life, Life::Runs(node) if node.defers(joints))
     }
 
     /// Cells that have a way to the gateway, by wires that work in both directions and cells that run.
@@ -44,21 +44,21 @@ impl Wiring {
 
     /// The way of a cell's sums to a root, by what the cells report; `None` without one, or in a circle.
     #[must_use]
-    pub fn way(&self, cell: usize) -> Option<Vec<usize>> {
-        let mut way = vec![cell];
+    pub fn route(&self, cell: usize) -> Option<Vec<usize>> {
+        let mut route = vec![cell];
         loop {
-            let at = *way.last()?;
+            let at = *route.last()?;
             let tree = self.cells[at].tree?;
             match tree.parent? {
-                0 => return Some(way),
+                0 => return Some(route),
                 parent => {
                     let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
                         return None;
                     };
-                    if self.cells[other].number.map(CellId::get) != Some(parent) || way.contains(&other) {
+                    if self.cells[other].number.map(CellId::get) != Some(parent) || route.contains(&other) {
                         return None;
                     }
-                    way.push(other);
+                    route.push(other);
                 }
             }
         }
@@ -67,12 +67,12 @@ impl Wiring {
     /// All ways, for people.
     #[must_use]
     pub fn ways(&self) -> String {
-        let way = |cell: usize| {
+        let route = |cell: usize| {
             let place = &self.cells[cell];
             let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
-            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.way(cell))
+            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.route(cell))
         };
-        (0..self.cells.len()).map(way).collect::<Vec<_>>().join("; ")
+        (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")
     }
 
     /// The bits of some cells.

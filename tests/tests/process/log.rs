@@ -7,7 +7,7 @@ use protocol::candump::{self, Line};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, Half, Packet, Paired, WORDS, data_id};
+use protocol::packet::{Epoch, Packet, Reassembly, Segment, WORDS, data_id};
 use protocol::time::Micros;
 
 /// A whole log.
@@ -32,14 +32,14 @@ impl Log {
 
     /// Reads frames of one bus.
     pub(crate) fn of(frames: Vec<Frame>, format: Format) -> Self {
-        let mut halves = BTreeMap::new();
+        let mut segments = BTreeMap::new();
         let packet = |frame: &Frame| match format {
             Format::Fd => Packet::from_fd(frame).ok(),
             Format::Classic => {
                 let id = data_id(frame).ok()?;
-                let half = halves.entry(id).or_insert(Half::NONE);
-                match half.push(Micros(0), id, frame.data()) {
-                    Ok(Paired::Whole(packet)) => Some(packet),
+                let segment = segments.entry(id).or_insert(Segment::NONE);
+                match segment.push(Micros(0), id, frame.data()) {
+                    Ok(Reassembly::Complete(packet)) => Some(packet),
                     _ => None,
                 }
             }
@@ -108,7 +108,7 @@ impl Log {
 
     /// Every torque with its cause and the number of the broadcast that it answers.
     pub(crate) fn torques(&self) -> Vec<(usize, Cause, Packet)> {
-        let mut felt: BTreeMap<u8, Feeling> = BTreeMap::new();
+        let mut contact_state: BTreeMap<u8, ContactState> = BTreeMap::new();
         let mut causes: BTreeMap<(u8, u8), (usize, Cause)> = BTreeMap::new();
         let (mut number, mut last) = (0, None);
         let mut torques = Vec::new();
@@ -116,13 +116,13 @@ impl Log {
             match *message {
                 Message::Stimulus { to, from, page: SensorPage::Skin(skin) } => {
                     let Node::Cell(cell) = to else { panic!("a stimulus to {to:?}") };
-                    felt.entry(cell.get()).or_default().push(from, skin, last);
+                    contact_state.entry(cell.get()).or_default().push(from, skin, last);
                 }
                 Message::Joints { epoch, joints } => {
                     last = Some(epoch);
-                    for (&cell, feeling) in &mut felt {
-                        feeling.latch(epoch);
-                        let cause = (cell, joints.positions.map(Q::to_bits), words(&feeling.now));
+                    for (&cell, contact_state) in &mut contact_state {
+                        contact_state.latch(epoch);
+                        let cause = (cell, joints.positions.map(Q::to_bits), words(&contact_state.now));
                         causes.insert((cell, epoch.0), (number, cause));
                     }
                     number += 1;
@@ -145,12 +145,12 @@ fn words(skin: &SkinSensors) -> [i16; 6] {
 
 /// What a cell feels, by the protocol's rules, as the document has them.
 #[derive(Default)]
-struct Feeling {
+struct ContactState {
     waiting: Vec<(From, SkinSensors)>,
     now: SkinSensors,
 }
 
-impl Feeling {
+impl ContactState {
     fn push(&mut self, from: From, skin: SkinSensors, last: Option<Epoch>) {
         let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
         self.waiting.push((if late { From::Next } else { from }, skin));

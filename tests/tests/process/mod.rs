@@ -1,7 +1,7 @@
 //! A bench of real processes on a bus of its own, embedded or a real kernel's: what all tests of this kind share.
 //!
 //! Nothing here waits for a time to pass: what is waited for is looked at until it is so, or until
-//! [`PATIENCE`] is over, which a slow machine never needs and a hanging program does.
+//! [`TIMEOUT`] is over, which a slow machine never needs and a hanging program does.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -13,13 +13,13 @@
 
 pub(crate) mod buses;
 pub(crate) mod external;
-pub(crate) mod guest;
 pub(crate) mod log;
 mod place;
 pub(crate) mod replay;
 mod running;
 mod summary;
 pub(crate) mod sums;
+pub(crate) mod test_client;
 pub(crate) mod vcan;
 pub(crate) mod whole;
 
@@ -27,7 +27,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use model::generate::{Format, Wanted, generate};
+use model::generate::{Format, Target, generate};
 use rustix::process::{Pid, Signal, kill_process};
 
 use running::proc;
@@ -37,7 +37,7 @@ pub(crate) use running::{Ended, Running};
 pub(crate) use summary::Summary;
 
 /// How long anything may take that should happen at once.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
+pub(crate) const TIMEOUT: Duration = Duration::from_secs(40);
 
 /// Every cell is pressed, harder and softer, while the arm stands.
 pub(crate) const PRESSED: &str = r#"version = 1
@@ -61,12 +61,12 @@ profile = "step"
 
 /// Looks until something is there.
 pub(crate) fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let give_up = Instant::now() + PATIENCE;
+    let give_up = Instant::now() + TIMEOUT;
     loop {
         if let Some(found) = look() {
             return found;
         }
-        assert!(Instant::now() < give_up, "waited {PATIENCE:?} and there is still not: {what}");
+        assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -97,12 +97,12 @@ pub(crate) fn example(name: &str) -> PathBuf {
 
 /// A skin's text: some cells on an arm, on one bus.
 pub(crate) fn skin(cells: usize) -> String {
-    generate(&Wanted { cells, ..Wanted::default() }).unwrap()
+    generate(&Target { cells, ..Target::default() }).unwrap()
 }
 
 /// Some cells over some buses in another format.
 pub(crate) fn skin_of(cells: usize, buses: usize, format: Format) -> String {
-    generate(&Wanted { cells, buses, format, ..Wanted::default() }).unwrap()
+    generate(&Target { cells, buses, format, ..Target::default() }).unwrap()
 }
 
 pub(crate) fn names(folder: &Path) -> Vec<String> {

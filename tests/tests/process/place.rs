@@ -9,9 +9,9 @@ use protocol::bus::BusKind;
 use rustix::process::Pid;
 use tempfile::TempDir;
 
-use super::guest::Guest;
 use super::running::{Running, all_processes, command_line, proc};
-use super::{PATIENCE, PRESSED, Summary, names, program, skin, vcan};
+use super::test_client::TestClient;
+use super::{PRESSED, Summary, TIMEOUT, names, program, skin, vcan};
 
 /// A directory of its own for a test, and in it its embedded buses.
 pub(crate) struct Place {
@@ -118,8 +118,8 @@ impl Place {
     }
 
     /// Another client of its bus.
-    pub(crate) fn guest(&self) -> Guest {
-        Guest::on(self, "vcan0", protocol::can::Format::Fd)
+    pub(crate) fn test_client(&self) -> TestClient {
+        TestClient::on(self, "vcan0", protocol::can::Format::Fd)
     }
 
     /// Processes of this place that live, with their command lines.
@@ -138,7 +138,7 @@ impl Place {
             let processes = self.processes();
             if processes.is_empty() && !self.buses().exists() { None } else { Some(processes) }
         };
-        let give_up = Instant::now() + PATIENCE;
+        let give_up = Instant::now() + TIMEOUT;
         while let Some(processes) = left() {
             let sockets = if self.buses().exists() { names(&self.buses()) } else { Vec::new() };
             assert!(Instant::now() < give_up, "left behind: {processes:?} {sockets:?}");

@@ -12,7 +12,7 @@ use std::path::Path;
 
 use mcap::read::{Summary, attachment, metadata};
 use mcap::{MessageStream, Schema};
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use protocol::candump::{Line, parse};
 use serde_json::{Map, Value, json};
 
@@ -197,8 +197,8 @@ impl<'a> From<'a> {
 
 /// Records a bench of pressed cells, and sees that the recording has exactly the frames that candump has seen.
 pub(crate) fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f64, more: &str) {
-    let wanted = Wanted { cells, broadcast_hz, ..Wanted::default() };
-    place.write("skin.toml", &generate(&wanted).unwrap());
+    let expected = Target { cells, broadcast_hz, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     place.bench(4.0, &format!("--record run.mcap {more}")).end().well();

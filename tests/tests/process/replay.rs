@@ -13,7 +13,7 @@ use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use serde_json::Value;
 
-use super::guest::Guest;
+use super::test_client::TestClient;
 use super::{Ended, Place, Running};
 
 /// Fresh cells of the skin of the recording.
@@ -64,41 +64,41 @@ pub(crate) fn cell(number: i64) -> CellId {
 
 /// What a guest says while a run is recorded: every command, stimuli of both pages in both ways, parameters that are
 /// read, written, refused and taken into use.
-pub(crate) fn says_everything(guest: &Guest, skin: &Path) {
+pub(crate) fn says_everything(test_client: &TestClient, skin: &Path) {
     let configure = |to, tag, request| Message::Configure { to, tag, request };
     let write = |parameter: Parameter, words| Request::Write { number: parameter.number(), words };
-    guest.waits_for_epoch(20);
-    guest.sends(&Message::Report);
-    guest.sends(&Message::Sync);
+    test_client.waits_for_epoch(20);
+    test_client.sends(&Message::Report);
+    test_client.sends(&Message::Sync);
     let page = SensorPage::Acceleration([Q3_12::nearest(0.5), Q3_12::ZERO, Q3_12::nearest(-1.0)]);
-    guest.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+    test_client.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
     let skin_page = SkinSensors { contact: [Q5_10::nearest(0.7); 3], ..SkinSensors::default() };
-    guest.sends(&Message::Stimulus {
+    test_client.sends(&Message::Stimulus {
         to: Node::Cell(cell(6)),
         from: From::Next,
         page: SensorPage::Skin(skin_page),
     });
-    guest.waits_for_epoch(40);
+    test_client.waits_for_epoch(40);
     // Cell 4 is moved by a hand's breadth: its torques change in the middle of a contact.
     let skin = Skin::read(skin).unwrap();
     let described = skin.cells.iter().find(|it| it.node.get() == 4).unwrap();
     let mut parameters = skin.parameters(described);
     let to = Node::Cell(cell(4));
-    guest.sends(&configure(to, 1, Request::Read { number: Parameter::Pose.number() }));
-    guest.sends(&configure(to, 2, write(Parameter::Commit, [1, 0, 0, 0, 0, 0])));
+    test_client.sends(&configure(to, 1, Request::Read { number: Parameter::Pose.number() }));
+    test_client.sends(&configure(to, 2, write(Parameter::Commit, [1, 0, 0, 0, 0, 0])));
     let [_, y, z] = parameters.pose.position;
     parameters.pose.position = [protocol::fixed::Q1_14::nearest(0.05), y, z];
-    guest.sends(&configure(to, 3, write(Parameter::Pose, parameters.words(Parameter::Pose))));
+    test_client.sends(&configure(to, 3, write(Parameter::Pose, parameters.words(Parameter::Pose))));
     let hash = [parameters.hash().cast_signed(), 0, 0, 0, 0, 0];
-    guest.sends(&configure(to, 4, write(Parameter::Commit, hash)));
-    guest.sends(&configure(Node::Everyone, 5, Request::Read { number: 99 }));
-    guest.waits_for_epoch(70);
-    guest.sends(&Message::Halt);
-    guest.waits_for_epoch(90);
-    guest.sends(&Message::Resume);
-    guest.waits_for_epoch(110);
+    test_client.sends(&configure(to, 4, write(Parameter::Commit, hash)));
+    test_client.sends(&configure(Node::Everyone, 5, Request::Read { number: 99 }));
+    test_client.waits_for_epoch(70);
+    test_client.sends(&Message::Halt);
+    test_client.waits_for_epoch(90);
+    test_client.sends(&Message::Resume);
+    test_client.waits_for_epoch(110);
     // Whoever is told what its mode is forgets what it felt.
-    guest.sends(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
+    test_client.sends(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
 }
 
 impl Place {
@@ -112,7 +112,7 @@ impl Place {
     pub(crate) fn records_with(&self, skin: &Path) {
         self.scenario(TOUCHED);
         let bench = self.running_bench(4.0, "");
-        says_everything(&self.guest(), skin);
+        says_everything(&self.test_client(), skin);
         bench.end().well();
         self.is_left_clean();
     }
@@ -174,18 +174,18 @@ impl Replayed {
     }
 }
 
-/// Changes the `nth` packet of a log for which `wanted` says so, with its CRC made right again.
+/// Changes the `nth` packet of a log for which `expected` says so, with its CRC made right again.
 pub(crate) fn changed(
     log: &str,
     nth: usize,
-    wanted: impl Fn(&Message) -> bool,
+    expected: impl Fn(&Message) -> bool,
     change: impl Fn(&mut [i16; WORDS]),
 ) -> String {
     let mut left = nth;
     let line = |line: &str| {
         let Ok(Line::Frame(record)) = candump::parse(line) else { return line.to_owned() };
         let Ok(mut packet) = Packet::from_fd(&record.frame) else { return line.to_owned() };
-        if !Message::decode(&packet).is_ok_and(|message| wanted(&message)) {
+        if !Message::decode(&packet).is_ok_and(|message| expected(&message)) {
             return line.to_owned();
         }
         left = left.wrapping_sub(1);

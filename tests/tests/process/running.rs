@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
-use super::{PATIENCE, signal, tells, tells_on, until};
+use super::{TIMEOUT, signal, tells, tells_on, until};
 
 /// A process whose words are taken as they come; it ends with the test.
 pub(crate) struct Running {
@@ -108,14 +108,14 @@ impl Running {
 
     /// Waits until it has ended, which takes so long by itself.
     pub(crate) fn end_after(mut self, run: Duration) -> Ended {
-        let give_up = Instant::now() + run + PATIENCE;
+        let give_up = Instant::now() + run + TIMEOUT;
         // Looking costs an emulated processor 2 % of its time.
         let look = Duration::from_millis(if run.is_zero() { 5 } else { 200 });
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
             }
-            assert!(Instant::now() < give_up, "still running after {PATIENCE:?}: {}", self.stderr());
+            assert!(Instant::now() < give_up, "still running after {TIMEOUT:?}: {}", self.stderr());
             std::thread::sleep(look);
         };
         Ended { status, stdout: self.out.whole(), stderr: self.err.whole() }
@@ -174,7 +174,7 @@ impl Output {
     }
 
     fn wait_until(&self, words: &str, said: impl Fn(&str) -> bool) {
-        let give_up = Instant::now() + PATIENCE;
+        let give_up = Instant::now() + TIMEOUT;
         loop {
             let text = self.text.lock().unwrap().clone();
             if said(&text) {

@@ -67,7 +67,8 @@ impl Summary {
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);
             if !self.0["buses"][bus]["sums"].is_null() {
-                let ways = ["first", "resent", "overheard", "stale"].map(|way| of(&format!("/sums/{way}")));
+                let ways =
+                    ["first", "resent", "overheard", "stale"].map(|route| of(&format!("/sums/{route}")));
                 assert_eq!(ways.iter().sum::<u64>(), of("/sums/received"), "{:#}", self.0);
                 let of = |how| of(&format!("/sums/contributions/{how}"));
                 assert_eq!(of("due"), of("in_time") + of("late") + of("missing"), "{:#}", self.0);

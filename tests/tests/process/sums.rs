@@ -2,15 +2,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use model::generate::{Reply, Wanted, generate};
+use model::generate::{Reply, Target, generate};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
 use rustix::process::Signal;
 
 use super::buses::mixed_skin;
-use super::guest::Guest;
-use super::{Ended, PATIENCE, PRESSED, Place, Running, is_stopped, until};
+use super::test_client::TestClient;
+use super::{Ended, PRESSED, Place, Running, TIMEOUT, is_stopped, until};
 
 /// Cells, in rows of four; those at two opposite corners are roots.
 pub(crate) const CELLS: u8 = 12;
@@ -33,9 +33,9 @@ pub(crate) fn grid(place: &Place, format: Format) {
 }
 
 pub(crate) fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
-    let wanted = Wanted { cells: CELLS.into(), reply: Reply::Sum, ..Wanted::default() };
+    let expected = Target { cells: CELLS.into(), reply: Reply::Sum, ..Target::default() };
     let classic: &[_] = if format == Format::Classic { &["vcan0"] } else { &[] };
-    let text = mixed_skin(&generate(&wanted).unwrap(), classic);
+    let text = mixed_skin(&generate(&expected).unwrap(), classic);
     let mut node = 0;
     let mut lines = Vec::new();
     for line in text.lines() {
@@ -74,18 +74,18 @@ pub(crate) fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
 }
 
 /// Waits until the roots' sums of three epochs in a row hold so many cells.
-pub(crate) fn holds(guest: &Guest, wanted: u32) {
+pub(crate) fn holds(test_client: &TestClient, expected: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
     // A root that found another way is in another one's sum.
     let mut below = BTreeSet::new();
-    guest.sends(&Message::Report);
+    test_client.sends(&Message::Report);
     let mut seen = Vec::new();
-    let whole = guest.hears(|message| match message {
+    let whole = test_client.hears(|message| match message {
         Message::Joints { epoch: of, .. } => {
             let roots = counts.iter().filter(|(root, _)| !below.contains(*root));
             let count: u32 = roots.map(|(_, &count)| u32::from(count)).sum();
             seen.push(count);
-            row = if epoch.is_some() && count == wanted { row + 1 } else { 0 };
+            row = if epoch.is_some() && count == expected { row + 1 } else { 0 };
             (epoch, counts) = (Some(*of), BTreeMap::new());
             row == 3
         }
@@ -104,25 +104,25 @@ pub(crate) fn holds(guest: &Guest, wanted: u32) {
         }
         _ => false,
     });
-    assert!(whole, "waited {PATIENCE:?} for sums of {wanted} cells; they were of {seen:?}");
+    assert!(whole, "waited {TIMEOUT:?} for sums of {expected} cells; they were of {seen:?}");
 }
 
 /// Waits until, by what cells say, each of these has a way to a root that leads over these only.
-fn have_ways(guest: &Guest, cells: &BTreeSet<u8>) {
+fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
         let up = |cell: &u8| parents.get(cell).copied().flatten();
-        let mut way = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
-        way.find(|cell| !cells.contains(cell)) == Some(0)
+        let mut route = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
+        route.find(|cell| !cells.contains(cell)) == Some(0)
     };
-    guest.sends(&Message::Report);
-    let all = guest.hears(|message| {
+    test_client.sends(&Message::Report);
+    let all = test_client.hears(|message| {
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } = message {
             parents.insert(cell.get(), tree.parent);
         }
         cells.iter().all(|&cell| leads(&parents, cell))
     });
-    assert!(all, "waited {PATIENCE:?} for ways of {cells:?}: {parents:?}");
+    assert!(all, "waited {TIMEOUT:?} for ways of {cells:?}: {parents:?}");
 }
 
 /// Ends a bench, and sees that all is accounted for.
@@ -140,25 +140,25 @@ pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
     place.scenario(PRESSED);
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Guest::on(place, "vcan0", format);
-    holds(&guest, 12);
+    let test_client = TestClient::on(place, "vcan0", format);
+    holds(&test_client, 12);
 
     super::signal(bench.cell(6), Signal::KILL);
-    holds(&guest, 11);
+    holds(&test_client, 11);
     bench.tells(6, "fallen silent");
 
     let stopped = bench.cell(7);
     super::signal(stopped, Signal::STOP);
     until("a stopped cell", || is_stopped(stopped).then_some(()));
-    holds(&guest, 10);
+    holds(&test_client, 10);
     super::signal(stopped, Signal::CONT);
-    holds(&guest, 11);
+    holds(&test_client, 11);
 
     // It is told again when to speak, and what it feels.
     let words = format!("--bus vcan0 --bus-kind {} --node 6 --skin skin.toml", place.kind());
     let again = place.start("cell-node", &words);
     bench.hears("cell 6 on vcan0 started anew");
-    holds(&guest, 12);
+    holds(&test_client, 12);
     bench.signal(Signal::TERM);
     bench.end().well();
     drop(again);
@@ -174,24 +174,24 @@ pub(crate) fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Guest::on(place, "vcan0", format);
+    let test_client = TestClient::on(place, "vcan0", format);
     let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
-    have_ways(&guest, &cells);
+    have_ways(&test_client, &cells);
     super::signal(bench.cell(6), Signal::KILL);
     cells.remove(&6);
-    have_ways(&guest, &cells);
+    have_ways(&test_client, &cells);
     let stopped = bench.cell(7);
     super::signal(stopped, Signal::STOP);
     cells.remove(&7);
-    have_ways(&guest, &cells);
+    have_ways(&test_client, &cells);
     super::signal(stopped, Signal::CONT);
     cells.insert(7);
-    have_ways(&guest, &cells);
+    have_ways(&test_client, &cells);
     end(place, bench);
 }
 
 /// Wires are cut while the loop runs: one of many in one direction, and all of the cell in a corner.
-const CUTS: &str = r#"
+const LINKS_DOWN: &str = r#"
 [[fault]]
 at_s = 2.0
 kind = "cut"
@@ -214,17 +214,17 @@ for_s = 8.0
 /// Who has no way any more is named, and the rest finds another.
 pub(crate) fn goes_on_without_a_wire(place: &Place, format: Format) {
     grid(place, format);
-    place.scenario(&format!("{PRESSED}{CUTS}"));
+    place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
-    let guest = Guest::on(place, "vcan0", format);
+    let test_client = TestClient::on(place, "vcan0", format);
     bench.hears("scenario: Cut the wires one way, from cell 6 and cell 5 on vcan0");
-    holds(&guest, 12);
+    holds(&test_client, 12);
     bench.hears("cell 4 on vcan0 has no way to a root: no sum holds it since");
-    holds(&guest, 11);
+    holds(&test_client, 11);
     bench.hears("scenario: Mend the wires between cell 8 and cell 4 on vcan0");
     bench.hears("cell 4 on vcan0 has a way to a root again, after");
-    holds(&guest, 12);
+    holds(&test_client, 12);
     end(place, bench);
     let summary = place.summary();
     assert!(summary.figure("/buses/0/network/longest_without_way_s") > 1.0, "{:#}", summary.0);

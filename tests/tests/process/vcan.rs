@@ -9,7 +9,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use protocol::can::Frame;
 use protocol::candump::{Line, parse, parse_frame};
 use protocol::id::{Id, Kind};
@@ -90,7 +90,7 @@ pub(crate) fn backlog_drops() -> u64 {
 
 /// A skin of a few cells at a rate that an emulated machine keeps up.
 pub(crate) fn small_skin(cells: usize) -> String {
-    generate(&Wanted { cells, broadcast_hz: 20.0, ..Wanted::default() }).unwrap()
+    generate(&Target { cells, broadcast_hz: 20.0, ..Target::default() }).unwrap()
 }
 
 /// `cansend vcan0 $(gateway frame ...)`, as a person would.

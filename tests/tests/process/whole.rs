@@ -3,7 +3,7 @@
 use std::fs;
 use std::time::Duration;
 
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use protocol::can::Frame;
 use protocol::id::{Id, Kind};
 
@@ -41,8 +41,8 @@ profile = "step"
 pub(crate) fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
     let place = Place::on_vcan();
-    let wanted = Wanted { cells: 253, broadcast_hz, ..Wanted::default() };
-    let (skin, usual) = (generate(&wanted).unwrap(), "control_hz = 500.0");
+    let expected = Target { cells: 253, broadcast_hz, ..Target::default() };
+    let (skin, usual) = (generate(&expected).unwrap(), "control_hz = 500.0");
     assert!(skin.contains(usual), "{usual}");
     place.write("skin.toml", &skin.replace(usual, &format!("control_hz = {control_hz:?}")));
     place.scenario(SCENARIO);

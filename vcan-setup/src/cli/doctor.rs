@@ -4,10 +4,10 @@ use clap::Args;
 use protocol::bus::{BusKind, Choice};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use vcan_setup::doctor::{Bus, Facts, Finding, Level, judge, would_run};
+use vcan_setup::doctor::{Bus, Facts, Finding, Level, comparator, would_run};
 use vcan_setup::look;
 
-use super::{ask, json, named};
+use super::{json, named, query};
 
 /// Say what a bench still needs on this machine, and what mends it
 ///
@@ -38,17 +38,17 @@ pub(crate) struct Doctor {
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
-        let present = match (ask(), self.bus_kind.resolve()) {
+        let present = match (query(), self.bus_kind.resolve()) {
             (Ok((_, present)), _) => present,
             // Which needs none of them.
             (Err(_), BusKind::Embedded) => Vec::new(),
             (Err(failure), BusKind::SocketCan) => return Err(failure),
         };
-        for Bus { wanted, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
-            wanted.take_format_of_hardware(&present);
+        for Bus { target, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
+            target.take_format_of_hardware(&present);
         }
         let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
-        let findings = judge(&facts);
+        let findings = comparator(&facts);
         let runs = would_run(&findings);
         if self.json {
             let bus_kind = facts.bus_kind().name();
@@ -62,10 +62,10 @@ impl Doctor {
 
 fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     let mut text = String::new();
-    for Finding { level, text: what, remedies } in findings {
+    for Finding { level, text: what, hints } in findings {
         text += &format!("{:<6}{what}\n", level.name());
-        for remedy in remedies {
-            text += &format!("        {remedy}\n");
+        for hint in hints {
+            text += &format!("        {hint}\n");
         }
     }
     let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();

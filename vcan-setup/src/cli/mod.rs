@@ -18,7 +18,7 @@ use protocol::usage::{Failure, end, one_line};
 use serde::Serialize;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::Wanted;
+use vcan_setup::plan::Target;
 
 /// Gives you a bus: makes vcan interfaces, says what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
@@ -62,7 +62,7 @@ pub(crate) fn main() -> ExitCode {
     let done = match Arguments::try_parse() {
         Ok(arguments) => arguments.command.run(),
         // Help and version, which are asked for, are printed as they are.
-        Err(asked) if !asked.use_stderr() => asked.exit(),
+        Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
     };
@@ -110,12 +110,12 @@ fn named<T>(
 }
 
 /// The interfaces that words on the command line name.
-fn wanted(words: &[String]) -> Result<Vec<Wanted>, Failure> {
-    named(words, Wanted::of_skin, Wanted::named)
+fn target(words: &[String]) -> Result<Vec<Target>, Failure> {
+    named(words, Target::of_skin, Target::named)
 }
 
 /// The interfaces that there are, and who told.
-fn ask() -> Result<(Netlink, Vec<Interface>), Failure> {
+fn query() -> Result<(Netlink, Vec<Interface>), Failure> {
     let mut netlink = Netlink::open().map_err(unreadable)?;
     let present = netlink.interfaces().map_err(unreadable)?;
     Ok((netlink, present))

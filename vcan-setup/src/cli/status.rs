@@ -7,7 +7,7 @@ use serde::Serialize;
 use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, Peer, Rates};
 use vcan_setup::look::{Embedded, embedded_buses};
 
-use super::{ask, json, wanted};
+use super::{json, query, target};
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
@@ -27,21 +27,21 @@ pub(crate) struct Status {
 
 impl Status {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let wanted = wanted(&self.what)?;
-        let (_, present) = ask()?;
-        let is_wanted = |name: &str| wanted.is_empty() || wanted.iter().any(|wanted| wanted.name == name);
+        let target = target(&self.what)?;
+        let (_, present) = query()?;
+        let is_requested = |name: &str| target.is_empty() || target.iter().any(|target| target.name == name);
         let named = |interface: &&Interface| {
-            if wanted.is_empty() { interface.is_can() } else { is_wanted(&interface.name) }
+            if target.is_empty() { interface.is_can() } else { is_requested(&interface.name) }
         };
         let interfaces: Vec<_> = present.iter().filter(named).collect();
-        let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_wanted(&bus.name)).collect();
+        let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_requested(&bus.name)).collect();
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
                 let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
                 json(&Report { interfaces, embedded: &embedded })?
             }
             (false, false) => table(&interfaces, &embedded),
-            (false, true) if wanted.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
+            (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
             // What was named and is not there is said below.
             (false, true) => String::new(),
         };
@@ -50,7 +50,7 @@ impl Status {
             interfaces.iter().any(|it| it.name == name)
                 || embedded.iter().any(|it| it.name == name && it.served)
         };
-        let absent: Vec<_> = wanted.iter().map(|it| it.name.as_str()).filter(|name| !there(name)).collect();
+        let absent: Vec<_> = target.iter().map(|it| it.name.as_str()).filter(|name| !there(name)).collect();
         if absent.is_empty() {
             return Ok(());
         }

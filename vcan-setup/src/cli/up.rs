@@ -12,9 +12,9 @@ use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
 use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{self, Action, Plan, Step, There, WantedPair};
+use vcan_setup::plan::{self, Action, Plan, Step, TargetPair, There};
 
-use super::{Word, ask, unreadable, wanted, word};
+use super::{Word, query, target, unreadable, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -69,12 +69,12 @@ impl Up {
         if let Some(peer) = &self.peer {
             return self.pair(peer);
         }
-        let wanted = wanted(&self.what)?;
-        for name in wanted.iter().map(|wanted| &wanted.name) {
+        let target = target(&self.what)?;
+        for name in target.iter().map(|target| &target.name) {
             plain(name)?;
         }
-        let (mut netlink, present) = ask()?;
-        let plan = plan::up(&wanted, &present, self.set_bit_rates)?;
+        let (mut netlink, present) = query()?;
+        let plan = plan::up(&target, &present, self.set_bit_rates)?;
         Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
 
@@ -89,7 +89,7 @@ impl Up {
         };
         plain(&name)?;
         plain(peer)?;
-        let (mut netlink, present) = ask()?;
+        let (mut netlink, present) = query()?;
         let mut other = self.namespace.as_deref().map(enter).transpose()?.flatten();
         let there = match &mut other {
             Some((namespace, file, inside)) => {
@@ -99,7 +99,7 @@ impl Up {
             }
             None => None,
         };
-        let plan = plan::up_pair(&WantedPair { name: &name, peer, there: there.as_ref() }, &present)?;
+        let plan = plan::up_pair(&TargetPair { name: &name, peer, there: there.as_ref() }, &present)?;
         let there = other.as_mut().map(|(_, file, inside)| (&*file, inside));
         Worker { netlink: &mut netlink, there }.finish(&plan, self.dry_run)
     }
@@ -107,9 +107,9 @@ impl Up {
 
 impl Down {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let wanted = wanted(&self.what)?;
-        let (mut netlink, present) = ask()?;
-        let plan = plan::down(&wanted, &present)?;
+        let target = target(&self.what)?;
+        let (mut netlink, present) = query()?;
+        let plan = plan::down(&target, &present)?;
         Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
 }
@@ -178,7 +178,7 @@ impl Worker<'_> {
     /// Says what is left alone, and does the rest or says what it would do.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
-        for line in &plan.left {
+        for line in &plan.unchanged {
             text += &format!("{line}\n");
         }
         if dry_run {
@@ -223,8 +223,8 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     };
     let doing = step.doing();
     let unknown = |kind: &str, kernel: &Kernel| {
-        let remedies = kernel.remedies(kernel.module(kind));
-        let nearest = remedies.first().map_or("", String::as_str);
+        let hints = kernel.hints(kernel.module(kind));
+        let nearest = hints.first().map_or("", String::as_str);
         // A command and its comment.
         let (command, why) = nearest.split_once("# ").unwrap_or((nearest, ""));
         let command = if command.is_empty() { String::new() } else { format!("`{}`", command.trim()) };

@@ -9,7 +9,7 @@ use protocol::skin::{Reply, Skin};
 
 use crate::kernel::Kernel;
 use crate::link::Interface;
-use crate::plan::Wanted;
+use crate::plan::Target;
 
 /// All that the judgement rests on.
 #[derive(Clone, Debug)]
@@ -60,7 +60,7 @@ pub struct Program {
 #[derive(Clone, Debug)]
 pub struct Bus {
     /// What is wanted of it.
-    pub wanted: Wanted,
+    pub target: Target,
     /// Its cells; `None` when no skin says.
     pub cells: Option<BTreeSet<CellId>>,
     /// Whether its cells are to answer with sums.
@@ -75,23 +75,23 @@ impl Bus {
     /// The buses of a skin.
     #[must_use]
     pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
-        let of = |(index, wanted): (usize, Wanted)| Self {
+        let of = |(index, target): (usize, Target)| Self {
             cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
             sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),
-            ..Self::of(wanted)
+            ..Self::of(target)
         };
-        Wanted::of_skin(file, skin).into_iter().enumerate().map(of).collect()
+        Target::of_skin(file, skin).into_iter().enumerate().map(of).collect()
     }
 
     /// A bus that was named.
     #[must_use]
     pub fn named(name: &str) -> Self {
-        Self::of(Wanted::named(name))
+        Self::of(Target::named(name))
     }
 
     /// One that nobody has looked at yet.
-    const fn of(wanted: Wanted) -> Self {
-        Self { wanted, cells: None, sums: false, interface: None, heard: Ok(None) }
+    const fn of(target: Target) -> Self {
+        Self { target, cells: None, sums: false, interface: None, heard: Ok(None) }
     }
 }
 

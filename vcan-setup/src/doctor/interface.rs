@@ -10,25 +10,25 @@ use crate::plan::widen;
 impl Facts {
     /// Whether interfaces that are missing can be made.
     pub(super) fn making(&self) -> Vec<Finding> {
-        let missing = |bus: &&Bus| bus.interface.is_none() && bus.wanted.hardware().is_none();
+        let missing = |bus: &&Bus| bus.interface.is_none() && bus.target.hardware().is_none();
         let mut findings = Vec::new();
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
             return findings;
         }
-        let remedies = self.kernel.remedies(self.kernel.vcan);
+        let hints = self.kernel.hints(self.kernel.vcan);
         findings.extend(match self.kernel.vcan {
             Module::There => None,
             Module::Unknown => {
                 let text = "whether the kernel has vcan is not to be seen; should it have none:";
-                Some(Finding::note(text).remedies(remedies))
+                Some(Finding::note(text).hints(hints))
             }
             Module::Loadable => {
                 let text = "the kernel's module vcan is not loaded; making an interface loads it";
-                Some(Finding::note(text).remedy(self.sudo("modprobe vcan")))
+                Some(Finding::note(text).hint(self.sudo("modprobe vcan")))
             }
             Module::Missing => {
                 let text = format!("the kernel ({}) has CAN and no vcan", self.kernel.release);
-                Some(Finding::fault(text).remedies(remedies))
+                Some(Finding::fault(text).hints(hints))
             }
         });
         findings.extend(match self.user {
@@ -40,9 +40,7 @@ impl Facts {
                 Finding::fault(
                     "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
                 )
-                .remedy(
-                    "docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network",
-                ),
+                .hint("docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network"),
             ),
         });
         findings
@@ -58,26 +56,26 @@ impl Facts {
             Some(Interface { name, mtu, .. }) => {
                 Finding::ok(format!("{name} is up and carries {}", carries(*mtu)))
             }
-            None => Finding::fault("no CAN interface is up").remedy(self.own("up vcan0")),
+            None => Finding::fault("no CAN interface is up").hint(self.own("up vcan0")),
         })
     }
 
     pub(super) fn interface(&self, bus: &Bus) -> Vec<Finding> {
-        let name = &bus.wanted.name;
+        let name = &bus.target.name;
         let Some(interface) = &bus.interface else {
-            let (text, up) = (format!("there is no interface {name}"), self.up(&bus.wanted));
-            return vec![if bus.wanted.hardware().is_some() {
+            let (text, up) = (format!("there is no interface {name}"), self.up(&bus.target));
+            return vec![if bus.target.hardware().is_some() {
                 Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")
-                    .remedy("# plug it in and load its driver; `vcan-setup status` shows when it is there")
-                    .remedy(up + "  # once bitrate is taken out of the skin: a vcan")
+                    .hint("# plug it in and load its driver; `vcan-setup status` shows when it is there")
+                    .hint(up + "  # once bitrate is taken out of the skin: a vcan")
             } else {
-                Finding::fault(text).remedy(up)
+                Finding::fault(text).hint(up)
             }];
         };
         let mut findings = match &interface.kind {
             Kind::Other(what) => {
                 let text = format!("{name} is {what}, which carries no CAN");
-                return vec![Finding::fault(text).remedy("# name another bus")];
+                return vec![Finding::fault(text).hint("# name another bus")];
             }
             Kind::Vcan | Kind::Vxcan(_) => self.virtual_faults(bus, interface),
             Kind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
@@ -86,12 +84,12 @@ impl Facts {
             let what = interface.what();
             let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
             findings.insert(0, Finding::ok(text));
-            if interface.is_virtual() && bus.wanted.hardware().is_some() {
+            if interface.is_virtual() && bus.target.hardware().is_some() {
                 let command = if interface.ours { self.own("down") } else { self.sudo("ip link del") };
                 let text =
                     format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
-                let remedy = format!("{command} {name}  # if hardware is to have this name");
-                findings.push(Finding::note(text).remedy(remedy));
+                let hint = format!("{command} {name}  # if hardware is to have this name");
+                findings.push(Finding::note(text).hint(hint));
             }
             findings.extend(self.traffic(bus, name));
         }
@@ -100,17 +98,17 @@ impl Facts {
 
     fn virtual_faults(&self, bus: &Bus, interface: &Interface) -> Vec<Finding> {
         let Interface { name, mtu, ours, up, .. } = interface;
-        let mend = |command: String| {
+        let repair = |command: String| {
             let command = if self.user.admin { command } else { format!("sudo sh -c '{command}'") };
-            if *ours { self.up(&bus.wanted) } else { command }
+            if *ours { self.up(&bus.target) } else { command }
         };
-        if !bus.wanted.carried_by(*mtu) {
+        if !bus.target.carried_by(*mtu) {
             let text = format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}");
-            return vec![Finding::fault(text).remedy(mend(widen("ip", name)))];
+            return vec![Finding::fault(text).hint(repair(widen("ip", name)))];
         }
         if !up {
-            let remedy = mend(format!("ip link set {name} up"));
-            return vec![Finding::fault(format!("{name} is down")).remedy(remedy)];
+            let hint = repair(format!("ip link set {name} up"));
+            return vec![Finding::fault(format!("{name} is down")).hint(hint)];
         }
         Vec::new()
     }
@@ -118,12 +116,12 @@ impl Facts {
     fn hardware_faults(&self, bus: &Bus, interface: &Interface, hardware: &Hardware) -> Vec<Finding> {
         let Interface { name, mtu, up, .. } = interface;
         let what = interface.what();
-        let skin = bus.wanted.skin.as_ref();
+        let skin = bus.target.skin.as_ref();
         // What sets the bit rates, or would if they were known.
-        let set = || match bus.wanted.hardware() {
+        let set = || match bus.target.hardware() {
             Some(skin) => self.own(&format!("up {} --set-bit-rates", skin.file)),
             None => {
-                let rates = match bus.wanted.format {
+                let rates = match bus.target.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
                     Format::Classic => "bitrate 1000000",
                 };
@@ -136,27 +134,27 @@ impl Facts {
         let has = hardware.rates();
         if let Some(skin) = skin.filter(|skin| !has.meet(skin.rates)) {
             let text = format!("{name} is {what} at {has}, and the skin says {}", skin.rates);
-            findings.push(Finding::fault(text).remedy(set()));
-        } else if !bus.wanted.carried_by(*mtu) {
+            findings.push(Finding::fault(text).hint(set()));
+        } else if !bus.target.carried_by(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
             let classic = "format = \"classic\"  # in the skin";
-            findings.push(Finding::fault(text).remedy(set()).remedy(classic));
+            findings.push(Finding::fault(text).hint(set()).hint(classic));
         } else if !up {
-            findings.push(Finding::fault(format!("{name} is {what}, and down")).remedy(set()));
+            findings.push(Finding::fault(format!("{name} is {what}, and down")).hint(set()));
         }
         if bus.sums {
             let text = format!(
                 "{name} is {what}, and the wires between cells that answer with sums are simulated by frames that may \
                  not go there"
             );
-            let remedy = "reply = \"torque\"  # in the skin; or name a vcan or the embedded bus";
-            findings.push(Finding::fault(text).remedy(remedy));
+            let hint = "reply = \"torque\"  # in the skin; or name a vcan or the embedded bus";
+            findings.push(Finding::fault(text).hint(hint));
         }
         if hardware.listen_only {
             let off = "type can listen-only off";
-            let remedy = self.sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
+            let hint = self.sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
             let text = format!("{name} only listens: it can neither send nor acknowledge");
-            findings.push(Finding::fault(text).remedy(remedy));
+            findings.push(Finding::fault(text).hint(hint));
         }
         findings.extend(match hardware.state.filter(|_| *up) {
             Some(State::BusOff) => Some(
@@ -164,14 +162,14 @@ impl Facts {
                     "{name} is BUS-OFF: after too many errors it takes no part any more; wiring, termination or bit \
                      rates are wrong"
                 ))
-                .remedy(self.sudo(&format!("ip link set {name} type can restart"))),
+                .hint(self.sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (State::ErrorPassive | State::ErrorWarning)) => Some(
                 Finding::note(format!(
                     "{name} is {}: it sees errors; is anybody else on the bus, terminated, at the same bit rates?",
                     state.name()
                 ))
-                .remedy(format!("ip -details -statistics link show {name}")),
+                .hint(format!("ip -details -statistics link show {name}")),
             ),
             Some(State::ErrorActive | State::Stopped | State::Sleeping) | None => None,
         });
@@ -182,7 +180,7 @@ impl Facts {
                 }
                 Some(_) => {
                     Finding::note(format!("{name} is at {has}; the skin does not say whether that is right"))
-                        .remedy("bitrate = ...  # under its [[bus]] in the skin")
+                        .hint("bitrate = ...  # under its [[bus]] in the skin")
                 }
                 None => Finding::ok(format!("{name} is at {has}")),
             });

@@ -17,7 +17,7 @@ fn bus(interface: Option<Interface>) -> Bus {
     let name = interface.as_ref().map_or("vcan0", |it| it.name.as_str()).to_owned();
     let skin = Some(SkinBus { file: "skin.toml".into(), rates: Rates::default() });
     Bus {
-        wanted: Wanted { name, format: Format::Fd, skin },
+        target: Target { name, format: Format::Fd, skin },
         cells: Some((1..=100).map(cell).collect()),
         sums: false,
         heard: Ok(interface.as_ref().map(|_| Heard::default())),
@@ -61,10 +61,10 @@ fn no_can(choice: Choice) -> Facts {
 /// All findings as they are printed, but for those that are ok.
 fn complaints(facts: &Facts) -> Vec<String> {
     let bad = |finding: Finding| {
-        let remedies = finding.remedies.iter().map(|remedy| format!(" | {remedy}")).collect::<String>();
-        (finding.level != Level::Ok).then(|| format!("{}: {}{remedies}", finding.level.name(), finding.text))
+        let hints = finding.hints.iter().map(|hint| format!(" | {hint}")).collect::<String>();
+        (finding.level != Level::Ok).then(|| format!("{}: {}{hints}", finding.level.name(), finding.text))
     };
-    judge(facts).into_iter().filter_map(bad).collect()
+    comparator(facts).into_iter().filter_map(bad).collect()
 }
 
 /// What is said when the bus, its interface or the machine is changed.
@@ -72,7 +72,11 @@ fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);
     let said = complaints(&facts);
-    assert_eq!(would_run(&judge(&facts)), !said.iter().any(|line| line.starts_with("fault")), "{said:?}");
+    assert_eq!(
+        would_run(&comparator(&facts)),
+        !said.iter().any(|line| line.starts_with("fault")),
+        "{said:?}"
+    );
     said
 }
 
@@ -81,7 +85,7 @@ fn about_interface(change: impl FnOnce(&mut Interface)) -> Vec<String> {
 }
 
 fn about_hardware(
-    wanted: impl FnOnce(&mut Wanted),
+    target: impl FnOnce(&mut Target),
     change: impl FnOnce(&mut Interface, &mut Hardware),
 ) -> Vec<String> {
     about(|facts| {
@@ -98,10 +102,10 @@ fn about_hardware(
         change(&mut can0, &mut hardware);
         can0.kind = Kind::Hardware(hardware);
         let mut can0 = bus(Some(can0));
-        if let Some(skin) = &mut can0.wanted.skin {
+        if let Some(skin) = &mut can0.target.skin {
             skin.rates = Rates { bitrate: Some(1_000_000), data_bitrate: Some(5_000_000) };
         }
-        wanted(&mut can0.wanted);
+        target(&mut can0.target);
         facts.buses = vec![can0];
     })
 }
@@ -120,7 +124,7 @@ fn cells(nodes: impl IntoIterator<Item = i64>) -> Heard {
 #[test]
 fn a_machine_on_which_all_is_well() {
     assert_eq!(complaints(&good()), Vec::<String>::new());
-    assert!(judge(&good()).len() > 4, "and says what it looked at");
+    assert!(comparator(&good()).len() > 4, "and says what it looked at");
 }
 
 #[test]
@@ -143,7 +147,7 @@ fn no_can_in_the_kernel_matters_by_what_was_chosen() {
     let mut facts = no_can(Choice::Auto);
     facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
     assert!(complaints(&facts).contains(&"fault: /tmp/skinbus-1 has mode 0755".to_owned()));
-    assert!(!would_run(&judge(&facts)));
+    assert!(!would_run(&comparator(&facts)));
 }
 
 #[test]
@@ -151,7 +155,7 @@ fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
     let note = |ours| {
         about(|facts| {
             let bus = &mut facts.buses[0];
-            bus.wanted.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
+            bus.target.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
             bus.interface.as_mut().unwrap().ours = ours;
         })
     };
@@ -195,13 +199,13 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let contained = missing(User { root: true, admin: false }, Module::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
-        facts.buses = vec![Bus { wanted: Wanted::named("vcan9"), cells: None, ..bus(None) }];
+        facts.buses = vec![Bus { target: Target::named("vcan9"), cells: None, ..bus(None) }];
         facts.user = admin;
     });
     assert_eq!(named, ["fault: there is no interface vcan9 | vcan-setup up vcan9"]);
     let hardware = about(|facts| {
         facts.buses = vec![bus(None)];
-        facts.buses[0].wanted.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
+        facts.buses[0].target.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
         facts.user = admin;
     });
     assert!(hardware[0].starts_with(
@@ -210,7 +214,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
 }
 
 #[test]
-fn an_interface_that_does_not_fit_is_mended_by_who_made_it() {
+fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
     let narrow = "fault: vcan0 has MTU 16 and CAN FD needs 72";
     assert_eq!(about_interface(|it| it.mtu = 16), [format!("{narrow} | sudo vcan-setup up skin.toml")]);
     assert_eq!(
@@ -227,7 +231,7 @@ fn an_interface_that_does_not_fit_is_mended_by_who_made_it() {
         ["fault: vcan0 is a network interface (ether), which carries no CAN | # name another bus"]
     );
     let classic = about(|facts| {
-        facts.buses[0].wanted.format = Format::Classic;
+        facts.buses[0].target.format = Format::Classic;
         facts.buses[0].interface.as_mut().unwrap().mtu = CLASSIC_MTU;
     });
     assert_eq!(classic, Vec::<String>::new());
@@ -235,7 +239,7 @@ fn an_interface_that_does_not_fit_is_mended_by_who_made_it() {
 
 #[test]
 fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
-    let same = |_: &mut Wanted| ();
+    let same = |_: &mut Target| ();
     let fine = |_: &mut Interface, _: &mut Hardware| ();
     assert_eq!(about_hardware(same, fine), Vec::<String>::new());
     let set = "sudo vcan-setup up skin.toml --set-bit-rates";
@@ -250,8 +254,8 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
         about_hardware(same, |can0, _| can0.up = false),
         [format!("fault: can0 is CAN hardware (kvaser_pci), and down | {set}")]
     );
-    let open = |wanted: &mut Wanted| {
-        let skin = wanted.skin.as_mut().unwrap();
+    let open = |target: &mut Target| {
+        let skin = target.skin.as_mut().unwrap();
         skin.rates = Rates::default();
     };
     let unsaid = about_hardware(open, fine);
@@ -296,8 +300,11 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
         complaints(&facts).split_off(1)
     };
     assert_eq!(embedded(None), Vec::<String>::new(), "the gateway will serve it");
-    let rival = Some(Heard { gateway: true, ..Heard::default() });
-    assert!(embedded(rival)[0].starts_with("fault: another gateway sends joints on the embedded bus vcan0"));
+    let other_gateway = Some(Heard { gateway: true, ..Heard::default() });
+    assert!(
+        embedded(other_gateway)[0]
+            .starts_with("fault: another gateway sends joints on the embedded bus vcan0")
+    );
 }
 
 #[test]
@@ -309,13 +316,13 @@ fn a_bus_that_does_not_open_says_why() {
 #[test]
 fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
     let granted = |bytes| about(|facts| facts.receive_buffer = Some(bytes));
-    let remedy = "sudo sysctl -w net.core.rmem_max=409600";
+    let hint = "sudo sysctl -w net.core.rmem_max=409600";
     assert_eq!(granted(400 << 10), Vec::<String>::new());
     assert_eq!(
         granted((400 << 10) - 1),
         [format!(
             "note: receive buffers are limited to 399 KiB; to hold all answers, 100 frames, 4 times over takes 400 \
-             KiB, and a gateway that is held up loses some | {remedy}"
+             KiB, and a gateway that is held up loses some | {hint}"
         )]
     );
     assert!(granted(100 << 10)[0].starts_with("note"));
@@ -323,12 +330,12 @@ fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
         granted((100 << 10) - 1),
         [format!(
             "fault: receive buffers are limited to 99 KiB and do not hold all answers, 100 frames, even once; 400 \
-             KiB are right | {remedy}"
+             KiB are right | {hint}"
         )]
     );
     let classic = about(|facts| {
         facts.receive_buffer = Some(400 << 10);
-        facts.buses[0].wanted.format = Format::Classic;
+        facts.buses[0].target.format = Format::Classic;
     });
     assert!(
         classic[0].contains("to hold all answers, 200 frames, 4 times over takes 800 KiB"),

@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn a_total_is_told_once() {
+    fn a_total_is_reported_once() {
         let mut queue = Queue::new(0);
         queue.tell();
         assert!(queue.is_empty());

@@ -246,11 +246,11 @@ mod tests {
             let masks = filters.iter().filter(errors).map(|filter| filter.mask).chain([error_mask]);
             return masks.into_iter().any(|mask| id & mask & EXTENDED_MASK != 0);
         }
-        filters.iter().filter(|filter| !errors(filter)).any(|&Filter { id: wanted, mut mask }| {
-            if mask & EXTENDED != 0 && wanted & EXTENDED == 0 {
+        filters.iter().filter(|filter| !errors(filter)).any(|&Filter { id: target, mut mask }| {
+            if mask & EXTENDED != 0 && target & EXTENDED == 0 {
                 mask &= STANDARD_MASK | EXTENDED | REMOTE;
             }
-            (id & mask == wanted & mask) != (wanted & Filter::INVERTED != 0)
+            (id & mask == target & mask) != (target & Filter::INVERTED != 0)
         })
     }
 

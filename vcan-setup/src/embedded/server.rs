@@ -231,10 +231,10 @@ impl Server {
             self.post.totals.refused += 1;
             return self.forget(id);
         };
-        let wanted = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
-        if sockopt::set_socket_send_buffer_size_force(&client.socket, wanted).is_err() {
+        let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
+        if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
             // What was granted is reported, whatever it is.
-            let _ = sockopt::set_socket_send_buffer_size(&client.socket, wanted);
+            let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
         }
         let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
         client.greeted = true;

@@ -45,7 +45,7 @@ pub enum Refusal {
     )]
     Down(String),
     /// A pair is wanted where there is something else.
-    #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {remedy}")]
+    #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {hint}")]
     OtherPair {
         /// Its name.
         name: String,
@@ -54,7 +54,7 @@ pub enum Refusal {
         /// The other end that was wanted.
         peer: String,
         /// What to do.
-        remedy: String,
+        hint: String,
     },
     /// A pair that is there, and whose other end does not work.
     #[error(
@@ -146,14 +146,14 @@ pub enum Refusal {
         file: String,
     },
     /// Interfaces that were to be removed and are somebody else's.
-    #[error("{name} is {what} that vcan-setup has not made, and is left alone{remedy}")]
+    #[error("{name} is {what} that vcan-setup has not made, and is left alone{hint}")]
     NotOurs {
         /// Its name.
         name: String,
         /// What it is.
         what: String,
         /// What to do.
-        remedy: String,
+        hint: String,
     },
 }
 

@@ -25,33 +25,33 @@ fn can0(hardware: Hardware, up: bool) -> Interface {
     Interface { up, mtu, ..interface("can0", 4, Kind::Hardware(hardware)) }
 }
 
-fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> Wanted {
+fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> Target {
     let rates = Rates { bitrate, data_bitrate };
     let skin = Some(SkinBus { file: "skin.toml".to_owned(), rates });
-    Wanted { name: name.to_owned(), format, skin }
+    Target { name: name.to_owned(), format, skin }
 }
 
-fn refused(wanted: &Wanted, present: &[Interface]) -> String {
-    up(std::slice::from_ref(wanted), present, false).unwrap_err().to_string()
+fn refused(target: &Target, present: &[Interface]) -> String {
+    up(std::slice::from_ref(target), present, false).unwrap_err().to_string()
 }
 
 #[test]
 fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
-    let wanted = ["vcan0", "vcan1"].map(Wanted::named);
+    let target = ["vcan0", "vcan1"].map(Target::named);
     let world = World::of(vec![interface("vcan0", 2, Kind::Vcan)]);
-    let plan = up(&wanted, &world.here, false).unwrap();
+    let plan = up(&target, &world.here, false).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: Action::MakeVcan }]);
-    assert_eq!(plan.left, ["vcan0 is there already, and fits (a vcan, made by somebody else)"]);
-    let again = up(&wanted, &world.carry_out_all(&plan).here, false).unwrap();
+    assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by somebody else)"]);
+    let again = up(&target, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
 }
 
 #[test]
-fn what_is_ours_is_mended() {
+fn what_is_ours_is_repaired() {
     let narrow = Interface { mtu: CLASSIC_MTU, ..ours("vcan0", 2) };
     let down = Interface { up: false, ..ours("vcan1", 3) };
-    let wanted = ["vcan0", "vcan1"].map(Wanted::named);
-    let plan = up(&wanted, &[narrow.clone(), down], false).unwrap();
+    let target = ["vcan0", "vcan1"].map(Target::named);
+    let plan = up(&target, &[narrow.clone(), down], false).unwrap();
     let said: Vec<_> = plan.steps.iter().map(ToString::to_string).collect();
     let expected = ["take vcan0 down, give it MTU 72 instead of 16, and bring it up", "bring vcan1 up"];
     assert_eq!(said, expected);
@@ -67,28 +67,28 @@ fn a_real_bus_is_never_touched_because_it_was_named() {
         interface("eth0", 2, Kind::Other("a network interface (ether)".into())),
     ];
     assert_eq!(
-        refused(&Wanted::named("can0"), &present),
+        refused(&Target::named("can0"), &present),
         "can0 is real, CAN hardware (kvaser_pci), and is left alone: to check its bit rates put it into a \
          skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status can0`"
     );
     assert_eq!(
-        refused(&Wanted::named("eth0"), &present),
+        refused(&Target::named("eth0"), &present),
         "eth0 is real, a network interface (ether), and is left alone: choose another name, as `vcan-setup \
          up vcan0` does"
     );
-    assert!(up(&[Wanted::named("can0")], &present, true).is_err(), "whatever else was asked for");
+    assert!(up(&[Target::named("can0")], &present, true).is_err(), "whatever else was asked for");
 }
 
 #[test]
-fn what_somebody_else_made_is_left_alone_and_the_remedy_is_told() {
+fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
     let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, Kind::Vcan) };
     assert_eq!(
-        refused(&Wanted::named("vcan0"), &[foreign(16, true)]),
+        refused(&Target::named("vcan0"), &[foreign(16, true)]),
         "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `sudo sh -c \
          'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` mends it"
     );
     assert_eq!(
-        refused(&Wanted::named("vcan0"), &[foreign(72, false)]),
+        refused(&Target::named("vcan0"), &[foreign(72, false)]),
         "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` mends it"
     );
 }
@@ -96,29 +96,29 @@ fn what_somebody_else_made_is_left_alone_and_the_remedy_is_told() {
 #[test]
 fn one_bus_that_cannot_be_had_keeps_the_others_from_being_made() {
     let present = [interface("lo", 1, Kind::Other("the loopback interface".into()))];
-    let wanted = ["vcan0", "lo", "vcan1"].map(Wanted::named);
-    assert!(matches!(up(&wanted, &present, false), Err(Refusal::NotCan { .. })));
+    let target = ["vcan0", "lo", "vcan1"].map(Target::named);
+    assert!(matches!(up(&target, &present, false), Err(Refusal::NotCan { .. })));
 }
 
 #[test]
 fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
-    let wanted = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
+    let target = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
     let right = can0(kvaser(Some(1_000_000), Some(5_000_000)), true);
-    let plan = up(std::slice::from_ref(&wanted), std::slice::from_ref(&right), false).unwrap();
+    let plan = up(std::slice::from_ref(&target), std::slice::from_ref(&right), false).unwrap();
     assert_eq!(plan.steps, []);
     let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin says, and is \
                 left as it is";
-    assert_eq!(plan.left, [line]);
-    assert_eq!(up(std::slice::from_ref(&wanted), &[right], true).unwrap().steps, [], "nor set again");
+    assert_eq!(plan.unchanged, [line]);
+    assert_eq!(up(std::slice::from_ref(&target), &[right], true).unwrap().steps, [], "nor set again");
 
     let other = [can0(kvaser(Some(500_000), None), true)];
     assert_eq!(
-        refused(&wanted, &other),
+        refused(&target, &other),
         "can0 is at 500 kbit/s and skin.toml says 1000 kbit/s, data 5000 kbit/s: `sudo vcan-setup up skin.toml \
          --set-bit-rates` sets them, or change skin.toml"
     );
     let unset = [can0(kvaser(None, None), false)];
-    assert!(refused(&wanted, &unset).starts_with("can0 is at no bit rate and skin.toml says 1000 kbit/s"));
+    assert!(refused(&target, &unset).starts_with("can0 is at no bit rate and skin.toml says 1000 kbit/s"));
     let open = in_skin("can0", Format::Fd, None, None);
     assert_eq!(
         refused(&open, &other),
@@ -127,12 +127,12 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     );
     let classic = Hardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
     assert!(
-        refused(&wanted, &[can0(classic, true)]).starts_with("can0 is at 1000 kbit/s and skin.toml says"),
+        refused(&target, &[can0(classic, true)]).starts_with("can0 is at 1000 kbit/s and skin.toml says"),
         "a rate for data that is not in use is none"
     );
     let down = [can0(kvaser(Some(1_000_000), Some(5_000_000)), false)];
     assert_eq!(
-        refused(&wanted, &down),
+        refused(&target, &down),
         "can0 is CAN hardware (kvaser_pci), and down: `sudo vcan-setup up skin.toml --set-bit-rates` sets its \
          bit rates and brings it up"
     );
@@ -140,9 +140,9 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
 
 #[test]
 fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
-    let wanted = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
+    let target = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
     let present = [can0(kvaser(Some(500_000), None), true)];
-    let plan = up(&[wanted], &present, true).unwrap();
+    let plan = up(&[target], &present, true).unwrap();
     let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
     assert_eq!(
         step.to_string(),
@@ -153,7 +153,7 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
         "ip link set can0 down && ip link set can0 type can bitrate 1000000 dbitrate 5000000 fd on && ip link \
          set can0 up"
     );
-    let set = |wanted| up(&[wanted], &present, true).unwrap_err().to_string();
+    let set = |target| up(&[target], &present, true).unwrap_err().to_string();
     assert_eq!(
         set(in_skin("can0", Format::Fd, None, None)),
         "skin.toml has no bitrate for can0: put `bitrate = 1000000` under its [[bus]], then try again"
@@ -166,9 +166,9 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
 
 #[test]
 fn who_goes_from_can_fd_to_classic_switches_it_off() {
-    let wanted = in_skin("can0", Format::Classic, Some(500_000), None);
+    let target = in_skin("can0", Format::Classic, Some(500_000), None);
     let fd = Hardware { fd: true, ..kvaser(Some(1_000_000), Some(5_000_000)) };
-    let plan = up(&[wanted], &[can0(fd, false)], true).unwrap();
+    let plan = up(&[target], &[can0(fd, false)], true).unwrap();
     assert_eq!(
         plan.steps[0].command(),
         "ip link set can0 type can bitrate 500000 fd off && ip link set can0 up"
@@ -193,14 +193,14 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
     let both = [skin(Some(500_000)), skin(None), skin(Some(500_000))];
     let plan = up(&both, &present, false).unwrap();
     assert_eq!(plan.steps, []);
-    assert_eq!(plan.left.len(), 2, "each line once: {:?}", plan.left);
+    assert_eq!(plan.unchanged.len(), 2, "each line once: {:?}", plan.unchanged);
 }
 
 #[test]
 fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
-    let met = |has, wanted| {
+    let met = |has, target| {
         let rates = |bitrate| Rates { bitrate, data_bitrate: None };
-        rates(has).meet(rates(wanted))
+        rates(has).meet(rates(target))
     };
     assert!(met(Some(10_000), Some(10_001)) && met(Some(83_333), Some(83_000)));
     assert!(met(Some(995_000), Some(1_000_000)) && !met(Some(994_999), Some(1_000_000)));
@@ -210,9 +210,9 @@ fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
 
 #[test]
 fn a_bus_with_a_bit_rate_is_never_made_of_software() {
-    let wanted = in_skin("can0", Format::Classic, Some(500_000), None);
+    let target = in_skin("can0", Format::Classic, Some(500_000), None);
     assert_eq!(
-        refused(&wanted, &[]),
+        refused(&target, &[]),
         "there is no interface can0, and skin.toml gives it a bitrate, so it is hardware: plug it in and load \
          its driver, or leave out bitrate and it will be a vcan"
     );
@@ -224,8 +224,8 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     let named =
         |there: &World, id| There { name: Namespace::Name("blue".into()), id, present: there.there.clone() };
     let there = named(&world, None);
-    let wanted = WantedPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
-    let plan = up_pair(&wanted, &world.here).unwrap();
+    let target = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
+    let plan = up_pair(&target, &world.here).unwrap();
     let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
     assert_eq!(
         step.command(),
@@ -234,18 +234,18 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     );
     world = world.carry_out_all(&plan);
     let there = named(&world, Some(THERE));
-    let again = WantedPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
+    let again = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
     assert_eq!(up_pair(&again, &world.here).unwrap().steps, []);
 
     let elsewhere = named(&world, Some(THERE + 1));
-    let other = WantedPair { there: Some(&elsewhere), ..again };
+    let other = TargetPair { there: Some(&elsewhere), ..again };
     let error = up_pair(&other, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
         "vcan1 is there already and is a vxcan, not one end of a pair with vcan1: `sudo vcan-setup down vcan1` \
          removes it, or choose another name"
     );
-    let error = up_pair(&WantedPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
+    let error = up_pair(&TargetPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
         "vcan1 is there already and is a vxcan in blue, not one end of a pair with vcan5: `sudo ip -n blue link \
@@ -253,13 +253,13 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     );
     world.there[0].up = false;
     let there = named(&world, Some(THERE));
-    let error = up_pair(&WantedPair { there: Some(&there), ..again }, &world.here).unwrap_err();
+    let error = up_pair(&TargetPair { there: Some(&there), ..again }, &world.here).unwrap_err();
     assert_eq!(
         error.to_string(),
         "the other end of vcan1, vcan1 in blue, is down, and vcan-setup changes nothing there: `sudo ip -n blue \
          link set vcan1 up` mends it"
     );
-    let same = WantedPair { name: "vcan3", peer: "vcan3", there: None };
+    let same = TargetPair { name: "vcan3", peer: "vcan3", there: None };
     assert!(matches!(up_pair(&same, &world.here), Err(Refusal::OneName { .. })));
 }
 
@@ -271,14 +271,14 @@ fn only_what_is_ours_is_removed() {
     let plan = down(&skin, &present).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan0".into(), action: Action::Remove { index: 2 } }]);
     assert_eq!(
-        plan.left,
+        plan.unchanged,
         [
             "vcan1 is a vcan that vcan-setup has not made, and is left alone",
             "can0 is CAN hardware (kvaser_pci) that vcan-setup has not made, and is left alone",
             "vcan9 is not there",
         ]
     );
-    let named = |name| down(&[Wanted::named(name)], &present);
+    let named = |name| down(&[Target::named(name)], &present);
     assert_eq!(
         named("vcan1").unwrap_err().to_string(),
         "vcan1 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
@@ -299,7 +299,7 @@ fn the_mark_on_something_real_is_not_believed() {
     ];
     present.iter_mut().for_each(|it| it.ours = true);
     for name in ["can0", "eth0"] {
-        assert!(up(&[Wanted::named(name)], &present, true).is_err(), "{name}");
-        assert!(down(&[Wanted::named(name)], &present).is_err(), "{name}");
+        assert!(up(&[Target::named(name)], &present, true).is_err(), "{name}");
+        assert!(down(&[Target::named(name)], &present).is_err(), "{name}");
     }
 }

@@ -201,7 +201,7 @@ fn filters_change_in_order_with_the_frames() {
 }
 
 #[test]
-fn filters_that_never_end_are_garbage_and_those_in_force_stay() {
+fn filters_that_never_end_are_garbage_and_those_latched_stay() {
     let bench = Bench::new();
     let client = bench.open(&[exact(1), exact(LAST)]);
     let part = |first, last| FilterPart { first, last, filters: vec![Filter::ALL; 8] }.encode();

@@ -152,7 +152,7 @@ fn eventful() -> Cell {
 }
 
 #[test]
-fn off_says_nothing_whatever_is_felt() {
+fn off_says_nothing_whatever_is_sensed() {
     let mut cell = Cell::new(Mode::Off);
     assert!(!cell.says(2_000) && !cell.says(0));
     for _ in 0..8 {
@@ -283,7 +283,7 @@ fn a_hang_skips_what_was_missed_and_keeps_the_phase() {
 }
 
 #[test]
-fn what_is_felt_during_a_hang_is_told_with_the_next_joints() {
+fn what_is_sensed_during_a_hang_is_told_with_the_next_joints() {
     let mut cell = eventful();
     let to = Address::Everyone;
     for bits in [500, 700, 900] {
@@ -312,7 +312,7 @@ fn a_long_period_comes_with_the_answer_before_it_and_a_short_one_keeps_its_own_t
 }
 
 #[test]
-fn switching_begins_anew_and_the_same_again_changes_nothing() {
+fn switching_starts_again_and_the_same_again_changes_nothing() {
     let mut cell = eventful();
     assert!(cell.says(500));
     assert_eq!(cell.switches(Mode::Event), [], "no other mode");
@@ -366,7 +366,7 @@ fn other_thresholds_hold_at_once() {
 }
 
 #[test]
-fn who_leaves_test_mode_has_let_go() {
+fn who_leaves_test_mode_has_released() {
     let mut cell = eventful();
     assert!(cell.says(500));
     assert_eq!(cell.write(Parameter::Mode, [0; WORDS]), [pressed(0)]);

@@ -15,7 +15,7 @@ const FD_TAIL: u32 = 12;
 
 /// A bit-error rate that is none, or too high for a frame to come through.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-#[error("bit-error rate {got}: 0 to {} are possible", BitErrors::GREATEST)]
+#[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX)]
 pub struct BitErrorsError {
     /// What was asked for.
     pub got: f64,
@@ -33,14 +33,14 @@ pub struct BitErrors {
 
 impl BitErrors {
     /// The greatest rate: a frame of 200 bits then comes through in one of seven attempts.
-    pub const GREATEST: f64 = 0.01;
+    pub const MAX: f64 = 0.01;
 
-    /// Errors by their rate, in [0, [`BitErrors::GREATEST`]].
+    /// Errors by their rate, in [0, [`BitErrors::MAX`]].
     ///
     /// # Errors
     /// When the rate is outside.
     pub fn new(rate: f64, seed: u64) -> Result<Self, BitErrorsError> {
-        if !(0.0..=Self::GREATEST).contains(&rate) {
+        if !(0.0..=Self::MAX).contains(&rate) {
             return Err(BitErrorsError { got: rate });
         }
         let mut errors = Self { dice: Pcg64Mcg::seed_from_u64(seed), sound: (-rate).ln_1p(), good: 0 };

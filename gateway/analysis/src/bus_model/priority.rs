@@ -74,10 +74,10 @@ mod tests {
     #[test]
     fn eleven_bits_win_over_twenty_nine_that_begin_alike() {
         let short = Frame::classic(0x123, &[]).unwrap();
-        let asked = Frame::remote(0x123, 0).unwrap();
+        let requested = Frame::remote(0x123, 0).unwrap();
         let long = Frame::classic(EXTENDED | 0x123 << 18, &[]).unwrap();
         let below = Frame::classic(EXTENDED | 0x122 << 18 | 0x3_FFFF, &[]).unwrap();
-        let order = [below, short, asked, long].map(|frame| Priority::of(&frame));
+        let order = [below, short, requested, long].map(|frame| Priority::of(&frame));
         assert!(order.is_sorted() && order[0] < order[1] && order[2] < order[3]);
     }
 }

@@ -39,7 +39,7 @@ fn a_frame_is_not_interrupted_and_then_the_lowest_identifier_goes() {
 }
 
 #[test]
-fn all_that_is_asked_for_at_one_instant_takes_part() {
+fn all_that_is_requested_for_at_one_instant_takes_part() {
     let idle = [request(5_000, 3, 50, 1), request(5_000, 1, 50, 2), request(5_000, 2, 50, 3)];
     assert_eq!(times(&all(BusModel::new(rates()), &idle)), [(2, 5, 55), (3, 55, 105), (1, 105, 155)]);
     // The instant at which the bus is free again.

@@ -69,7 +69,7 @@ fn numbers(layouts: &'static [Layout]) -> Vec<(i64, &'static str)> {
 
 /// Some bits as they are, unsigned.
 fn bits(name: String, start: usize, bits: u8) -> Signal {
-    let greatest = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
+    let max = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
     Signal {
         name,
         page: Page::Every,
@@ -77,7 +77,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
         bits,
         signed: false,
         factor: 1.0,
-        range: [0.0, greatest],
+        range: [0.0, max],
         unit: "",
         names: Vec::new(),
     }
@@ -122,11 +122,11 @@ fn one(field: &'static Field, name: String) -> Signal {
     let is_angle = matches!(field.format, Format::Angle | Format::Position);
     let factor = if is_angle { FRAC_PI_2 } else { 1.0 } / f64::from(1_u32 << field.fraction());
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
-    let [least, greatest] = if field.is_signed() { signed } else { unscaled.range };
+    let [min, max] = if field.is_signed() { signed } else { unscaled.range };
     let range = match field.range {
-        Range::All => [least, greatest],
-        Range::NotNegative | Range::NotNegativeAtCommit => [0.0, greatest],
-        Range::Within(least, greatest) => [least, greatest].map(f64::from),
+        Range::All => [min, max],
+        Range::NotNegative | Range::NotNegativeAtCommit => [0.0, max],
+        Range::Within(min, max) => [min, max].map(f64::from),
     };
     let named = |(value, name): &'static (i16, String)| (i64::from(*value), name.as_str());
     let names = if let Format::Parameter(_) = field.format {

@@ -10,12 +10,12 @@ use protocol::packet::{BYTES, Epoch, Packet, WORDS};
 mod said;
 
 use super::*;
-use model::generate::{self, Wanted};
+use model::generate::{self, Target};
 
 /// A skin with cells 1 to 254 on its one bus.
 fn full() -> Skin {
-    let wanted = Wanted { cells: 254, ..Wanted::default() };
-    Skin::parse("full.toml", &generate::generate(&wanted).unwrap()).unwrap()
+    let target = Target { cells: 254, ..Target::default() };
+    Skin::parse("full.toml", &generate::generate(&target).unwrap()).unwrap()
 }
 
 fn parsed(skin: &Skin, bus: usize) -> Dbc {
@@ -260,8 +260,8 @@ fn what_the_file_and_its_nodes_are_stands_in_comments() {
 
 #[test]
 fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
-    let wanted = Wanted { cells: 20, buses: 2, ..Wanted::default() };
-    let skin = Skin::parse("two.toml", &generate::generate(&wanted).unwrap()).unwrap();
+    let target = Target { cells: 20, buses: 2, ..Target::default() };
+    let skin = Skin::parse("two.toml", &generate::generate(&target).unwrap()).unwrap();
     for bus in 0..2 {
         let cells: BTreeSet<_> = skin.cells_of(bus).map(|cell| format!("cell_{}", cell.node)).collect();
         let nodes: BTreeSet<_> = parsed(&skin, bus).nodes.into_iter().skip(1).map(|node| node.0).collect();

@@ -87,8 +87,7 @@ fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Resul
     parties(out, *from, everyone)?;
     writeln!(out)?;
     for signal in &message.signals {
-        let Signal { name, page, start, bits, signed, factor, range: [least, greatest], unit, names: _ } =
-            signal;
+        let Signal { name, page, start, bits, signed, factor, range: [min, max], unit, names: _ } = signal;
         write!(out, " SG_ {name} ")?;
         match page {
             Page::Every => {}
@@ -97,7 +96,7 @@ fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Resul
         }
         let sign = if *signed { '-' } else { '+' };
         // After the @ stands 1: least significant byte first.
-        write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{least}|{greatest}] \"{unit}\" ")?;
+        write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{min}|{max}] \"{unit}\" ")?;
         parties(out, message.to, everyone)?;
         writeln!(out)?;
     }

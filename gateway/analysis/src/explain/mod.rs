@@ -15,7 +15,7 @@ mod read;
 mod watch;
 
 pub use read::{Found, find};
-pub use watch::{Asked, CellMoment, Moment, NotFound, Origin, Watch};
+pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch};
 
 use protocol::fixed::{Q, Q3_12};
 use protocol::message::{SkinSensors, State};
@@ -209,7 +209,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
             let force = known.map(|(sensors, origin)| force(cell, &sensors, origin));
             let active = force.is_some_and(|force| force.force_steps > 0);
             if said.answer.is_none() && force.is_none() {
-                silent += u32::from(said.felt.is_none());
+                silent += u32::from(said.contact_state.is_none());
             }
             if said.answer.is_none() && !active {
                 continue;
@@ -322,25 +322,25 @@ fn known(
     missing: &mut Vec<String>,
 ) -> Option<(SkinSensors, Origin)> {
     let node = cell.node;
-    let wanted = skin.parameters(cell).hash();
+    let target = skin.parameters(cell).hash();
     let answered = said.answer.is_some();
-    let touched = said.felt.is_some_and(|(sensors, _)| sensors != SkinSensors::default());
+    let touched = said.contact_state.is_some_and(|(sensors, _)| sensors != SkinSensors::default());
     match said.hash {
-        Some(hash) if hash != wanted => {
+        Some(hash) if hash != target => {
             if answered || touched {
                 missing.push(format!(
-                    "{bus} {node}: it computes with configuration {hash:04X}, the skin says {wanted:04X}: its force \
+                    "{bus} {node}: it computes with configuration {hash:04X}, the skin says {target:04X}: its force \
                      and its torque cannot be computed from this skin"
                 ));
             }
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it said nothing of its configuration; taken to be the skin's, {wanted:04X}"
+            "{bus} {node}: it said nothing of its configuration; taken to be the skin's, {target:04X}"
         )),
         Some(_) | None => {}
     }
-    if answered && said.felt.is_none() {
+    if answered && said.contact_state.is_none() {
         let why = match said.test_mode {
             Some(false) => "it measures, and said no sensors page of this epoch",
             Some(true) | None => "no stimulus, start or sensors page of it came before",
@@ -350,7 +350,7 @@ fn known(
     if said.repeated > 0 {
         missing.push(format!("{bus} {node}: {} further torques of this epoch are not used", said.repeated));
     }
-    said.felt
+    said.contact_state
 }
 
 impl Force {
@@ -414,7 +414,7 @@ fn row(
         nearest.zip(word).map(|(nearest, word)| i32::from(word.to_bits()) - i32::from(nearest.to_bits()));
     let verdict = match (force, jacobian_m, nearest, word) {
         (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
-            judge(force.force_steps, jacobian, moves, nearest, word)
+            comparator(force.force_steps, jacobian, moves, nearest, word)
         }
         (_, _, _, _) => Verdict::Open,
     };
@@ -436,7 +436,7 @@ fn row(
     clippy::cast_precision_loss,
     reason = "J is within +-2 m: 2^15 steps"
 )]
-fn judge(force_steps: i64, jacobian_m: f64, moves: bool, nearest: Q3_12, word: Q3_12) -> Verdict {
+fn comparator(force_steps: i64, jacobian_m: f64, moves: bool, nearest: Q3_12, word: Q3_12) -> Verdict {
     if word == nearest {
         return if word.is_saturated() { Verdict::Saturated } else { Verdict::Nearest };
     }

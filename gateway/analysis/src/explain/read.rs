@@ -5,7 +5,7 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 
-use super::watch::{Asked, Moment, NotFound, Watch};
+use super::watch::{Moment, NotFound, Requested, Watch};
 
 /// What a capture tells up to some joints.
 #[derive(Debug)]
@@ -24,10 +24,10 @@ pub struct Found {
 ///
 /// # Errors
 /// When it cannot be read, or is damaged.
-pub fn find(reader: &mut Reader, skin: &Skin, asked: Asked) -> Result<Found, CaptureError> {
-    let mut watch = Watch::new(skin, asked);
+pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Found, CaptureError> {
+    let mut watch = Watch::new(skin, requested);
     let mut decoder = Decoder::new(None);
-    for before in &reader.extras().in_force {
+    for before in &reader.extras().latched {
         let at = Micros(before.nanos / 1_000);
         if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
             watch.begin(before.nanos, &before.bus, &message);

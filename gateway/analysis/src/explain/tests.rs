@@ -50,8 +50,8 @@ fn heartbeat(configuration: u16) -> Message {
 }
 
 /// What these messages, a millisecond apart, explain.
-fn explained(skin: &Skin, messages: &[Message], asked: Asked) -> Result<Explanation, NotFound> {
-    let mut watch = Watch::new(skin, asked);
+fn explained(skin: &Skin, messages: &[Message], requested: Requested) -> Result<Explanation, NotFound> {
+    let mut watch = Watch::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
         if watch.take(at * 1_000_000, "vcan0", Some(message)) {
             break;
@@ -60,8 +60,8 @@ fn explained(skin: &Skin, messages: &[Message], asked: Asked) -> Result<Explanat
     watch.moments().map(|moments| explain(skin, &moments))
 }
 
-fn first(epoch: u8) -> Asked {
-    Asked { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 }
+fn first(epoch: u8) -> Requested {
+    Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 }
 }
 
 #[test]
@@ -175,13 +175,13 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
 fn joints_are_found_by_epoch_time_and_occurrence() {
     let skin = skin();
     let said: Vec<_> = (0..=255).chain(0..=20).map(joints).collect();
-    let at = |asked: Asked| {
-        explained(&skin, &said, asked).map(|explanation| explanation.buses[0].at_ns / 1_000_000)
+    let at = |requested: Requested| {
+        explained(&skin, &said, requested).map(|explanation| explanation.buses[0].at_ns / 1_000_000)
     };
     assert_eq!(at(first(7)), Ok(8));
-    assert_eq!(at(Asked { occurrence: 2, ..first(7) }), Ok(264));
-    assert_eq!(at(Asked { from_ns: 100_000_000, ..first(7) }), Ok(264));
-    let error = at(Asked { occurrence: 2, ..first(21) }).unwrap_err().to_string();
+    assert_eq!(at(Requested { occurrence: 2, ..first(7) }), Ok(264));
+    assert_eq!(at(Requested { from_ns: 100_000_000, ..first(7) }), Ok(264));
+    let error = at(Requested { occurrence: 2, ..first(21) }).unwrap_err().to_string();
     let expected = "there are no joints of epoch 21 for the 2. time; there are 277 joints in a row, from epoch 0 at \
                     0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
@@ -203,7 +203,7 @@ fn what_is_not_there_is_named_with_what_is() {
     assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
     // Memory is bounded whatever comes.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
-    let error = explained(&skin, &said, Asked { occurrence: 9, ..first(5) }).unwrap_err().to_string();
+    let error = explained(&skin, &said, Requested { occurrence: 9, ..first(5) }).unwrap_err().to_string();
     assert!(error.ends_with("; 192 further rows"), "{error}");
 }
 
@@ -211,7 +211,7 @@ fn what_is_not_there_is_named_with_what_is() {
 fn joints_that_a_cell_drops_are_none() {
     let skin = skin();
     let again = [joints(7), joints(7), joints(8), joints(7)];
-    let explanation = explained(&skin, &again, Asked { occurrence: 2, ..first(7) }).unwrap();
+    let explanation = explained(&skin, &again, Requested { occurrence: 2, ..first(7) }).unwrap();
     assert_eq!(explanation.buses[0].at_ns, 4_000_000, "the second of them was repeated");
 }
 

@@ -13,7 +13,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 /// Joints after them, within which late torques and the configurations of cells are waited for.
-const PATIENCE: u32 = 32;
+const TIMEOUT: u32 = 32;
 /// Runs of epochs that an error names.
 const RUNS: usize = 8;
 
@@ -49,7 +49,7 @@ pub enum Origin {
 
 /// Which joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Asked {
+pub struct Requested {
     /// Their epoch.
     pub epoch: Epoch,
     /// Only from so many ns after the first frame on.
@@ -77,10 +77,10 @@ pub enum NotFound {
         buses: String,
     },
     /// The epoch is not there, or not so often, or not so late.
-    #[error("there are no joints {asked}; there are {runs}")]
+    #[error("there are no joints {requested}; there are {runs}")]
     Epoch {
         /// What was asked for.
-        asked: String,
+        requested: String,
         /// Epochs that are there, in their order, and from when to when.
         runs: String,
     },
@@ -103,7 +103,7 @@ pub struct Moment {
 #[derive(Clone, Debug, Default)]
 pub struct CellMoment {
     /// What it felt and how that is known.
-    pub felt: Option<(SkinSensors, Origin)>,
+    pub contact_state: Option<(SkinSensors, Origin)>,
     /// Whether it obeys stimuli; `None` when it has not said.
     pub test_mode: Option<bool>,
     /// How it was, by its last heartbeat.
@@ -122,16 +122,16 @@ pub struct CellMoment {
 #[derive(Debug)]
 pub struct Watch<'a> {
     skin: &'a Skin,
-    asked: Asked,
+    requested: Requested,
     first: Option<u64>,
     /// By the skin's bus.
-    lanes: Vec<Lane>,
+    bus_watches: Vec<LinkId>,
     /// Buses that are not the skin's.
     others: Vec<String>,
 }
 
 #[derive(Debug, Default)]
-struct Lane {
+struct LinkId {
     /// Whether the capture has it.
     there: bool,
     /// Whether the skin has cells on it.
@@ -167,22 +167,22 @@ struct Run {
 impl<'a> Watch<'a> {
     /// Begins before the first frame.
     #[must_use]
-    pub fn new(skin: &'a Skin, asked: Asked) -> Self {
-        let lane = |bus| Lane { cells_here: skin.cells_of(bus).next().is_some(), ..Lane::default() };
-        let lanes = (0..skin.buses.len()).map(lane).collect();
-        Self { skin, asked, first: None, lanes, others: Vec::new() }
+    pub fn new(skin: &'a Skin, requested: Requested) -> Self {
+        let bus_watch = |bus| LinkId { cells_here: skin.cells_of(bus).next().is_some(), ..LinkId::default() };
+        let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
+        Self { skin, requested, first: None, bus_watches, others: Vec::new() }
     }
 
     /// Takes in what was said before the first frame and is in force when the capture begins.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         let joints = self.skin.robot.joints.len();
-        if let Some(lane) = self.skin.bus_named(bus).and_then(|at| self.lanes.get_mut(at)) {
+        if let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) {
             if let Message::Joints { epoch, joints: Joints { in_use, .. } } = *message {
-                if usize::from(in_use) == joints && lane.last != Some(epoch) {
-                    lane.latch(epoch);
+                if usize::from(in_use) == joints && bus_watch.last != Some(epoch) {
+                    bus_watch.latch(epoch);
                 }
             } else {
-                lane.take(nanos, 0, message, self.asked, joints);
+                bus_watch.take(nanos, 0, message, self.requested, joints);
             }
         }
     }
@@ -190,22 +190,28 @@ impl<'a> Watch<'a> {
     /// Takes in the next frame; `message` is what it says, when that is anything. Whether all is known now.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let first = *self.first.get_or_insert(nanos);
-        let Some(lane) = self.skin.bus_named(bus).and_then(|at| self.lanes.get_mut(at)) else {
+        let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) else {
             if self.others.len() < RUNS && !self.others.iter().any(|other| other == bus) {
                 self.others.push(bus.to_owned());
             }
             return false;
         };
-        lane.there = true;
+        bus_watch.there = true;
         if let Some(message) = message {
-            lane.take(nanos, nanos.saturating_sub(first), message, self.asked, self.skin.robot.joints.len());
+            bus_watch.take(
+                nanos,
+                nanos.saturating_sub(first),
+                message,
+                self.requested,
+                self.skin.robot.joints.len(),
+            );
         }
         self.is_complete()
     }
 
     /// Whether nothing more is waited for.
     fn is_complete(&self) -> bool {
-        self.lanes.iter().filter(|lane| lane.cells_here).all(Lane::is_complete)
+        self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(LinkId::is_complete)
     }
 
     /// What was found, by the skin's bus; a bus that has no such joints has none. The capture is at its end, or
@@ -215,33 +221,38 @@ impl<'a> Watch<'a> {
     /// When no bus has them.
     pub fn moments(self) -> Result<Vec<Option<Moment>>, NotFound> {
         let names = |there: bool| {
-            let buses = self.skin.buses.iter().zip(&self.lanes).filter(|(_, lane)| lane.there || !there);
+            let buses = self
+                .skin
+                .buses
+                .iter()
+                .zip(&self.bus_watches)
+                .filter(|(_, bus_watch)| bus_watch.there || !there);
             buses.map(|(bus, _)| bus.name.as_str()).collect::<Vec<_>>().join(", ")
         };
-        if !self.lanes.iter().any(|lane| lane.there) {
+        if !self.bus_watches.iter().any(|bus_watch| bus_watch.there) {
             let capture = if self.others.is_empty() { "none".to_owned() } else { self.others.join(", ") };
             return Err(NotFound::Buses { capture, skin: names(false) });
         }
-        if self.lanes.iter().all(|lane| lane.moment.is_none()) {
+        if self.bus_watches.iter().all(|bus_watch| bus_watch.moment.is_none()) {
             let first = self.first.unwrap_or_default();
-            let Some(lane) = self.lanes.iter().find(|lane| !lane.runs.is_empty()) else {
+            let Some(bus_watch) = self.bus_watches.iter().find(|bus_watch| !bus_watch.runs.is_empty()) else {
                 return Err(NotFound::Joints { buses: names(true) });
             };
-            let Asked { epoch, from_ns, occurrence } = self.asked;
-            let mut asked = format!("of epoch {epoch}");
+            let Requested { epoch, from_ns, occurrence } = self.requested;
+            let mut requested = format!("of epoch {epoch}");
             if occurrence > 1 {
-                asked += &format!(" for the {occurrence}. time");
+                requested += &format!(" for the {occurrence}. time");
             }
             if from_ns > 0 {
-                asked += &format!(" at {} s or later", seconds(from_ns));
+                requested += &format!(" at {} s or later", seconds(from_ns));
             }
-            let mut runs: Vec<_> = lane.runs.iter().map(|run| run.text(first)).collect();
-            if lane.further_runs > 0 {
-                runs.push(format!("{} further rows", lane.further_runs));
+            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(first)).collect();
+            if bus_watch.further_runs > 0 {
+                runs.push(format!("{} further rows", bus_watch.further_runs));
             }
-            return Err(NotFound::Epoch { asked, runs: runs.join("; ") });
+            return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
         }
-        Ok(self.lanes.into_iter().map(|lane| lane.moment).collect())
+        Ok(self.bus_watches.into_iter().map(|bus_watch| bus_watch.moment).collect())
     }
 }
 
@@ -262,22 +273,23 @@ impl Run {
     }
 }
 
-impl Lane {
+impl LinkId {
     fn is_complete(&self) -> bool {
         // Whoever answered has said its configuration, and whoever was touched has answered.
         let settled = |cell: &CellMoment| match cell.answer {
             Some(_) => cell.hash.is_some(),
             None => {
-                cell.too_late.is_some() || cell.felt.is_none_or(|(skin, _)| skin == SkinSensors::default())
+                cell.too_late.is_some()
+                    || cell.contact_state.is_none_or(|(skin, _)| skin == SkinSensors::default())
             }
         };
         let known = |moment: &Moment| moment.cells.iter().all(settled);
         self.moment
             .as_ref()
-            .is_some_and(|moment| self.since >= PATIENCE || self.is_too_late() && known(moment))
+            .is_some_and(|moment| self.since >= TIMEOUT || self.is_too_late() && known(moment))
     }
 
-    fn take(&mut self, nanos: u64, after: u64, message: &Message, asked: Asked, robot: usize) {
+    fn take(&mut self, nanos: u64, after: u64, message: &Message, requested: Requested, robot: usize) {
         let last = self.last;
         match *message {
             Message::Halt => self.halted = true,
@@ -285,7 +297,7 @@ impl Lane {
             // Other counts are not this robot's, and a cell drops joints of the last epoch.
             Message::Joints { epoch, joints } => {
                 if usize::from(joints.in_use) == robot && last != Some(epoch) {
-                    self.joints(nanos, after, epoch, joints, asked);
+                    self.joints(nanos, after, epoch, joints, requested);
                 }
             }
             Message::Stimulus { to, from, page } => {
@@ -323,12 +335,12 @@ impl Lane {
                     cell.contact.learn(page, origin);
                 }
                 // A cell that measures has read its sensors at these very joints.
-                if let Some((cell, _)) = self.answering(from, epoch, asked) {
-                    cell.felt.get_or_insert((skin, origin));
+                if let Some((cell, _)) = self.answering(from, epoch, requested) {
+                    cell.contact_state.get_or_insert((skin, origin));
                 }
             }
             Message::Torque { from, epoch, torque } => {
-                if let Some((cell, in_time)) = self.answering(from, epoch, asked) {
+                if let Some((cell, in_time)) = self.answering(from, epoch, requested) {
                     if cell.answer.is_some() {
                         cell.repeated += 1;
                     } else if in_time {
@@ -348,16 +360,16 @@ impl Lane {
         }
     }
 
-    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, asked: Asked) {
+    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Requested) {
         self.run(nanos, epoch);
         self.latch(epoch);
         if self.moment.is_some() {
             self.since += 1;
-        } else if epoch == asked.epoch && after >= asked.from_ns {
+        } else if epoch == requested.epoch && after >= requested.from_ns {
             self.occurrences += 1;
-            if self.occurrences == asked.occurrence {
+            if self.occurrences == requested.occurrence {
                 let cells = self.cells.iter().map(|(_, Cell { claim, contact, hash })| CellMoment {
-                    felt: contact.skin().copied(),
+                    contact_state: contact.skin().copied(),
                     test_mode: contact.obeys(),
                     state: claim.heartbeat().map(|heartbeat| heartbeat.state),
                     hash: *hash,
@@ -393,9 +405,14 @@ impl Lane {
     }
 
     /// The cell at the moment, when it speaks of it; and whether that is in time.
-    fn answering(&mut self, from: CellId, epoch: Epoch, asked: Asked) -> Option<(&mut CellMoment, bool)> {
+    fn answering(
+        &mut self,
+        from: CellId,
+        epoch: Epoch,
+        requested: Requested,
+    ) -> Option<(&mut CellMoment, bool)> {
         let in_time = !self.is_too_late();
-        let moment = self.moment.as_mut().filter(|_| epoch == asked.epoch)?;
+        let moment = self.moment.as_mut().filter(|_| epoch == requested.epoch)?;
         Some((moment.cells.get_mut(from.index())?, in_time))
     }
 

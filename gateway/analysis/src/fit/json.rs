@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::case::{Answers, Load};
 use super::limits::Need;
-use super::{BusFit, Judged, Row, Whole, name};
+use super::{BusFit, Rated, Row, Whole, name};
 
 #[derive(Serialize)]
 struct Document<'a> {
@@ -44,7 +44,7 @@ pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok,
     .serialize(serializer)
 }
 
-impl Serialize for Judged {
+impl Serialize for Rated {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self { case, load, times, exceeded } = self;
         let answers = match case.answers {

@@ -70,8 +70,8 @@ impl Most {
     #[must_use]
     pub fn of(case: &Case) -> Self {
         Self {
-            bandwidth: greatest(|cells| has_room(&case.with_cells(cells))),
-            deadline: greatest(|cells| case.with_cells(cells).is_in_time()),
+            bandwidth: max(|cells| has_room(&case.with_cells(cells))),
+            deadline: max(|cells| case.with_cells(cells).is_in_time()),
             nodes: NODES - 1,
         }
     }
@@ -100,21 +100,21 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
 }
 
 /// The greatest number that something holds for which holds for all lesser ones; 0 when it does not even for 1.
-fn greatest(holds: impl Fn(u32) -> bool) -> u32 {
+fn max(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < ENDLESS && holds(beyond) {
         beyond *= 2;
     }
-    let mut least = beyond / 2;
-    while beyond - least > 1 {
-        let middle = least.midpoint(beyond);
+    let mut min = beyond / 2;
+    while beyond - min > 1 {
+        let middle = min.midpoint(beyond);
         if holds(middle) {
-            least = middle;
+            min = middle;
         } else {
             beyond = middle;
         }
     }
-    least
+    min
 }
 
 /// Buses that so many cells take, by each limit; `None` where not even one cell fits.
@@ -171,11 +171,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_greatest_is_found_wherever_it_is() {
+    fn the_max_is_found_wherever_it_is() {
         for limit in [0, 1, 2, 3, 4, 5, 63, 64, 65, 253, 1_000] {
-            assert_eq!(greatest(|number| number <= limit), limit);
+            assert_eq!(max(|number| number <= limit), limit);
         }
-        assert!(greatest(|_| true) >= ENDLESS / 2);
+        assert!(max(|_| true) >= ENDLESS / 2);
     }
     #[test]
     fn the_larger_need_binds_and_equal_ones_both() {

@@ -12,10 +12,10 @@
 //! ```
 
 pub mod case;
+pub mod hint;
 mod json;
 pub mod limits;
 pub mod rates;
-pub mod remedy;
 pub mod response;
 pub mod traffic;
 pub mod verdict;
@@ -28,8 +28,8 @@ use serde::Serialize;
 pub use json::json;
 
 use case::{Case, Load, Times};
+use hint::Hint;
 use limits::{Limit, Most, Need, exceeded};
-use remedy::Remedy;
 use verdict::Verdict;
 
 /// The paper's cell computes 68.5 µs: 1096 instructions at 16 MIPS.
@@ -69,7 +69,7 @@ pub fn name(format: Format, rates: BitRates) -> String {
 
 /// A bus with these rates and cells, judged.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Judged {
+pub struct Rated {
     /// What was looked at.
     pub case: Case,
     /// Shares of its time.
@@ -80,7 +80,7 @@ pub struct Judged {
     pub exceeded: Vec<Limit>,
 }
 
-impl Judged {
+impl Rated {
     /// Looks at a bus.
     #[must_use]
     pub fn of(case: &Case) -> Self {
@@ -102,7 +102,7 @@ pub struct BusFit {
     pub name: String,
     /// As it is described.
     #[serde(flatten)]
-    pub judged: Judged,
+    pub rated: Rated,
     /// The most cells that it takes.
     #[serde(rename = "most_cells")]
     pub most: Most,
@@ -111,10 +111,10 @@ pub struct BusFit {
     pub need: Need,
     /// What its cells could answer with instead.
     #[serde(rename = "other_answers")]
-    pub answers: Vec<Remedy>,
+    pub answers: Vec<Hint>,
     /// What else can be done when it is too much.
     #[serde(rename = "changes")]
-    pub remedies: Vec<Remedy>,
+    pub hints: Vec<Hint>,
 }
 
 /// Looks at one bus of a skin, given as an index into [`Skin::buses`]; `None` when there is none.
@@ -131,24 +131,24 @@ pub fn bus(
     let most = Most::of(&case);
     Some(BusFit {
         name,
-        judged: Judged::of(&case),
+        rated: Rated::of(&case),
         most,
         need: Need::of(&most, case.answers.cells()),
-        answers: remedy::answers(skin, index, &case),
-        remedies: remedy::remedies(skin, &case),
+        answers: hint::answers(skin, index, &case),
+        hints: hint::hints(skin, &case),
     })
 }
 
 /// One bus of a skin as it is described, at these rates, with all cells answering; `None` where a cell that answers with
 /// sums has no way to a root.
 #[must_use]
-pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Judged> {
+pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
     let format = skin.buses.get(index)?.format;
     let rates = match format {
         Format::Fd => rates,
         Format::Classic => BitRates::classic(rates.nominal()).ok()?,
     };
-    Some(Judged::of(&Case::of(skin, index, format, rates, COMPUTATION_NS)?))
+    Some(Rated::of(&Case::of(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
 /// All cells of a skin, evenly on several buses.
@@ -169,7 +169,7 @@ pub struct Spread {
     /// How many.
     pub buses: u32,
     /// The fullest one.
-    pub fullest: Judged,
+    pub fullest: Rated,
 }
 
 /// Spreads all cells of a skin over more and more buses that are like the fullest one of it.
@@ -182,8 +182,8 @@ pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
     let told = |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
     let spread = numbers
         .filter(told)
-        .map(|buses| (buses, fullest.judged.case.with_cells(cells.div_ceil(buses))))
-        .map(|(buses, case)| Spread { buses, fullest: Judged::of(&case) });
+        .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
+        .map(|(buses, case)| Spread { buses, fullest: Rated::of(&case) });
     Whole { cells, need, spread: spread.collect() }
 }
 
@@ -215,7 +215,7 @@ pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Ro
 /// The bus with the greatest load.
 #[must_use]
 pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
-    buses.max_by(|one, other| one.judged.load.total().total_cmp(&other.judged.load.total()))
+    buses.max_by(|one, other| one.rated.load.total().total_cmp(&other.rated.load.total()))
 }
 
 #[cfg(test)]

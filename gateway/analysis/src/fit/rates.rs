@@ -11,7 +11,7 @@ const DATA: u32 = 5_000_000;
 
 /// Bits in a second that are asked for, for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Asked {
+pub struct Requested {
     /// Of identifiers, and of all of a classic frame.
     pub nominal: Option<u32>,
     /// Of FD frames' data.
@@ -27,7 +27,7 @@ pub struct Chosen {
     pub is_chosen: bool,
 }
 
-impl Asked {
+impl Requested {
     /// Of a bus that no skin describes.
     ///
     /// # Errors
@@ -74,15 +74,15 @@ mod tests {
     use protocol::skin::Skin;
 
     fn rates(nominal: Option<u32>, data: Option<u32>, described: &str) -> (String, bool) {
-        let text = model::generate::generate(&model::generate::Wanted::default()).unwrap();
+        let text = model::generate::generate(&model::generate::Target::default()).unwrap();
         let text = text.replace("format = \"fd\"", described);
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let chosen = Asked { nominal, data }.of_bus(&skin.buses[0]).unwrap();
+        let chosen = Requested { nominal, data }.of_bus(&skin.buses[0]).unwrap();
         (chosen.rates.to_string(), chosen.is_chosen)
     }
 
     #[test]
-    fn rates_are_those_asked_for_or_the_skins_or_common_ones() {
+    fn rates_are_those_requested_or_the_skins_or_common_ones() {
         let fd = "format = \"fd\"";
         let both = "format = \"fd\"\nbitrate = 500000\ndata_bitrate = 2000000";
         let one = "format = \"fd\"\nbitrate = 500000";

@@ -10,10 +10,10 @@ use super::case::{Answers, Case};
 use super::limits::{Limit, Most};
 use super::verdict::Verdict;
 use super::{BusFit, COMPUTATION_NS, bus, fullest, json, table, whole};
-use model::generate::{Reply, Wanted, generate};
+use model::generate::{Reply, Target, generate};
 
-fn text(wanted: &Wanted) -> String {
-    generate(wanted).unwrap()
+fn text(target: &Target) -> String {
+    generate(target).unwrap()
 }
 
 fn skin(text: &str) -> Skin {
@@ -30,7 +30,7 @@ fn fit(skin: &Skin, rates: &str) -> BusFit {
 
 #[test]
 fn packets_take_what_is_known_of_them() {
-    let skin = skin(&text(&Wanted { cells: 1, ..Wanted::default() }));
+    let skin = skin(&text(&Target { cells: 1, ..Target::default() }));
     for (rates, us) in [
         ("500k/2M", 160.0),
         ("500k/5M", 102.4),
@@ -41,22 +41,22 @@ fn packets_take_what_is_known_of_them() {
         ("classic 1M", 266.0),
         ("classic 500k", 532.0),
     ] {
-        let packet_us = fit(&skin, rates).judged.case.packet_ns() as f64 / 1e3;
+        let packet_us = fit(&skin, rates).rated.case.packet_ns() as f64 / 1e3;
         assert!((packet_us - us).abs() < 1e-9, "{rates}: {packet_us}");
     }
 }
 
 #[test]
 fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrically() {
-    let fit = fit(&skin(&text(&Wanted::default())), "1M/5M");
-    let load = fit.judged.load;
+    let fit = fit(&skin(&text(&Target::default())), "1M/5M");
+    let load = fit.rated.load;
     let share = |packets: f64| packets * 70.4 / 16_000.0;
     assert!((load.joints + load.answers - share(254.0)).abs() < 1e-12, "111.76 %: {load:?}");
     assert!((load.heartbeats - share(253.0 * 0.064)).abs() < 1e-12);
     assert_eq!(load.sensors.to_bits(), 0);
-    assert_eq!(fit.judged.exceeded, [Limit::Bandwidth, Limit::Deadline, Limit::Nodes]);
-    assert_eq!(fit.judged.times.last_ns(), None);
-    assert_eq!(fit.judged.times.heartbeat_ns, None);
+    assert_eq!(fit.rated.exceeded, [Limit::Bandwidth, Limit::Deadline, Limit::Nodes]);
+    assert_eq!(fit.rated.times.last_ns(), None);
+    assert_eq!(fit.rated.times.heartbeat_ns, None);
     // 212 * 70.4 * 1.064 + 70.4 = 15 950 of 16 000 us; 223 * 70.4 + 3 * 70.4 + 68.5 = 15 979 us.
     assert_eq!(fit.most, Most { bandwidth: 212, deadline: 223, nodes: 109 });
     assert_eq!((fit.need.in_time(), fit.need.buses()), (Some(2), Some(3)));
@@ -65,21 +65,21 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
 
 #[test]
 fn at_1m_8m_it_is_in_time_and_the_chain_is_the_smaller_bound() {
-    let fit = fit(&skin(&text(&Wanted::default())), "1M/8M");
-    assert_eq!(fit.judged.exceeded, [Limit::Nodes]);
-    assert_eq!(fit.judged.verdict(), Verdict::Nodes(254));
+    let fit = fit(&skin(&text(&Target::default())), "1M/8M");
+    assert_eq!(fit.rated.exceeded, [Limit::Nodes]);
+    assert_eq!(fit.rated.verdict(), Verdict::Nodes(254));
     // Blocking, joints, computation, blocking, 253 torques.
-    assert_eq!(fit.judged.times.chain_ns, Some(56_000 * (3 + 253) + 68_500));
-    let response = fit.judged.times.response_ns.unwrap();
+    assert_eq!(fit.rated.times.chain_ns, Some(56_000 * (3 + 253) + 68_500));
+    let response = fit.rated.times.response_ns.unwrap();
     // Response-time analysis counts joints and blocking once more for the torque itself.
     assert_eq!(response.worst_ns, 56_000 * (4 + 253) + 68_500);
-    assert_eq!(fit.judged.times.last_ns(), fit.judged.times.chain_ns);
-    assert!(fit.remedies.iter().all(|it| it.change == "3 buses of 85 cells"));
+    assert_eq!(fit.rated.times.last_ns(), fit.rated.times.chain_ns);
+    assert!(fit.hints.iter().all(|it| it.change == "3 buses of 85 cells"));
 }
 
 #[test]
 fn a_single_cell_waits_for_joints_and_one_heartbeat_at_most() {
-    let case = fit(&skin(&text(&Wanted { cells: 1, ..Wanted::default() })), "1M/5M").judged.case;
+    let case = fit(&skin(&text(&Target { cells: 1, ..Target::default() })), "1M/5M").rated.case;
     // Its own heartbeat: once before the joints, once while it computes.
     assert_eq!(case.times().chain_ns, Some(4 * 70_400 + 68_500));
     // Who computes in no time answers before anybody else begins.
@@ -89,12 +89,12 @@ fn a_single_cell_waits_for_joints_and_one_heartbeat_at_most() {
 
 #[test]
 fn the_most_cells_fit_and_one_more_does_not_at_all_rates_and_with_sensors() {
-    let text = text(&Wanted { cells: 40, ..Wanted::default() });
+    let text = text(&Target { cells: 40, ..Target::default() });
     let format = "format = \"fd\"";
     for sensing in ["", "\nsensing = \"event\"", "\nsensing = \"continuous\"\nsensing_hz = 62.5"] {
         let skin = skin(&text.replace(format, &format!("{format}{sensing}")));
         for row in table(&skin, None, COMPUTATION_NS) {
-            let (case, most) = (&row.fullest.judged.case, row.fullest.most);
+            let (case, most) = (&row.fullest.rated.case, row.fullest.most);
             for (limit, cells) in [(Limit::Bandwidth, most.bandwidth), (Limit::Deadline, most.deadline)] {
                 let exceeded = |cells| super::exceeded(&case.with_cells(cells)).contains(&limit);
                 assert!(cells > 0 && !exceeded(cells) && exceeded(cells + 1), "{limit:?} {cells} {case:?}");
@@ -105,11 +105,11 @@ fn the_most_cells_fit_and_one_more_does_not_at_all_rates_and_with_sensors() {
 
 #[test]
 fn sensors_are_loaded_with_what_they_say() {
-    let text = text(&Wanted { cells: 40, ..Wanted::default() });
+    let text = text(&Target { cells: 40, ..Target::default() });
     let format = "format = \"fd\"";
     let sensors = |sensing: &str| {
         let skin = skin(&text.replace(format, &format!("{format}\n{sensing}")));
-        fit(&skin, "1M/5M").judged.load.sensors
+        fit(&skin, "1M/5M").rated.load.sensors
     };
     // Page 0 and, once a second, page 1, of 40 cells.
     let share = |hz: f64| 40.0 * hz * 70.4e-6;
@@ -118,25 +118,25 @@ fn sensors_are_loaded_with_what_they_say() {
 }
 
 #[test]
-fn every_remedy_does_in_a_description_what_it_says() {
-    let wanted = Wanted { cells: 200, ..Wanted::default() };
+fn every_hint_does_in_a_description_what_it_says() {
+    let target = Target { cells: 200, ..Target::default() };
     let format = "format = \"fd\"";
     let sensing = "sensing = \"continuous\"\nsensing_hz = 20.0";
-    let text = text(&wanted).replace(format, &format!("{format}\n{sensing}"));
+    let text = text(&target).replace(format, &format!("{format}\n{sensing}"));
     let before = fit(&skin(&text), "500k/5M");
-    let changes: Vec<_> = before.remedies.iter().map(|it| it.change.as_str()).collect();
+    let changes: Vec<_> = before.hints.iter().map(|it| it.change.as_str()).collect();
     assert_eq!(
         changes,
         ["2 buses of 100 cells", "1M/8M", "joint_broadcast_hz = 22.727273", "sensing = \"event\", quiet",]
     );
-    for remedy in &before.remedies {
-        let rates = remedy.change.parse::<BitRates>().unwrap_or_else(|_| "500k/5M".parse().unwrap());
-        let other = if remedy.change.starts_with("joint") {
-            text.replace("joint_broadcast_hz = 62.5", &remedy.change)
-        } else if remedy.change.starts_with("sensing") {
+    for hint in &before.hints {
+        let rates = hint.change.parse::<BitRates>().unwrap_or_else(|_| "500k/5M".parse().unwrap());
+        let other = if hint.change.starts_with("joint") {
+            text.replace("joint_broadcast_hz = 62.5", &hint.change)
+        } else if hint.change.starts_with("sensing") {
             text.replace(sensing, "sensing = \"event\"")
-        } else if remedy.change.contains("buses") {
-            let two = generate(&Wanted { buses: 2, ..wanted.clone() }).unwrap();
+        } else if hint.change.contains("buses") {
+            let two = generate(&Target { buses: 2, ..target.clone() }).unwrap();
             two.replace(format, &format!("{format}\n{sensing}"))
         } else {
             text.clone()
@@ -144,18 +144,18 @@ fn every_remedy_does_in_a_description_what_it_says() {
         let skin = skin(&other);
         let buses =
             (0..skin.buses.len()).filter_map(|index| bus(&skin, index, Format::Fd, rates, COMPUTATION_NS));
-        let after = fullest(buses).unwrap().judged;
-        assert_eq!(after, remedy.after, "{}", remedy.change);
+        let after = fullest(buses).unwrap().rated;
+        assert_eq!(after, hint.after, "{}", hint.change);
     }
 }
 
 #[test]
 fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
-    let skin = skin(&text(&Wanted { buses: 3, ..Wanted::default() }));
+    let skin = skin(&text(&Target { buses: 3, ..Target::default() }));
     let fit = fit(&skin, "1M/5M");
     let [shared, roots] = &fit.answers[..] else { panic!("{:?}", fit.answers) };
-    assert_eq!(shared.after.load, fit.judged.load);
-    assert!(shared.after.times.last_ns() > fit.judged.times.last_ns(), "parents wait for their children");
+    assert_eq!(shared.after.load, fit.rated.load);
+    assert!(shared.after.times.last_ns() > fit.rated.times.last_ns(), "parents wait for their children");
     assert_eq!(roots.after.case.answers.cells(), 1);
     let packets = roots.after.load.total() / (70.4 / 16_000.0);
     assert!((packets - 2.064).abs() < 1e-9, "joints, one sum, and that cell's heartbeats: {packets}");
@@ -164,9 +164,9 @@ fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
 
 #[test]
 fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
-    let skin = skin(&text(&Wanted { cells: 60, reply: Reply::Sum, ..Wanted::default() }));
+    let skin = skin(&text(&Target { cells: 60, reply: Reply::Sum, ..Target::default() }));
     let fit = fit(&skin, "1M/5M");
-    let Answers::Sums { by_depth, slot_ns, shared } = &fit.judged.case.answers else { panic!("{fit:?}") };
+    let Answers::Sums { by_depth, slot_ns, shared } = &fit.rated.case.answers else { panic!("{fit:?}") };
     let depths = skin.wires(0).depths();
     let deepest = depths.iter().flatten().max().copied().unwrap();
     assert_eq!((by_depth.iter().sum::<u32>(), by_depth.len()), (60, usize::from(deepest) + 1));
@@ -176,17 +176,17 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
     );
     // Of every wire on the way up one computation, and one frame of somebody else's.
     let chain_ns = 70_400 * 62 + (u64::from(deepest) + 1) * (68_500 + 70_400);
-    assert_eq!(fit.judged.times.chain_ns, Some(chain_ns));
+    assert_eq!(fit.rated.times.chain_ns, Some(chain_ns));
     let changes: Vec<_> = fit.answers.iter().map(|it| it.change.as_str()).collect();
     assert_eq!(changes, ["torques", "sums, only of roots"]);
     // Half the cells, half of every depth.
-    let half = fit.judged.case.answers.with_cells(30);
-    assert_eq!(half.cells(), 30);
+    let segment = fit.rated.case.answers.with_cells(30);
+    assert_eq!(segment.cells(), 30);
 }
 
 #[test]
 fn json_has_the_same_figures_and_null_where_there_is_no_bound() {
-    let skin = skin(&text(&Wanted::default()));
+    let skin = skin(&text(&Target::default()));
     let fits = [fit(&skin, "1M/5M")];
     let json = json(&skin, &fits, Some(&whole(&skin, &fits[0])), &[]);
     let bus = &json["buses"][0];

@@ -6,7 +6,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Node};
 use protocol::message::{Message, NetworkPage, SensorPage, State};
-use protocol::packet::{Epoch, Half, Packet, Paired, data_id};
+use protocol::packet::{Epoch, Packet, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use serde::Serialize;
 
@@ -100,7 +100,7 @@ pub struct Traffic {
     ours: u64,
     others: u64,
     /// By identifier.
-    halves: Vec<Half>,
+    segments: Vec<Segment>,
     /// By cell: what it owes the bench.
     owed: Vec<Owed>,
 }
@@ -139,17 +139,17 @@ impl Traffic {
             *(if packet.is_some() { &mut self.ours } else { &mut self.others }) += 1;
             return Some((packet?, false));
         }
-        if self.halves.is_empty() {
-            self.halves.resize(IDS, Half::NONE);
+        if self.segments.is_empty() {
+            self.segments.resize(IDS, Segment::NONE);
         }
-        let half = self.halves.get_mut(usize::from(id.to_bits()))?;
-        match half.push(Micros(nanos / 1_000), id, frame.data()) {
-            Ok(Paired::Whole(packet)) => {
+        let segment = self.segments.get_mut(usize::from(id.to_bits()))?;
+        match segment.push(Micros(nanos / 1_000), id, frame.data()) {
+            Ok(Reassembly::Complete(packet)) => {
                 self.ours += 2;
                 Some((packet, true))
             }
-            Ok(Paired::Waiting) => None,
-            Ok(Paired::Incomplete) | Err(_) => {
+            Ok(Reassembly::Waiting) => None,
+            Ok(Reassembly::Incomplete) | Err(_) => {
                 self.others += 1;
                 None
             }
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn a_first_half_says_nothing_and_the_second_one_all_of_it() {
+    fn a_first_segment_says_nothing_and_the_second_one_all_of_it() {
         let mut traffic = Traffic::default();
         let stimulus = Message::Stimulus {
             to: Node::Everyone,
@@ -286,8 +286,8 @@ mod tests {
         fn chance_makes_no_bench(frames in proptest::collection::vec((0..0x800_u32, any::<[u8; 16]>(), any::<bool>()), 0..400)) {
             let mut traffic = Traffic::default();
             // Of the first frame alone it would be believed: one in 65 536.
-            let stranger = Frame::classic(0x700, &[1]).unwrap();
-            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &stranger), Sorted::OTHER));
+            let unknown_node = Frame::classic(0x700, &[1]).unwrap();
+            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &unknown_node), Sorted::OTHER));
             for (id, data, is_fd) in frames {
                 let frame = if is_fd {
                     Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)

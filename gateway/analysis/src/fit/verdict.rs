@@ -4,7 +4,7 @@ use std::fmt::{self, Display, Formatter};
 
 use serde::{Serialize, Serializer};
 
-use super::Judged;
+use super::Rated;
 use super::limits::{ByLimit, Limit, NODES};
 
 /// Whether something fits on a bus.
@@ -132,12 +132,12 @@ pub struct Answer {
 impl Answer {
     /// Of a bus whose cells all answer.
     #[must_use]
-    pub fn worst_case(judged: &Judged) -> Self {
+    pub fn worst_case(rated: &Rated) -> Self {
         Self {
-            load: judged.load.total(),
-            rates: super::name(judged.case.format, judged.case.rates),
-            cells: Cells::All { cells: judged.case.answers.cells() },
-            verdict: judged.verdict(),
+            load: rated.load.total(),
+            rates: super::name(rated.case.format, rated.case.rates),
+            cells: Cells::All { cells: rated.case.answers.cells() },
+            verdict: rated.verdict(),
         }
     }
 

@@ -110,8 +110,8 @@ impl Figure {
 
     /// The same with one more series; see [`Series`].
     #[must_use]
-    pub fn draw(mut self, label: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
-        self.series.push(Series::new(label, shape, points));
+    pub fn draw(mut self, caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
+        self.series.push(Series::new(caption, shape, points));
         self
     }
 
@@ -144,7 +144,7 @@ pub enum Size {
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Axis {
     /// What it counts.
-    pub label: String,
+    pub caption: String,
     /// In what; empty for numbers of things.
     pub unit: String,
     /// How values become places.
@@ -156,8 +156,8 @@ pub struct Axis {
 impl Axis {
     /// A linear axis that fits what is drawn.
     #[must_use]
-    pub fn new(label: impl Into<String>, unit: impl Into<String>) -> Self {
-        Self { label: label.into(), unit: unit.into(), scale: Scale::Linear, range: None }
+    pub fn new(caption: impl Into<String>, unit: impl Into<String>) -> Self {
+        Self { caption: caption.into(), unit: unit.into(), scale: Scale::Linear, range: None }
     }
 
     /// The same, from `from` to `to`.
@@ -177,10 +177,10 @@ impl Axis {
 
 impl fmt::Display for Axis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match (self.label.as_str(), self.unit.as_str()) {
-            (label, "") => f.write_str(label),
+        match (self.caption.as_str(), self.unit.as_str()) {
+            (caption, "") => f.write_str(caption),
             ("", unit) => f.write_str(unit),
-            (label, unit) => write!(f, "{label} ({unit})"),
+            (caption, unit) => write!(f, "{caption} ({unit})"),
         }
     }
 }
@@ -199,7 +199,7 @@ pub enum Scale {
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Series {
     /// What it is, for the legend; empty: it is not in the legend.
-    pub label: String,
+    pub caption: String,
     /// How it is drawn.
     pub shape: Shape,
     /// x and y, by increasing x for all shapes but points. What is not finite is a gap.
@@ -209,8 +209,8 @@ pub struct Series {
 impl Series {
     /// A series of a shape.
     #[must_use]
-    pub fn new(label: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
-        Self { label: label.into(), shape, points }
+    pub fn new(caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
+        Self { caption: caption.into(), shape, points }
     }
 }
 
@@ -238,20 +238,20 @@ pub struct Mark {
     /// Where.
     pub at: f64,
     /// What is there.
-    pub label: String,
+    pub caption: String,
 }
 
 impl Mark {
     /// An upright line.
     #[must_use]
-    pub fn x(at: f64, label: impl Into<String>) -> Self {
-        Self { on: On::X, at, label: label.into() }
+    pub fn x(at: f64, caption: impl Into<String>) -> Self {
+        Self { on: On::X, at, caption: caption.into() }
     }
 
     /// A level line.
     #[must_use]
-    pub fn y(at: f64, label: impl Into<String>) -> Self {
-        Self { on: On::Y, at, label: label.into() }
+    pub fn y(at: f64, caption: impl Into<String>) -> Self {
+        Self { on: On::Y, at, caption: caption.into() }
     }
 }
 

@@ -23,21 +23,21 @@ impl Finding {
     /// A number of which less is better, beside the paper's: within 5 % of that it is the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::told(what, ours).beside(paper);
+        let finding = Self::stated(what, ours).beside(paper);
         Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
     /// A number of which more is better, beside the paper's: within 5 % of that it is the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::told(what, ours).beside(paper);
+        let finding = Self::stated(what, ours).beside(paper);
         Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
     /// A number that is told and not judged.
     #[must_use]
-    pub fn told(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
-        Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Told }
+    pub fn stated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
+        Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Stated }
     }
 
     /// The same, told beside the paper's in the same unit: of what is no better for being more or less.
@@ -75,7 +75,7 @@ pub enum Verdict {
     Worse,
     /// Not judged.
     #[default]
-    Told,
+    Stated,
 }
 
 impl Verdict {
@@ -83,7 +83,7 @@ impl Verdict {
     #[must_use]
     pub fn less_is_better(paper: f64, ours: f64) -> Self {
         if !(paper.is_finite() && ours.is_finite()) {
-            Self::Told
+            Self::Stated
         } else if (ours - paper).abs() <= 0.05 * paper.abs() {
             Self::Same
         } else if ours < paper {
@@ -100,7 +100,7 @@ impl fmt::Display for Verdict {
             Self::Better => "better",
             Self::Same => "the same",
             Self::Worse => "worse",
-            Self::Told => "",
+            Self::Stated => "",
         })
     }
 }
@@ -201,8 +201,8 @@ mod tests {
             [1.0, 1.95, 2.05, 3.0].map(more),
             [Verdict::Worse, Verdict::Same, Verdict::Same, Verdict::Better]
         );
-        assert_eq!(less(f64::NAN), Verdict::Told);
-        assert_eq!(Finding::told("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
+        assert_eq!(less(f64::NAN), Verdict::Stated);
+        assert_eq!(Finding::stated("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
     }
 
     #[test]

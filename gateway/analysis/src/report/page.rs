@@ -107,7 +107,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
             (Verdict::Same, _) => ("same", "= the same"),
             (Verdict::Worse, None) => ("worse", "✗ worse"),
             (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
-            (Verdict::Told, _) => ("told", ""),
+            (Verdict::Stated, _) => ("told", ""),
         };
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
         let cells: [(&str, &str); 5] = [
@@ -191,7 +191,7 @@ mod tests {
             ],
             findings: vec![
                 Finding::less_is_better("error", 0.0054, nm(6.3e-5)),
-                Finding::told("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false),
+                Finding::stated("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false),
             ],
             tables: vec![Table {
                 title: "cells".to_owned(),

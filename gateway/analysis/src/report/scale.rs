@@ -56,7 +56,7 @@ impl Span {
     }
 
     /// How a tick is written: with the digits that tell neighbours apart.
-    pub(crate) fn label(&self, tick: f64, most: usize) -> String {
+    pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
         let size = self.from.abs().max(self.to.abs());
         match self.scale {
             Scale::Log if (0.01..1e5).contains(&tick) => format!("{}", round(tick)),
@@ -120,10 +120,10 @@ fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
 /// The smallest of 1, 2 or 5 times a power of ten that needs no more than `most` ticks.
 fn step(from: f64, to: f64, most: usize) -> f64 {
     let most = u32::try_from(most.max(1)).unwrap_or(u32::MAX);
-    let least = (to - from) / f64::from(most);
-    let power = 10_f64.powf(least.log10().floor());
+    let min = (to - from) / f64::from(most);
+    let power = 10_f64.powf(min.log10().floor());
     let mut steps = [1.0, 2.0, 5.0].into_iter().map(|times| times * power);
-    steps.find(|step| *step >= 0.999_999 * least).unwrap_or(10.0 * power)
+    steps.find(|step| *step >= 0.999_999 * min).unwrap_or(10.0 * power)
 }
 
 fn linear_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
@@ -193,15 +193,15 @@ mod tests {
 
     #[test]
     fn ticks_stand_at_round_numbers_and_are_written_with_the_digits_that_tell_them_apart() {
-        let labels = |from, to, scale, most| {
+        let captions = |from, to, scale, most| {
             let span = span(from, to, scale);
-            span.ticks(most).into_iter().map(|tick| span.label(tick, most)).collect::<Vec<_>>().join(" ")
+            span.ticks(most).into_iter().map(|tick| span.caption(tick, most)).collect::<Vec<_>>().join(" ")
         };
-        assert_eq!(labels(0.0, 12.0, Scale::Linear, 8), "0 2 4 6 8 10 12");
-        assert_eq!(labels(-1.3, 0.4, Scale::Linear, 9), "-1.2 -1.0 -0.8 -0.6 -0.4 -0.2 0.0 0.2 0.4");
-        assert_eq!(labels(0.0, 2e-5, Scale::Linear, 4), "0 5·10⁻⁶ 10⁻⁵ 1.5·10⁻⁵ 2·10⁻⁵");
-        assert_eq!(labels(1e-7, 0.04, Scale::Log, 6), "10⁻⁷ 10⁻⁶ 10⁻⁵ 10⁻⁴ 10⁻³ 0.01");
-        assert_eq!(labels(15.0, 2_000.0, Scale::Log, 8), "20 50 100 200 500 1000 2000");
+        assert_eq!(captions(0.0, 12.0, Scale::Linear, 8), "0 2 4 6 8 10 12");
+        assert_eq!(captions(-1.3, 0.4, Scale::Linear, 9), "-1.2 -1.0 -0.8 -0.6 -0.4 -0.2 0.0 0.2 0.4");
+        assert_eq!(captions(0.0, 2e-5, Scale::Linear, 4), "0 5·10⁻⁶ 10⁻⁵ 1.5·10⁻⁵ 2·10⁻⁵");
+        assert_eq!(captions(1e-7, 0.04, Scale::Log, 6), "10⁻⁷ 10⁻⁶ 10⁻⁵ 10⁻⁴ 10⁻³ 0.01");
+        assert_eq!(captions(15.0, 2_000.0, Scale::Log, 8), "20 50 100 200 500 1000 2000");
     }
 
     #[test]

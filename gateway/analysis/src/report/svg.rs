@@ -157,7 +157,8 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
 
     let (width, height) = area.dim_in_pixel();
     let (x_most, y_most) = ((width / pixels(80)) as usize, (height / pixels(42)) as usize);
-    let digits = y.ticks(y_most).iter().map(|tick| y.label(*tick, y_most).chars().count()).max().unwrap_or(1);
+    let digits =
+        y.ticks(y_most).iter().map(|tick| y.caption(*tick, y_most).chars().count()).max().unwrap_or(1);
     let left = pixels(34) + in_pixels(0.62 * LETTERS * digits as f64).unsigned_abs();
 
     let rows = legend(figure, width);
@@ -180,8 +181,8 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
         .label_style(letters(&INK, LETTERS))
         .axis_desc_style(letters(&INK, LETTERS))
         .set_all_tick_mark_size(pixels(5))
-        .x_label_formatter(&|tick| x.label(*tick, x_most))
-        .y_label_formatter(&|tick| y.label(*tick, y_most))
+        .x_label_formatter(&|tick| x.caption(*tick, x_most))
+        .y_label_formatter(&|tick| y.caption(*tick, y_most))
         .x_desc(figure.x.to_string())
         .y_desc(figure.y.to_string())
         .draw()?;
@@ -329,17 +330,17 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
     let style = letters(&FAINT, LETTERS - 1.0).pos(Pos::new(side, end));
     let at = (x.value(across + gap), y.value(up - if mark.on == On::X { 0.02 } else { 0.0 }));
-    chart.draw_series([Text::new(mark.label.clone(), at, style)])?;
+    chart.draw_series([Text::new(mark.caption.clone(), at, style)])?;
     Ok(())
 }
 
 /// Rows of the legend: where each entry begins, its series and its colour.
 fn legend(figure: &Figure, width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
-    let named = figure.series.iter().zip(colours()).filter(|(series, _)| !series.label.is_empty());
+    let named = figure.series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
     let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
     for (series, colour) in named {
-        let room = in_pixels(48.0 + 0.56 * LETTERS * series.label.chars().count() as f64);
+        let room = in_pixels(48.0 + 0.56 * LETTERS * series.caption.chars().count() as f64);
         if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
             rows.push(Vec::new());
             at = in_pixels(12.0);
@@ -373,7 +374,7 @@ fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32,
         }
     }
     let style = letters(&INK, LETTERS).pos(Pos::new(HPos::Left, VPos::Center));
-    area.draw(&Text::new(series.label.clone(), (end + in_pixels(6.0), middle), style))
+    area.draw(&Text::new(series.caption.clone(), (end + in_pixels(6.0), middle), style))
 }
 
 /// Letters of a size in pixels: the backend makes them smaller by 1.24.

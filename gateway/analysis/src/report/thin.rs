@@ -6,33 +6,29 @@
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Column {
     first: (f64, f64),
-    least: (f64, f64),
-    greatest: (f64, f64),
+    min: (f64, f64),
+    max: (f64, f64),
     last: (f64, f64),
 }
 
 impl Column {
     const fn new(point: (f64, f64)) -> Self {
-        Self { first: point, least: point, greatest: point, last: point }
+        Self { first: point, min: point, max: point, last: point }
     }
 
     fn join(&mut self, later: &Self) {
-        if later.least.1 < self.least.1 {
-            self.least = later.least;
+        if later.min.1 < self.min.1 {
+            self.min = later.min;
         }
-        if later.greatest.1 > self.greatest.1 {
-            self.greatest = later.greatest;
+        if later.max.1 > self.max.1 {
+            self.max = later.max;
         }
         self.last = later.last;
     }
 
     /// The points that are different, in their order.
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
-        let (a, b) = if self.least.0 <= self.greatest.0 {
-            (self.least, self.greatest)
-        } else {
-            (self.greatest, self.least)
-        };
+        let (a, b) = if self.min.0 <= self.max.0 { (self.min, self.max) } else { (self.max, self.min) };
         let mut before = None;
         [self.first, a, b, self.last].into_iter().filter(move |point| before.replace(*point) != Some(*point))
     }
@@ -225,9 +221,9 @@ mod tests {
     use proptest::prelude::*;
 
     fn ends(points: &[(f64, f64)]) -> (f64, f64) {
-        points.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, greatest), (_, y)| {
-            (least.min(*y), greatest.max(*y))
-        })
+        points
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(min, max), (_, y)| (min.min(*y), max.max(*y)))
     }
 
     #[test]

@@ -11,7 +11,7 @@ const MOMENTS: usize = 1 << 16;
 #[derive(Debug, Default)]
 pub(super) struct Window<const SPAN: u64> {
     /// When, and how much.
-    asked: VecDeque<(u64, u64)>,
+    requested: VecDeque<(u64, u64)>,
     sum: u64,
     /// As a share of the span, and when the span began.
     pub(super) most: Most,
@@ -19,19 +19,20 @@ pub(super) struct Window<const SPAN: u64> {
 
 impl<const SPAN: u64> Window<SPAN> {
     /// So many ns of the bus were asked for at a time, which never runs backwards.
-    pub(super) fn ask(&mut self, at: u64, nanos: u64) {
-        while let Some(&(then, gone)) = self.asked.front().filter(|(then, _)| then + SPAN <= at) {
-            self.asked.pop_front();
+    pub(super) fn request(&mut self, at: u64, nanos: u64) {
+        while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
+            self.requested.pop_front();
             self.sum -= gone;
             debug_assert!(then <= at, "time runs forwards");
         }
-        let is_full = self.asked.len() >= MOMENTS;
-        match self.asked.back_mut() {
+        let is_full = self.requested.len() >= MOMENTS;
+        match self.requested.back_mut() {
             Some((then, sum)) if *then == at || is_full => *sum += nanos,
-            _ => self.asked.push_back((at, nanos)),
+            _ => self.requested.push_back((at, nanos)),
         }
         self.sum += nanos;
-        self.most.raise(self.sum as f64 / SPAN as f64, self.asked.front().map_or(at, |(first, _)| *first));
+        self.most
+            .raise(self.sum as f64 / SPAN as f64, self.requested.front().map_or(at, |(first, _)| *first));
     }
 }
 
@@ -84,10 +85,10 @@ mod tests {
         fn the_most_is_that_of_every_span_that_ends_with_a_request(steps in proptest::collection::vec((0..30_u64, 1..9_u64), 1..80)) {
             let mut window = Window::<50>::default();
             let mut now = 0;
-            let asked: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
-            asked.iter().for_each(|&(at, nanos)| window.ask(at, nanos));
-            let within = |end: u64| -> u64 { asked.iter().filter(|(at, _)| *at <= end && at + 50 > end).map(|(_, n)| n).sum() };
-            let most = asked.iter().map(|(at, _)| within(*at)).max().unwrap();
+            let requested: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
+            requested.iter().for_each(|&(at, nanos)| window.request(at, nanos));
+            let within = |end: u64| -> u64 { requested.iter().filter(|(at, _)| *at <= end && at + 50 > end).map(|(_, n)| n).sum() };
+            let most = requested.iter().map(|(at, _)| within(*at)).max().unwrap();
             prop_assert!((window.most.value - most as f64 / 50.0).abs() < 1e-12);
         }
     }

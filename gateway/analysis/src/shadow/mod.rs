@@ -7,16 +7,16 @@
 //!
 //! A frame's time stamp is taken for the moment at which its sender wanted to send it, which on a bus without bit rate (vcan, the
 //! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
-//! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`GREATEST_QUEUE`] frames wait on a bus.
+//! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`MAX_QUEUE`] frames wait on a bus.
 
+mod bus_timing;
 mod epochs;
-mod lane;
 mod load;
 mod phase;
 mod report;
+mod reported;
 #[cfg(test)]
 mod tests;
-mod told;
 
 use std::fmt::{self, Display, Formatter};
 
@@ -27,14 +27,14 @@ use protocol::wire_time::{BitRates, Bits};
 use crate::bus_model::{BitErrors, BitErrorsError};
 use crate::fit;
 use crate::fit::verdict::Answer;
-use lane::{Known, Lane};
-use told::Told;
+use bus_timing::{Known, LinkId};
+use reported::Reported;
 
+pub use bus_timing::MAX_QUEUE;
 pub use epochs::Answering;
-pub use lane::GREATEST_QUEUE;
 pub use phase::PAUSE_NS;
 pub use report::{BusShadow, Counts, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
-pub use told::Shaded;
+pub use reported::Shaded;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 
 /// A bus without a pause for so long, in ns, is saturated: from joints to joints, as mostly set.
@@ -52,7 +52,7 @@ pub struct Options {
     pub rates: BitRates,
     /// Bit rates by the name of the bus.
     pub of_bus: Vec<(String, BitRates)>,
-    /// How many bits are damaged, as a share, in [0, [`BitErrors::GREATEST`]].
+    /// How many bits are damaged, as a share, in [0, [`BitErrors::MAX`]].
     pub bit_errors: f64,
     /// From what errors are drawn; each bus has its own.
     pub seed: u64,
@@ -99,8 +99,8 @@ const LATEST: u64 = u64::MAX / 2;
 #[derive(Debug)]
 pub struct Shadow {
     options: Options,
-    lanes: Vec<Lane>,
-    told: Option<Told>,
+    bus_timings: Vec<LinkId>,
+    reported: Option<Reported>,
     frames: u64,
     further: u64,
 }
@@ -112,8 +112,8 @@ impl Shadow {
     /// When the bit-error rate is outside its range.
     pub fn new(options: Options) -> Result<Self, BitErrorsError> {
         BitErrors::new(options.bit_errors, options.seed)?;
-        let told = options.each_frame.then(Told::default);
-        Ok(Self { options, lanes: Vec::new(), told, frames: 0, further: 0 })
+        let reported = options.each_frame.then(Reported::default);
+        Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0 })
     }
 
     /// Takes the next frame of a bus, with its time in ns. A time after the year 2262 counts as its end: what a bus makes
@@ -122,52 +122,54 @@ impl Shadow {
         let nanos = nanos.min(LATEST);
         let place = self.frames;
         self.frames += 1;
-        let lane = self.lane(bus);
-        let bits = lane.and_then(|_| Bits::of(frame));
-        if let Some(told) = &mut self.told {
+        let bus_timing = self.bus_timing(bus);
+        let bits = bus_timing.and_then(|_| Bits::of(frame));
+        if let Some(reported) = &mut self.reported {
             let (id, extended) =
                 (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
-            told.enter(Shaded { nanos, bus: lane, id, extended, bits, sent: None });
+            reported.enter(Shaded { nanos, bus: bus_timing, id, extended, bits, sent: None });
         }
-        let Some(lane) = lane.and_then(|lane| self.lanes.get_mut(lane)) else {
+        let Some(bus_timing) = bus_timing.and_then(|bus_timing| self.bus_timings.get_mut(bus_timing)) else {
             self.further += 1;
             return;
         };
-        lane.count(nanos);
+        bus_timing.count(nanos);
         match bits {
-            Some(bits) => lane.take(nanos, frame, bits, place, self.told.as_mut()),
-            None => lane.counts.error_frames += 1,
+            Some(bits) => bus_timing.take(nanos, frame, bits, place, self.reported.as_mut()),
+            None => bus_timing.counts.error_frames += 1,
         }
     }
 
     /// A frame that was on a bus before the capture began, and still says what holds.
-    pub fn in_force(&mut self, bus: &str, nanos: u64, frame: &Frame) {
-        let lane = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane));
-        lane.into_iter().for_each(|lane| lane.in_force(nanos, frame));
+    pub fn latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+        let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
+        bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
     }
 
     /// Frames that whoever took the capture lost.
     pub fn missing(&mut self, bus: &str, frames: u64) {
-        if let Some(lane) = self.lane(bus).and_then(|lane| self.lanes.get_mut(lane)) {
-            lane.counts.missing = lane.counts.missing.saturating_add(frames);
+        if let Some(bus_timing) =
+            self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing))
+        {
+            bus_timing.counts.missing = bus_timing.counts.missing.saturating_add(frames);
         }
     }
 
     /// There is no more: all that waits goes out.
     pub fn finish(&mut self) {
-        self.lanes.iter_mut().for_each(|lane| lane.finish(self.told.as_mut()));
-        self.told.iter_mut().for_each(Told::finish);
+        self.bus_timings.iter_mut().for_each(|bus_timing| bus_timing.finish(self.reported.as_mut()));
+        self.reported.iter_mut().for_each(Reported::finish);
     }
 
     /// The next frame, in the order in which they came, once it is known what became of it.
     pub fn poll(&mut self) -> Option<Shaded> {
-        self.told.as_mut()?.poll()
+        self.reported.as_mut()?.poll()
     }
 
     /// The name of a bus, by [`Shaded::bus`].
     #[must_use]
     pub fn bus(&self, bus: usize) -> &str {
-        self.lanes.get(bus).map_or("", |lane| &lane.name)
+        self.bus_timings.get(bus).map_or("", |bus_timing| &bus_timing.name)
     }
 
     /// What it adds up to.
@@ -177,21 +179,21 @@ impl Shadow {
             frames: self.frames,
             frames_of_other_buses: self.further,
             bit_error_rate: self.options.bit_errors,
-            buses: self.lanes.iter().map(Lane::report).collect(),
+            buses: self.bus_timings.iter().map(LinkId::report).collect(),
         }
     }
 
-    fn lane(&mut self, bus: &str) -> Option<usize> {
+    fn bus_timing(&mut self, bus: &str) -> Option<usize> {
         // Mostly the one of the frame before, or one of a few.
-        let known = self.lanes.iter().position(|lane| lane.name == bus);
-        if known.is_some() || self.lanes.len() >= BUSES {
+        let known = self.bus_timings.iter().position(|bus_timing| bus_timing.name == bus);
+        if known.is_some() || self.bus_timings.len() >= BUSES {
             return known;
         }
-        let index = self.lanes.len();
+        let index = self.bus_timings.len();
         let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
         let errors = BitErrors::new(self.options.bit_errors, seed).ok();
         let errors = errors.filter(|_| self.options.bit_errors > 0.0);
-        self.lanes.push(Lane::new(bus, self.options.of(bus), errors));
+        self.bus_timings.push(LinkId::new(bus, self.options.of(bus), errors));
         Some(index)
     }
 }

@@ -118,7 +118,7 @@ impl Phases {
 #[derive(Debug, Default)]
 pub(super) struct Figures {
     pub(super) frames: u64,
-    asked: u64,
+    requested: u64,
     in_16_ms: Window<SATURATED_NS>,
     in_1_s: Window<SECOND_NS>,
     pub(super) busy: Busy,
@@ -132,11 +132,11 @@ pub(super) struct Figures {
 
 impl Figures {
     /// A frame wants so many ns of the bus.
-    pub(super) fn ask(&mut self, at: u64, took: u64) {
+    pub(super) fn request(&mut self, at: u64, took: u64) {
         self.frames += 1;
-        self.asked += took;
-        self.in_16_ms.ask(at, took);
-        self.in_1_s.ask(at, took);
+        self.requested += took;
+        self.in_16_ms.request(at, took);
+        self.in_1_s.request(at, took);
     }
 
     /// So many frames wait, and of one identifier.
@@ -168,12 +168,13 @@ impl Figures {
         let worst_1_s = match span {
             // Of less than a second, all of it; but a few frames are no load of theirs alone.
             0..SECOND_NS => {
-                let all = self.asked as f64 / span.max(SATURATED_NS) as f64;
+                let all = self.requested as f64 / span.max(SATURATED_NS) as f64;
                 Most { value: worst_1_s.value.max(all), ..worst_1_s }
             }
             _ => worst_1_s,
         };
-        let (mean, busy) = (share(self.asked, span), share(self.busy.total, span.saturating_add(overrun)));
+        let (mean, busy) =
+            (share(self.requested, span), share(self.busy.total, span.saturating_add(overrun)));
         Loads { mean, worst_16_ms: self.in_16_ms.most, worst_1_s, busy }
     }
 

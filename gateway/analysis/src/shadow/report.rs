@@ -76,7 +76,7 @@ pub struct Counts {
     /// Frames that only a bench sends.
     pub bench: BenchFrames,
     /// Whether they are left out.
-    pub bench_left_out: bool,
+    pub bench_omitted: bool,
     /// The driver's error frames, which never were on a wire.
     pub error_frames: u64,
     /// Frames that whoever took the capture lost: the load is that much too low.

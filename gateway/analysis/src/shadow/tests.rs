@@ -113,8 +113,8 @@ fn what_is_too_far_out_of_order_counts_at_a_later_time() {
 
 #[test]
 fn what_is_on_no_real_bus_takes_no_time() {
-    let lane = protocol::wire::Lane { wire: 3, back: false };
-    let wire = lane.frame(protocol::wire::PortMessage::Join);
+    let bus_timing = protocol::wire::LinkId { wire: 3, back: false };
+    let wire = bus_timing.frame(protocol::wire::PortMessage::Join);
     let mut shadow = shadow();
     shadow.frame("vcan0", 0, &wire);
     shadow.frame("vcan0", 0, &classic(ERROR | 4, &[0; 8]));
@@ -155,7 +155,7 @@ fn an_answer_is_late_when_the_next_joints_were_to_go_out_before_its_end() {
 }
 
 #[test]
-fn load_is_what_is_asked_for_even_if_it_does_not_fit() {
+fn load_is_what_is_requested_for_even_if_it_does_not_fit() {
     let mut shadow = shadow();
     let frame = classic(0x2AA, &[0x55; 8]);
     // Every 100 us for 1.1 s: frames of more than 110 us.

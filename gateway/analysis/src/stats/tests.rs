@@ -98,7 +98,7 @@ fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not()
     }
     tape.torque(9, i16::MAX);
     let cell = tape.cell();
-    assert_eq!((cell.missed, cell.repeated, cell.saturated), (2 + 2, 1, 1));
+    assert_eq!((cell.unanswered, cell.repeated, cell.saturated), (2 + 2, 1, 1));
     assert_eq!((cell.first_epoch, cell.last_epoch, cell.torques), (Some(250), Some(9), 6));
     // A heartbeat after it says that the contact has ended: its last word was lost.
     tape.heartbeat(9, 0, State::default());
@@ -106,7 +106,7 @@ fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not()
     tape.joints(11);
     tape.joints(12);
     tape.torque(12, 7);
-    assert_eq!(tape.cell().missed, 4);
+    assert_eq!(tape.cell().unanswered, 4);
 }
 
 #[test]
@@ -119,7 +119,7 @@ fn an_old_heartbeat_does_not_end_a_contact() {
     tape.joints(3);
     tape.joints(4);
     tape.torque(4, 7);
-    assert_eq!(tape.cell().missed, 1);
+    assert_eq!(tape.cell().unanswered, 1);
 }
 
 #[test]
@@ -180,10 +180,10 @@ fn what_is_refused_is_counted_by_reason_and_bus() {
 #[test]
 fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
     let mut tape = Tape::default();
-    let lane = wire::Lane { wire: 3, back: false };
+    let bus_stats = wire::LinkId { wire: 3, back: false };
     tape.joints(0);
-    tape.frame("vcan0", lane.frame(wire::PortMessage::Join));
-    tape.frame("vcan0", lane.frame(wire::PortMessage::Leave));
+    tape.frame("vcan0", bus_stats.frame(wire::PortMessage::Join));
+    tape.frame("vcan0", bus_stats.frame(wire::PortMessage::Leave));
     tape.joints(1);
     let bus = tape.bus();
     assert_eq!((bus.frames, bus.wires, bus.wires_per_s), (2, 2, Some(1_000.0)));
@@ -251,8 +251,8 @@ fn a_claim_of_a_number_that_is_taken_is_no_restart_and_loses_nothing() {
         tape.joints(3);
         tape.torque(3, 7);
         tape.page(owner(43 + lost));
-        let CellReport { lost, restarts, missed, refused, state, .. } = tape.cell();
-        (lost, restarts, missed, refused, state)
+        let CellReport { lost, restarts, unanswered, refused, state, .. } = tape.cell();
+        (lost, restarts, unanswered, refused, state)
     };
     assert_eq!(told(true, 0), told(false, 0));
     assert_eq!((told(true, 5).0, told(true, 5).1, told(true, 5).2), (5, 0, 1), "what is lost is still lost");

@@ -128,7 +128,7 @@ impl Outlet {
 
 /// The recorder's end of a bus.
 #[derive(Debug)]
-pub struct Lane {
+pub struct LinkId {
     pub(super) frames: rtrb::Consumer<Captured>,
     pub(super) touched: Option<rtrb::Consumer<Touched>>,
     /// How its cells are.
@@ -139,18 +139,18 @@ pub struct Lane {
 
 /// The queues of a bus, both ends; `all` when not only frames are wanted.
 #[must_use]
-pub fn lane(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, Lane) {
+pub fn bus_feed(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, LinkId) {
     let (frames, taken) = rtrb::RingBuffer::new(FRAMES);
-    let (touched, felt) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
+    let (touched, contact_state) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
     let outlet = Outlet { frames, touched, unrecorded: 0, untold: 0, untouched: 0 };
-    (outlet, Lane { frames: taken, touched: felt, view, state })
+    (outlet, LinkId { frames: taken, touched: contact_state, view, state })
 }
 
 /// All that comes to the recorder.
 #[derive(Debug)]
 pub struct Feed {
     /// Each bus.
-    pub lanes: Vec<Lane>,
+    pub bus_feeds: Vec<LinkId>,
     /// The control loop's ticks.
     pub ticks: Option<rtrb::Consumer<Timed>>,
 }
@@ -162,22 +162,24 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_said_where_it_is_missing() {
-        let (mut outlet, mut lane) = lane(false, Arc::default(), Arc::default());
+        let (mut outlet, mut bus_feed) = bus_feed(false, Arc::default(), Arc::default());
         let frame = |at_nanos| Seen { at_nanos, own: false, frame: Frame::EMPTY };
         let all = FRAMES as u64;
         (0..all + 7).for_each(|at| outlet.frame(frame(at)));
         assert_eq!(outlet.unrecorded(), Unrecorded { frames: 7, epochs: 0 });
         let mut taken = 0;
-        while let Ok(Captured::Frame(seen)) = lane.frames.pop() {
+        while let Ok(Captured::Frame(seen)) = bus_feed.frames.pop() {
             assert_eq!(seen.at_nanos, taken);
             taken += 1;
         }
         assert_eq!(taken, all);
         outlet.frame(frame(1_000_000));
         outlet.frame(frame(1_000_001));
-        let said = lane.frames.pop().unwrap();
+        let said = bus_feed.frames.pop().unwrap();
         assert!(matches!(said, Captured::Unrecorded { at_nanos: 1_000_000, frames: 7 }), "{said:?}");
-        assert!(matches!(lane.frames.pop().unwrap(), Captured::Frame(seen) if seen.at_nanos == 1_000_000));
+        assert!(
+            matches!(bus_feed.frames.pop().unwrap(), Captured::Frame(seen) if seen.at_nanos == 1_000_000)
+        );
         assert_eq!(outlet.unrecorded().frames, 7);
     }
 }

@@ -17,7 +17,7 @@ use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{self, Epoch, Half, Packet, Paired};
+use protocol::packet::{self, Epoch, Packet, Reassembly, Segment};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
@@ -34,17 +34,17 @@ pub struct Seen {
 
 /// The frames of one packet, and its place in the bus' order.
 #[derive(Debug)]
-struct Said {
+struct PlacedPacket {
     place: u64,
     frames: [Option<Seen>; 2],
 }
 
-type Kept = Option<Arc<Said>>;
+type Kept = Option<Arc<PlacedPacket>>;
 
 /// Where a page that a cell feels stands: who said it, the last joints before that, and those from which on it holds.
 #[derive(Clone, Debug)]
-struct Felt {
-    said: Arc<Said>,
+struct ContactPage {
+    placed_packet: Arc<PlacedPacket>,
     before: Kept,
     since: Kept,
 }
@@ -60,39 +60,39 @@ struct Cell {
     /// Its last word on where its sums go.
     tree: Kept,
     /// By number: the last writes of what is not stored.
-    switches: BTreeMap<u8, Arc<Said>>,
+    switches: BTreeMap<u8, Arc<PlacedPacket>>,
     /// By number: the last writes that a commit has taken into use, and that commit.
-    committed: BTreeMap<u8, Arc<Said>>,
+    committed: BTreeMap<u8, Arc<PlacedPacket>>,
     commit: Kept,
     /// By number: the last writes since then, and a commit that has not been answered.
-    staged: BTreeMap<u8, Arc<Said>>,
-    asked: Kept,
-    contact: Contact<Felt>,
+    staged: BTreeMap<u8, Arc<PlacedPacket>>,
+    requested: Kept,
+    contact: Contact<ContactPage>,
 }
 
 /// The packets of one bus that are in force.
 #[derive(Debug)]
-pub struct InForce {
+pub struct Latched {
     /// Packets so far.
     places: u64,
     cells: PerCell<Cell>,
-    joints: Option<(Epoch, Arc<Said>)>,
+    joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: Kept,
     /// By identifier: a classic first half whose second one is to come.
-    halves: Vec<(Half, Option<Seen>)>,
+    segments: Vec<(Segment, Option<Seen>)>,
     /// Identifiers of the gateway's side of which a first half stood on the bus last, and when, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
 
-impl Default for InForce {
+impl Default for Latched {
     fn default() -> Self {
         Self {
             places: 0,
             cells: PerCell::default(),
             joints: None,
             halt: None,
-            halves: vec![(Half::NONE, None); 1 << 11],
+            segments: vec![(Segment::NONE, None); 1 << 11],
             open: BTreeMap::new(),
         }
     }
@@ -105,7 +105,7 @@ impl Cell {
         self.contact.set_obeys(obeys);
     }
 
-    fn heartbeat(&mut self, heartbeat: &Heartbeat, said: &Arc<Said>) {
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
         let word = self.claim.hear(heartbeat);
         if word == Word::Claimant {
             return;
@@ -114,26 +114,26 @@ impl Cell {
             self.clear(true);
             self.switches.clear();
             self.staged.clear();
-            self.asked = None;
+            self.requested = None;
         }
         if heartbeat.state.has(State::CLAIMING) {
             let [first, last] = &mut self.starts;
             if heartbeat.sent == 0 {
-                *first = Some(Arc::clone(said));
+                *first = Some(Arc::clone(placed_packet));
             }
-            *last = Some(Arc::clone(said));
+            *last = Some(Arc::clone(placed_packet));
         }
-        self.heartbeat = Some(Arc::clone(said));
+        self.heartbeat = Some(Arc::clone(placed_packet));
     }
 
-    fn write(&mut self, number: u8, said: &Arc<Said>, obeys: bool) {
+    fn write(&mut self, number: u8, placed_packet: &Arc<PlacedPacket>, obeys: bool) {
         let parameter = Parameter::from_number(number);
         if parameter == Some(Parameter::Commit) {
-            self.asked = Some(Arc::clone(said));
+            self.requested = Some(Arc::clone(placed_packet));
         } else if parameter.is_some_and(Parameter::is_volatile) {
-            self.switches.insert(number, Arc::clone(said));
+            self.switches.insert(number, Arc::clone(placed_packet));
         } else if parameter.is_some() {
-            self.staged.insert(number, Arc::clone(said));
+            self.staged.insert(number, Arc::clone(placed_packet));
         }
         if parameter == Some(Parameter::Mode) {
             self.clear(obeys);
@@ -142,33 +142,41 @@ impl Cell {
 
     /// It has taken into use what was written before the commit that was asked last.
     fn commit(&mut self) {
-        let Some(asked) = self.asked.take() else { return };
+        let Some(requested) = self.requested.take() else { return };
         let staged = std::mem::take(&mut self.staged).into_iter();
-        let (mut taken, later): (BTreeMap<_, _>, _) = staged.partition(|(_, said)| said.place < asked.place);
+        let (mut taken, later): (BTreeMap<_, _>, _) =
+            staged.partition(|(_, placed_packet)| placed_packet.place < requested.place);
         self.committed.append(&mut taken);
-        (self.staged, self.commit) = (later, Some(asked));
+        (self.staged, self.commit) = (later, Some(requested));
     }
 
     /// What the cell itself says that it feels, when nothing else is known of it.
-    fn learn(&mut self, page: SensorPage, felt: Felt) {
-        let joints = felt.before.as_ref().map_or(0, |joints| joints.place);
-        if !self.contact.waiting().iter().any(|(_, _, felt)| felt.said.place < joints) {
-            self.contact.learn(page, felt);
+    fn learn(&mut self, page: SensorPage, contact_page: ContactPage) {
+        let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
+        if !self
+            .contact
+            .waiting()
+            .iter()
+            .any(|(_, _, contact_page)| contact_page.placed_packet.place < joints)
+        {
+            self.contact.learn(page, contact_page);
         }
     }
 
-    fn packets(&self) -> impl Iterator<Item = &Arc<Said>> {
-        let said = [&self.heartbeat, &self.tree, &self.commit, &self.asked].into_iter().chain(&self.starts);
+    fn packets(&self) -> impl Iterator<Item = &Arc<PlacedPacket>> {
+        let placed_packet =
+            [&self.heartbeat, &self.tree, &self.commit, &self.requested].into_iter().chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
-        let waiting = self.contact.waiting().iter().map(|(_, _, felt)| felt);
-        let felt = self.contact.latched().map(|(_, felt)| felt).chain(waiting);
-        let felt =
-            felt.flat_map(|Felt { said, before, since }| core::iter::once(said).chain(before).chain(since));
-        said.flatten().chain(written).chain(felt)
+        let waiting = self.contact.waiting().iter().map(|(_, _, contact_page)| contact_page);
+        let contact_page = self.contact.latched().map(|(_, contact_page)| contact_page).chain(waiting);
+        let contact_page = contact_page.flat_map(|ContactPage { placed_packet, before, since }| {
+            core::iter::once(placed_packet).chain(before).chain(since)
+        });
+        placed_packet.flatten().chain(written).chain(contact_page)
     }
 }
 
-impl InForce {
+impl Latched {
     /// Takes a frame that stood on the bus. Bounded work; what is no packet counts for nothing.
     pub fn take(&mut self, seen: Seen) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
@@ -180,7 +188,7 @@ impl InForce {
         let Some((frames, packet)) = self.packet(id, seen) else { return };
         let Ok(message) = Message::decode(&packet) else { return };
         self.places += 1;
-        self.hear(&message, &Arc::new(Said { place: self.places, frames }));
+        self.hear(&message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
     /// The packet that a frame is or completes.
@@ -188,13 +196,13 @@ impl InForce {
         if seen.frame.format() == Format::Fd {
             return Some(([Some(seen), None], Packet::from_fd(&seen.frame).ok()?));
         }
-        let (half, first) = self.halves.get_mut(usize::from(id.to_bits()))?;
-        match half.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
-            Ok(Paired::Whole(packet)) => {
+        let (segment, first) = self.segments.get_mut(usize::from(id.to_bits()))?;
+        match segment.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
+            Ok(Reassembly::Complete(packet)) => {
                 self.open.remove(&id.to_bits());
                 Some(([first.take(), Some(seen)], packet))
             }
-            Ok(Paired::Waiting | Paired::Incomplete) => {
+            Ok(Reassembly::Waiting | Reassembly::Incomplete) => {
                 *first = Some(seen);
                 if !id.kind.is_from_cells() {
                     self.open.insert(id.to_bits(), seen.at_nanos);
@@ -209,14 +217,14 @@ impl InForce {
     /// the two.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
-        let within = |bits: u16| Half::within(Id::from_bits(bits)).0 * 1_000;
+        let within = |bits: u16| Segment::within(Id::from_bits(bits)).0 * 1_000;
         self.open.iter().any(|(bits, at)| now_nanos < at.saturating_add(within(*bits)))
     }
 
-    fn hear(&mut self, message: &Message, said: &Arc<Said>) {
+    fn hear(&mut self, message: &Message, placed_packet: &Arc<PlacedPacket>) {
         let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
-        let felt = || Felt {
-            said: Arc::clone(said),
+        let contact_page = || ContactPage {
+            placed_packet: Arc::clone(placed_packet),
             before: self.joints.as_ref().map(|(_, joints)| Arc::clone(joints)),
             since: None,
         };
@@ -224,22 +232,23 @@ impl InForce {
             // Cells drop joints of the last epoch.
             if last != Some(epoch) {
                 for (_, cell) in self.cells.iter_mut() {
-                    cell.contact.latch(epoch, |felt| felt.since = Some(Arc::clone(said)));
+                    cell.contact
+                        .latch(epoch, |contact_page| contact_page.since = Some(Arc::clone(placed_packet)));
                 }
             }
-            self.joints = Some((epoch, Arc::clone(said)));
+            self.joints = Some((epoch, Arc::clone(placed_packet)));
         } else if let Message::Halt | Message::Resume = message {
-            self.halt = Some(Arc::clone(said));
+            self.halt = Some(Arc::clone(placed_packet));
         } else if let Message::Network { from, page, .. } = *message {
             let Some(cell) = self.cells.named(from).first_mut() else { return };
             if let NetworkPage::Heartbeat(heartbeat) = page {
-                cell.heartbeat(&heartbeat, said);
+                cell.heartbeat(&heartbeat, placed_packet);
             } else if let NetworkPage::Tree(_) = page {
-                cell.tree = Some(Arc::clone(said));
+                cell.tree = Some(Arc::clone(placed_packet));
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             let obeys = words.first() == Some(&1);
-            self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, said, obeys));
+            self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, placed_packet, obeys));
         } else if let Message::Configured {
             from, answer: Answer::Value { number, written: true, .. }, ..
         } = *message
@@ -248,15 +257,15 @@ impl InForce {
                 cell.commit();
             }
         } else if let Message::Stimulus { to, from, page } = *message {
-            let felt = felt();
+            let contact_page = contact_page();
             self.cells
                 .named(to)
                 .iter_mut()
-                .for_each(|cell| cell.contact.push(from, page, felt.clone(), last));
+                .for_each(|cell| cell.contact.push(from, page, contact_page.clone(), last));
         } else if let Message::Sensors { from, epoch, page } = *message {
-            let felt = felt();
+            let contact_page = contact_page();
             if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch)) {
-                cell.learn(page, felt);
+                cell.learn(page, contact_page);
             }
         }
     }
@@ -266,8 +275,9 @@ impl InForce {
     pub fn frames(&self) -> Vec<Seen> {
         let joints = self.joints.iter().map(|(_, joints)| joints);
         let packets = self.cells.iter().flat_map(|(_, cell)| cell.packets()).chain(joints).chain(&self.halt);
-        let ordered: BTreeMap<_, _> = packets.map(|said| (said.place, said)).collect();
-        ordered.values().flat_map(|said| said.frames.iter().flatten().copied()).collect()
+        let ordered: BTreeMap<_, _> =
+            packets.map(|placed_packet| (placed_packet.place, placed_packet)).collect();
+        ordered.values().flat_map(|placed_packet| placed_packet.frames.iter().flatten().copied()).collect()
     }
 }
 
@@ -279,7 +289,7 @@ mod tests {
     use protocol::message::{From, Joints, SkinSensors, Tree};
     use protocol::packet::WORDS;
 
-    fn say(force: &mut InForce, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
+    fn say(force: &mut Latched, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
         let frames: Vec<_> = message.encode().frames(format).collect();
         frames.iter().for_each(|&frame| force.take(Seen { at_nanos, own: true, frame }));
         frames
@@ -307,7 +317,7 @@ mod tests {
     #[test]
     fn the_last_of_everything_is_kept_in_both_formats() {
         for format in [Format::Fd, Format::Classic] {
-            let mut force = InForce::default();
+            let mut force = Latched::default();
             let cell = CellId::new(3).unwrap();
             say(&mut force, 1, format, &heartbeat(3, 1));
             let write = |number, word| Message::Configure {
@@ -344,8 +354,8 @@ mod tests {
     }
 
     #[test]
-    fn of_stimuli_those_are_kept_that_are_felt_or_wait_with_the_joints_that_say_which() {
-        let mut force = InForce::default();
+    fn of_stimuli_those_are_kept_that_are_contact_page_or_wait_with_the_joints_that_say_which() {
+        let mut force = Latched::default();
         let mut kept = vec![];
         let mut now = 0;
         let mut say = |message: &Message, keep: bool| {
@@ -367,8 +377,8 @@ mod tests {
     }
 
     #[test]
-    fn who_has_started_anew_has_nothing_in_force_but_what_was_committed() {
-        let mut force = InForce::default();
+    fn who_has_restarted_has_nothing_latched_but_what_was_committed() {
+        let mut force = Latched::default();
         let to = Node::Cell(CellId::new(3).unwrap());
         let write = |number, word| {
             let request = Request::Write { number, words: [word, 0, 0, 0, 0, 0] };
@@ -380,10 +390,10 @@ mod tests {
             let beat = Heartbeat { state: State::CLAIMING, sent, ..Heartbeat::default() };
             Message::Network { from: to, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
         };
-        let said = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
-        let said = [&said[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
-        let kept = |force: &InForce| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
-        (0..).zip(&said).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
+        let placed_packet = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
+        let placed_packet = [&placed_packet[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
+        let kept = |force: &Latched| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
+        (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         assert_eq!(kept(&force), [0, 1, 3, 4, 5, 6, 7]);
         say(&mut force, 8, Format::Fd, &claims(0));
         say(&mut force, 9, Format::Fd, &claims(1));
@@ -391,10 +401,10 @@ mod tests {
     }
 
     #[test]
-    fn nobody_begins_between_the_halves_of_what_the_gateway_says() {
-        let mut force = InForce::default();
-        let halves = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
-        let (ours, theirs) = (halves(&joints(1)), halves(&heartbeat(3, 1)));
+    fn nobody_begins_between_the_segments_of_what_the_gateway_says() {
+        let mut force = Latched::default();
+        let segments = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
+        let (ours, theirs) = (segments(&joints(1)), segments(&heartbeat(3, 1)));
         let mut take = |at_nanos, frame| {
             force.take(Seen { at_nanos, own: true, frame });
             [0, 14_000_000, 16_000_000].map(|later| force.is_within_a_packet(at_nanos + later))
@@ -413,10 +423,10 @@ mod tests {
         };
         let write =
             |number| Message::Configure { to, tag: 0, request: Request::Write { number, words: [1; 6] } };
-        let said =
+        let placed_packet =
             [beat(7, 40, State::CONFIGURED), write(7), write(1), joints(1), stimulus(3, 1.0, 2), joints(2)];
-        let mut force = InForce::default();
-        (0..).zip(&said).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
+        let mut force = Latched::default();
+        (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         let before = force.frames();
         say(&mut force, 9, Format::Fd, &beat(9, 0, State::CLAIMING));
         assert_eq!(force.frames(), before);

@@ -34,11 +34,11 @@ impl Text {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn create(wanted: &Candump, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
-        let log = if wanted.numbered && !force {
-            LogFile::create_numbered(&wanted.path, stopped)?
+    pub fn create(target: &Candump, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
+        let log = if target.numbered && !force {
+            LogFile::create_numbered(&target.path, stopped)?
         } else {
-            LogFile::create(&wanted.path, force, stopped)?
+            LogFile::create(&target.path, force, stopped)?
         };
         let lines = String::with_capacity(PIECE + 256);
         Ok(Self { log, failed: false, lines, waiting: 0, frames: 0, lost: 0 })
@@ -125,8 +125,8 @@ mod tests {
     use protocol::can::Frame;
 
     fn text(path: &Path) -> Text {
-        let wanted = Candump { path: path.to_owned(), numbered: false };
-        Text::create(&wanted, false, &AtomicBool::new(false)).unwrap()
+        let target = Candump { path: path.to_owned(), numbered: false };
+        Text::create(&target, false, &AtomicBool::new(false)).unwrap()
     }
 
     fn seen(at: u64) -> Seen {

@@ -13,8 +13,8 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
 use super::facts::realtime_minus_monotonic;
-use super::feed::{Captured, FRAMES, Feed, Lane};
-use super::force::InForce;
+use super::feed::{Captured, FRAMES, Feed, LinkId};
+use super::force::Latched;
 use super::text::Text;
 use super::topics::Topics;
 use super::{Outputs, Stop};
@@ -24,7 +24,7 @@ use trace::files::sync;
 use trace::recording::account::{Recording, Written};
 use trace::recording::layout::Layout;
 use trace::recording::series::{Count, Head, Said, Series, Writer};
-use trace::ros2::skin::Felt;
+use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
 /// The thread's rhythm.
@@ -32,14 +32,14 @@ const LOOK: Duration = Duration::from_millis(10);
 /// What has been written for so long is handed on: what a killed run may lose, beside one [`LOOK`].
 const FLUSH: Duration = Duration::from_millis(40);
 /// How often the kernel is asked for what its backlog dropped.
-const ASK: Duration = Duration::from_millis(100);
+const REQUEST: Duration = Duration::from_millis(100);
 /// How often the state of everything is recorded.
 const DIAGNOSE: Duration = Duration::from_millis(500);
 
 /// One bus, as the recorder sees it.
 #[derive(Default)]
 struct Seen {
-    in_force: InForce,
+    latched: Latched,
     /// Frames recorded or counted as lost.
     frames: u64,
     /// Dropped by the bus.
@@ -73,8 +73,8 @@ pub(super) struct Work {
     backlog: Option<u64>,
     ticks: u64,
     ticks_skipped: u64,
-    greatest_late_ns: u64,
-    scratch: (Vec<Felt>, Vec<Point>),
+    max_late_ns: u64,
+    scratch: (Vec<ContactState>, Vec<Point>),
 }
 
 /// Something that happens now and then.
@@ -97,7 +97,7 @@ impl Every {
 impl Work {
     pub(super) fn new(outputs: Outputs, feed: Feed, layout: Layout, tell: Sender<String>) -> Self {
         let Outputs { text, series } = outputs;
-        let buses = feed.lanes.iter().map(|_| Seen::default()).collect();
+        let buses = feed.bus_feeds.iter().map(|_| Seen::default()).collect();
         Self {
             files: Files { text, series, errors: Vec::new() },
             feed,
@@ -109,7 +109,7 @@ impl Work {
             backlog: backlog::dropped(),
             ticks: 0,
             ticks_skipped: 0,
-            greatest_late_ns: 0,
+            max_late_ns: 0,
             scratch: (Vec::new(), Vec::new()),
         }
     }
@@ -119,15 +119,16 @@ impl Work {
         if let Some(series) = &mut self.files.series {
             series.begin(head, |writer| Topics::new(writer, &self.layout));
         }
-        let (mut flush, mut ask, mut diagnose) = (Every::new(FLUSH), Every::new(ASK), Every::new(DIAGNOSE));
+        let (mut flush, mut request, mut diagnose) =
+            (Every::new(FLUSH), Every::new(REQUEST), Every::new(DIAGNOSE));
         loop {
             let ended = stop.now.load(Ordering::Acquire);
             let taken = self.take();
             if ended && stop.discard.load(Ordering::Relaxed) {
                 return self.discard();
             }
-            if ask.is_due() || ended {
-                self.ask_kernel();
+            if request.is_due() || ended {
+                self.request_kernel();
             }
             if diagnose.is_due() || ended {
                 self.diagnose();
@@ -151,7 +152,7 @@ impl Work {
         let offset = realtime_minus_monotonic();
         let mut most = 0;
         self.take_ticks(offset);
-        for bus in 0..self.feed.lanes.len() {
+        for bus in 0..self.feed.bus_feeds.len() {
             most = most.max(self.take_frames(bus));
             self.take_touched(bus);
         }
@@ -159,20 +160,20 @@ impl Work {
     }
 
     fn take_frames(&mut self, bus: usize) -> usize {
-        let (Some(lane), Some(seen), Some(name)) =
-            (self.feed.lanes.get_mut(bus), self.buses.get_mut(bus), self.layout.buses.get(bus))
+        let (Some(bus_feed), Some(seen), Some(name)) =
+            (self.feed.bus_feeds.get_mut(bus), self.buses.get_mut(bus), self.layout.buses.get(bus))
         else {
             return 0;
         };
         // What comes while this is written is the next round's, so that other queues have their turn.
-        let waiting = lane.frames.slots();
-        let Ok(waiting) = lane.frames.read_chunk(waiting) else { return 0 };
+        let waiting = bus_feed.frames.slots();
+        let Ok(waiting) = bus_feed.frames.read_chunk(waiting) else { return 0 };
         let taken = waiting.len();
         for captured in waiting {
             match captured {
                 Captured::Frame(frame) => {
                     seen.frames += 1;
-                    seen.in_force.take(frame);
+                    seen.latched.take(frame);
                     seen.missing += u64::from(self.files.is_between());
                     self.files.text(|text| text.frame(name, &frame));
                     self.files.put(Count::FRAME, |writer, topics| topics.frame(writer, bus, name, &frame));
@@ -198,7 +199,7 @@ impl Work {
             self.q = Some(timed.record.q);
             self.ticks += 1;
             self.ticks_skipped += timed.record.skipped;
-            self.greatest_late_ns = self.greatest_late_ns.max(timed.late_ns);
+            self.max_late_ns = self.max_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
             self.files.put(Count::others(4), |writer, topics| topics.tick(writer, layout, nanos, &timed));
@@ -206,10 +207,10 @@ impl Work {
     }
 
     fn take_touched(&mut self, bus: usize) {
-        let (Some(lane), Some(seen)) = (self.feed.lanes.get_mut(bus), self.buses.get_mut(bus)) else {
+        let (Some(bus_feed), Some(seen)) = (self.feed.bus_feeds.get_mut(bus), self.buses.get_mut(bus)) else {
             return;
         };
-        let Some(queue) = &mut lane.touched else { return };
+        let Some(queue) = &mut bus_feed.touched else { return };
         while let Ok(touched) = queue.pop() {
             let cloud = seen.epochs.is_multiple_of(self.layout.epochs_per_cloud);
             let q = self.q.as_ref().filter(|_| cloud);
@@ -225,7 +226,7 @@ impl Work {
     }
 
     /// What the kernel dropped on the way to all sockets: of which bus, if of any, nobody knows.
-    fn ask_kernel(&mut self) {
+    fn request_kernel(&mut self) {
         let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
         let frames = total.saturating_sub(before);
         self.backlog = Some(total);
@@ -244,11 +245,11 @@ impl Work {
             values: vec![
                 ("ticks", mem::take(&mut self.ticks).to_string()),
                 ("skipped", mem::take(&mut self.ticks_skipped).to_string()),
-                ("greatest_late_us", (mem::take(&mut self.greatest_late_ns) / 1_000).to_string()),
+                ("greatest_late_us", (mem::take(&mut self.max_late_ns) / 1_000).to_string()),
             ],
         }];
-        let buses = self.feed.lanes.iter().zip(&self.layout.buses).zip(&self.buses);
-        parts.extend(buses.map(|((lane, name), seen)| bus(lane, name, seen)));
+        let buses = self.feed.bus_feeds.iter().zip(&self.layout.buses).zip(&self.buses);
+        parts.extend(buses.map(|((bus_feed, name), seen)| bus(bus_feed, name, seen)));
         let lost = series.lost();
         let unrecorded: u64 = self.buses.iter().map(|bus| bus.unrecorded).sum();
         let all_well = lost.frames + lost.others + unrecorded == 0;
@@ -272,16 +273,15 @@ impl Work {
         let Some(series) = &mut self.files.series else { return };
         // Both halves of what the cells are told stand in one file.
         let now = wall();
-        let holds = self.buses.iter().any(|bus| bus.in_force.is_within_a_packet(now));
+        let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
         if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
         // So that this file can be understood without the one before.
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
-            for frame in seen.in_force.frames() {
-                series.put(Count::others(1), |writer, topics| {
-                    topics.in_force(writer, now, (bus, name), &frame)
-                });
+            for frame in seen.latched.frames() {
+                series
+                    .put(Count::others(1), |writer, topics| topics.latched(writer, now, (bus, name), &frame));
             }
         }
         for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
@@ -396,10 +396,10 @@ fn dropped(frames: u64, place: &str, total: u64) -> String {
 }
 
 /// How a bus is.
-fn bus(lane: &Lane, name: &str, seen: &Seen) -> Diagnosis {
-    let works = lane.state.is_there();
+fn bus(bus_feed: &LinkId, name: &str, seen: &Seen) -> Diagnosis {
+    let works = bus_feed.state.is_there();
     let (mut cells, mut silent) = (0, 0);
-    if let Ok(view) = lane.view.lock() {
+    if let Ok(view) = bus_feed.view.lock() {
         cells = view.cells.len();
         silent = view.cells.iter().filter(|cell| !cell.heard || cell.dead).count();
     }

@@ -16,7 +16,7 @@ use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
 use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
-use trace::ros2::skin::{Felt, LoopTiming, PatchState, Torques};
+use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
 /// What positions of points are relative to.
@@ -82,7 +82,7 @@ impl Topics {
     ///
     /// # Errors
     /// See above.
-    pub fn in_force(
+    pub fn latched(
         &mut self,
         writer: &mut Writer,
         nanos: u64,
@@ -127,7 +127,7 @@ impl Topics {
         let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
         writer.write(&mut self.joint_commands, nanos, &command)?;
         let (central, active) = match &timed.central {
-            Some((_, felt)) => (of(names.len(), &felt.torque), felt.active),
+            Some((_, contact_state)) => (of(names.len(), &contact_state.torque), contact_state.active),
             None => (&[][..], 0),
         };
         writer.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active })?;
@@ -145,33 +145,33 @@ impl Topics {
         place: usize,
         touched: &Touched,
         q: Option<&[f64; MAX_JOINTS]>,
-        scratch: &mut (Vec<Felt>, Vec<Point>),
+        scratch: &mut (Vec<ContactState>, Vec<Point>),
     ) -> io::Result<()> {
         let (Some(patch), Some([state, points])) = (layout.patches.get(place), self.patches.get_mut(place))
         else {
             return Ok(());
         };
         let Some(central) = layout.central.get(patch.bus) else { return Ok(()) };
-        let (felt, cloud) = scratch;
-        felt.clear();
-        felt.extend(patch.cells.iter().map(|&(cell, node)| {
+        let (contact_state, cloud) = scratch;
+        contact_state.clear();
+        contact_state.extend(patch.cells.iter().map(|&(cell, node)| {
             let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, Status::Unknown));
             #[expect(clippy::cast_possible_truncation, reason = "words of 16 bits")]
             let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
                 (central.force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
             });
-            Felt { node, force, proximity, status: number(status) }
+            ContactState { node, force, proximity, status: number(status) }
         }));
         let nanos = touched.at_nanos;
-        let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells: felt };
+        let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells: contact_state };
         writer.write(state, nanos, &message)?;
         let Some(q) = q else { return Ok(()) };
         let frames = central.frames_at(q);
         cloud.clear();
-        cloud.extend(felt.iter().zip(&patch.cells).map(|(felt, &(cell, _))| {
+        cloud.extend(contact_state.iter().zip(&patch.cells).map(|(contact_state, &(cell, _))| {
             #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]
             let position = central.position(cell, &frames).map(|metres| metres as f32);
-            Point { position, force: felt.force }
+            Point { position, force: contact_state.force }
         }));
         writer.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud })
     }

@@ -7,7 +7,7 @@ use protocol::message::State;
 use thiserror::Error;
 
 use super::Options;
-use super::judge::Judge;
+use super::comparator::Comparator;
 use super::start::Routes;
 use super::survey::{Bus, Cell, Known, Survey};
 use crate::setup::names;
@@ -18,7 +18,7 @@ pub enum Mismatch {
     /// All of them.
     #[error(
         "the recording is of another skin: all {count} cells have another configuration than then, {cells}; {}",
-        remedy(*.spawned)
+        hint(*.spawned)
     )]
     Skin {
         /// How many there are.
@@ -29,7 +29,7 @@ pub enum Mismatch {
         spawned: bool,
     },
     /// Some.
-    #[error("cells have another configuration than in the recording: {cells}; {}", remedy(*.spawned))]
+    #[error("cells have another configuration than in the recording: {cells}; {}", hint(*.spawned))]
     Cells {
         /// Which, with their configurations.
         cells: String,
@@ -47,7 +47,7 @@ pub enum Mismatch {
     Unknown,
 }
 
-fn remedy(spawned: bool) -> &'static str {
+fn hint(spawned: bool) -> &'static str {
     if spawned {
         "name the recording's skin with --skin"
     } else {
@@ -67,12 +67,12 @@ pub(super) struct Checks {
 
 impl Checks {
     /// What a lane is called now.
-    pub(super) fn lane(&self, lane: usize) -> &str {
-        self.routes.names.get(lane).map_or("", |(_, name)| name)
+    pub(super) fn bus_link(&self, bus_link: usize) -> &str {
+        self.routes.names.get(bus_link).map_or("", |(_, name)| name)
     }
 
     /// Each lane's name and its bus in the capture.
-    pub(super) fn lanes(&self) -> impl Iterator<Item = (&str, &Bus)> {
+    pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &Bus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
     }
@@ -84,36 +84,36 @@ impl Checks {
 
     /// The same, by lane.
     pub(super) fn recorded(&self) -> Vec<BTreeSet<CellId>> {
-        self.lanes().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
+        self.bus_links().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
     }
 
     /// Whether the state in force where the replay begins has to be brought about with new parameters: then cells
     /// have them only after that.
     pub(super) fn configures(&self) -> bool {
-        self.lanes().any(|(_, bus)| bus.state.configures())
+        self.bus_links().any(|(_, bus)| bus.state.configures())
     }
 
     /// Whether cells that were just started are in the state in which the replay begins.
     pub(super) fn are_fresh(&self) -> bool {
-        self.options.spawn.is_some() && self.lanes().all(|(_, bus)| bus.state.is_fresh())
+        self.options.spawn.is_some() && self.bus_links().all(|(_, bus)| bus.state.is_fresh())
     }
 
     /// Cells whose configuration in the recording is not known.
     pub(super) fn unchecked(&self) -> u64 {
         let unknown = |bus| self.cells(bus).filter(|(_, cell)| hash(cell).is_none()).count() as u64;
-        self.lanes().map(|(_, bus)| unknown(bus)).sum()
+        self.bus_links().map(|(_, bus)| unknown(bus)).sum()
     }
 
     /// The cells have to be there, with the configuration that they had.
-    pub(super) fn hashes(&self, judge: &Judge) -> Result<(), Mismatch> {
+    pub(super) fn hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
         if !self.options.expect {
             return Ok(());
         }
         let (mut absent, mut other) = (Vec::new(), Vec::new());
         let (mut equal, mut others, mut count) = (0_usize, 0_usize, 0_usize);
-        for (lane, (name, bus)) in self.lanes().enumerate() {
-            let there: BTreeMap<_, _> = judge
-                .settled(lane)
+        for (bus_link, (name, bus)) in self.bus_links().enumerate() {
+            let there: BTreeMap<_, _> = comparator
+                .settled(bus_link)
                 .filter_map(|(cell, present)| Some((cell, present.claim.heartbeat()?.configuration)))
                 .collect();
             let (mut missing, mut differing) = (Vec::new(), Vec::new());
@@ -151,13 +151,14 @@ impl Checks {
     }
 
     /// The cells on each lane that measure, though in the recording they obeyed stimuli.
-    pub(super) fn measuring(&self, judge: &Judge) -> Vec<Vec<CellId>> {
-        let measures = |(lane, (_, bus)): (usize, (&str, &Bus))| {
+    pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
+        let measures = |(bus_link, (_, bus)): (usize, (&str, &Bus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
-            let now = judge.settled(lane).filter(|(_, present)| !present.claim.says(State::TEST_MODE));
+            let now =
+                comparator.settled(bus_link).filter(|(_, present)| !present.claim.says(State::TEST_MODE));
             now.map(|(cell, _)| cell).filter(obeyed).collect()
         };
-        self.lanes().enumerate().map(measures).collect()
+        self.bus_links().enumerate().map(measures).collect()
     }
 }
 

@@ -8,7 +8,7 @@ use protocol::message::{Answer, Message};
 use protocol::packet::{Epoch, Packet, WORDS};
 use serde::Serialize;
 
-use super::judge::Own;
+use super::comparator::Own;
 use model::decode::Decoded;
 
 /// A reply to joints.

@@ -107,7 +107,7 @@ pub enum ReplayError {
     },
     /// Another gateway is on a bus.
     #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]
-    Rival(String),
+    OtherGateway(String),
     /// Nobody is there.
     #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
     NoCell(String),
@@ -157,7 +157,7 @@ impl ReplayError {
             | Self::Line(_)
             | Self::CellsThere { .. }
             | Self::Ended { .. }
-            | Self::Rival(_)
+            | Self::OtherGateway(_)
             | Self::NoCell(_)
             | Self::Mismatch(_)
             | Self::NoTestMode(_)

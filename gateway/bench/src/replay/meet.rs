@@ -11,12 +11,12 @@ use protocol::message::{Message, Request, State};
 use protocol::parameters::Parameter;
 
 use super::ReplayError;
-use super::judge::Judge;
+use super::comparator::Comparator;
 use super::session::Session;
-use super::start::Wearing;
+use super::start::SkinOverride;
 use crate::run::RunError;
 use crate::run::launch::STARTING;
-use crate::setup::{Patience, names};
+use crate::setup::{Timeout, names};
 
 /// Cells that were there before say something within this time, by heartbeats alone.
 const SHOWING: Duration = Duration::from_secs(1);
@@ -27,33 +27,36 @@ const LOOK: Duration = Duration::from_millis(5);
 
 impl Session {
     /// Calls the cells, and sees that they are as they have to be.
-    pub(super) fn meet(&mut self, wearing: Option<&Wearing>) -> Result<(), ReplayError> {
-        let hall = Arc::clone(&self.hall);
-        let (checks, options) = (&hall.checks, &hall.checks.options);
+    pub(super) fn meet(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
+        let shared_state = Arc::clone(&self.shared_state);
+        let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
         if !options.hears() {
             return Ok(());
         }
-        let worn = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
+        let spawned_skin = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
             let bus = skin.bus_named(name);
             bus.into_iter().flat_map(|bus| skin.cells_of(bus)).map(|cell| cell.node).collect()
         };
-        let wanted = match wearing {
+        let target = match skin_override {
             None => checks.recorded(),
-            Some(wearing) => checks.lanes().map(|(name, _)| worn(&wearing.skin, name)).collect(),
+            Some(skin_override) => {
+                checks.bus_links().map(|(name, _)| spawned_skin(&skin_override.skin, name)).collect()
+            }
         };
-        self.call_the_roll(&wanted)?;
-        self.let_them_organise()?;
-        let judge = hall.judge();
-        let nobody = (0..self.buses.lanes.len()).all(|lane| judge.settled(lane).next().is_none());
-        if nobody && (options.expect || options.lockstep || wearing.is_some()) {
-            let names: Vec<_> = checks.lanes().map(|(name, _)| name).collect();
+        self.wait_for_cells(&target)?;
+        self.wait_for_tree()?;
+        let comparator = shared_state.comparator();
+        let nobody =
+            (0..self.buses.bus_links.len()).all(|bus_link| comparator.settled(bus_link).next().is_none());
+        if nobody && (options.expect || options.lockstep || skin_override.is_some()) {
+            let names: Vec<_> = checks.bus_links().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
         }
         if !checks.configures() {
-            checks.hashes(&judge)?;
+            checks.hashes(&comparator)?;
         }
-        let measuring = checks.measuring(&judge);
-        drop(judge);
+        let measuring = checks.measuring(&comparator);
+        drop(comparator);
         let all = measuring.concat();
         if all.is_empty() {
             return Ok(());
@@ -74,10 +77,10 @@ impl Session {
     /// Looks again and again at who is there, until a look is the last one.
     fn wait(
         &mut self,
-        mut is_last: impl FnMut(&mut Self, &Judge) -> Result<bool, ReplayError>,
+        mut is_last: impl FnMut(&mut Self, &Comparator) -> Result<bool, ReplayError>,
     ) -> Result<(), ReplayError> {
-        let hall = Arc::clone(&self.hall);
-        while !is_last(self, &hall.judge())? {
+        let shared_state = Arc::clone(&self.shared_state);
+        while !is_last(self, &shared_state.comparator())? {
             thread::sleep(LOOK);
         }
         Ok(())
@@ -88,49 +91,52 @@ impl Session {
     }
 
     /// Waits until the cells that have to be there answer, or nobody more does.
-    fn call_the_roll(&mut self, wanted: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
+    fn wait_for_cells(&mut self, target: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
         let spawned = self.buses.processes.pids().next().is_some();
-        for lane in self.buses.lanes.iter() {
-            lane.send(&[Message::Sync])?;
+        for bus_link in self.buses.bus_links.iter() {
+            bus_link.send(&[Message::Sync])?;
         }
         // Whoever is there answers: also where nobody has to be there, who is there is known at the first look.
         thread::sleep(LOOK);
-        let all = wanted.iter().map(BTreeSet::len).sum::<usize>();
-        let mut patience = Patience::new(if spawned { STARTING } else { SHOWING });
-        self.wait(|session, judge| {
+        let all = target.iter().map(BTreeSet::len).sum::<usize>();
+        let mut timeout = Timeout::new(if spawned { STARTING } else { SHOWING });
+        self.wait(|session, comparator| {
             if session.is_interrupted() {
                 return Err(RunError::Interrupted.into());
             }
             if let Some(ended) = session.buses.processes.ended().first() {
                 return Err(ReplayError::Ended { cells: ended.to_string(), status: ended.status });
             }
-            if let Some(lane) = judge.rival() {
-                return Err(ReplayError::Rival(session.hall.checks.lane(lane).to_owned()));
+            if let Some(bus_link) = comparator.other_gateway() {
+                return Err(ReplayError::OtherGateway(
+                    session.shared_state.checks.bus_link(bus_link).to_owned(),
+                ));
             }
-            let there = |(lane, cells): (usize, &BTreeSet<CellId>)| {
-                judge.settled(lane).filter(|(cell, _)| cells.contains(cell)).count()
+            let there = |(bus_link, cells): (usize, &BTreeSet<CellId>)| {
+                comparator.settled(bus_link).filter(|(cell, _)| cells.contains(cell)).count()
             };
-            let there = wanted.iter().enumerate().map(there).sum();
-            Ok(there == all || patience.is_over(there))
+            let there = target.iter().enumerate().map(there).sum();
+            Ok(there == all || timeout.is_over(there))
         })
     }
 
     /// Waits until all cells that reply with sums have a way to the gateway, or nobody more finds one.
-    fn let_them_organise(&mut self) -> Result<(), ReplayError> {
-        for lane in self.buses.lanes.iter().filter(|lane| lane.wired) {
-            lane.send(&[Message::Report])?;
+    fn wait_for_tree(&mut self) -> Result<(), ReplayError> {
+        for bus_link in self.buses.bus_links.iter().filter(|bus_link| bus_link.wired) {
+            bus_link.send(&[Message::Report])?;
         }
-        let mut patience = Patience::new(ORGANISING);
-        self.wait(|session, judge| {
-            let wired = session.buses.lanes.iter().enumerate().filter(|(_, lane)| lane.wired);
-            let without: Vec<_> = wired.map(|(index, lane)| (lane, judge.without_a_way(index))).collect();
+        let mut timeout = Timeout::new(ORGANISING);
+        self.wait(|session, comparator| {
+            let wired = session.buses.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.wired);
+            let without: Vec<_> =
+                wired.map(|(index, bus_link)| (bus_link, comparator.unreachable(index))).collect();
             let count: usize = without.iter().map(|(_, cells)| cells.len()).sum();
             if count == 0 || session.is_interrupted() {
                 return Ok(true);
             }
-            let is_over = patience.is_over(usize::MAX - count);
-            for (lane, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
-                let (name, cells) = (lane.bus.name(), names(cells, ""));
+            let is_over = timeout.is_over(usize::MAX - count);
+            for (bus_link, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
+                let (name, cells) = (bus_link.bus.name(), names(cells, ""));
                 session.progress.note(&format!("cells on {name} have no way to the gateway's side: {cells}"));
             }
             Ok(is_over)
@@ -141,9 +147,9 @@ impl Session {
     fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
         self.tell_mode(measuring, true)?;
         let give_up = Instant::now() + SHOWING;
-        self.wait(|_, judge| {
-            let obeys = |(lane, cells): (usize, &Vec<CellId>)| {
-                let obeying = judge.present(lane).filter(|(_, it)| it.claim.says(State::TEST_MODE));
+        self.wait(|_, comparator| {
+            let obeys = |(bus_link, cells): (usize, &Vec<CellId>)| {
+                let obeying = comparator.present(bus_link).filter(|(_, it)| it.claim.says(State::TEST_MODE));
                 obeying.filter(|(cell, _)| cells.contains(cell)).count() == cells.len()
             };
             let all_obey = measuring.iter().enumerate().all(obeys);
@@ -161,9 +167,10 @@ impl Session {
 
     /// Lets cells obey stimuli and say so at once, or measure.
     fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
-        for (lane, cells) in self.buses.lanes.iter().zip(cells).filter(|(_, cells)| !cells.is_empty()) {
+        for (bus_link, cells) in self.buses.bus_links.iter().zip(cells).filter(|(_, cells)| !cells.is_empty())
+        {
             let told = cells.iter().map(|cell| mode(*cell, obey));
-            lane.send(&told.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
+            bus_link.send(&told.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
         }
         Ok(())
     }

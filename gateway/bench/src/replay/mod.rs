@@ -10,20 +10,20 @@
 //!                                                          └── ear (one a bus) <──────┘
 //! ```
 //!
-//! What decides is pure: [`survey`], [`state`], [`trace::order`], [`reel`], [`player`] (its clock and buses are a
-//! [`player::Stage`]), [`judge`] and [`difference`]. The rest is threads, sockets and the clock.
+//! What decides is pure: [`survey`], [`state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and buses are a
+//! [`player::Stage`]), [`comparator`] and [`difference`]. The rest is threads, sockets and the clock.
 
 mod checks;
+pub mod comparator;
 pub mod difference;
 mod error;
-mod hall;
-pub mod judge;
 mod live;
 mod meet;
 pub mod player;
-pub mod reel;
+pub mod replay_plan;
 pub mod report;
 mod session;
+mod shared_state;
 mod source;
 mod start;
 pub mod state;
@@ -42,11 +42,11 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use self::checks::Checks;
 pub use self::checks::Mismatch;
 pub use self::error::ReplayError;
-use self::hall::Hall;
 use self::player::Pace;
-use self::reel::Only;
+use self::replay_plan::Only;
 use self::report::Summary;
 use self::session::Session;
+use self::shared_state::SharedState;
 use self::start::Routes;
 use self::survey::{Part, Survey};
 use crate::run::progress::Progress;
@@ -107,7 +107,7 @@ pub struct Options {
     /// Whether cells that measure are put into test mode.
     pub test_mode: bool,
     /// How long a full bus is waited for.
-    pub patience: Duration,
+    pub timeout: Duration,
     /// Bytes that may wait in the socket of a bus, as the kernel counts them.
     pub receive_buffer: usize,
     /// Whether a line that cannot be read ends it before it begins.
@@ -125,26 +125,28 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let progress = Progress::lines(options.quiet);
     let (survey, extras, name) = look_through(options, &progress)?;
     let routes = Routes::new(options, &survey, &name)?;
-    let wearing = options.spawn.as_ref().map(|spawn| start::wearing(spawn, &routes, &extras, &name));
-    let wearing = wearing.transpose()?;
+    let skin_override =
+        options.spawn.as_ref().map(|spawn| start::skin_override(spawn, &routes, &extras, &name));
+    let skin_override = skin_override.transpose()?;
     // Until now there was nothing that had to be put in order at an end.
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
-    let mut buses = start::open(options, &survey, &routes, wearing.as_ref(), recorded.as_ref())?;
-    for lane in buses.lanes.iter() {
-        progress.note(&format!("{} is {}", lane.bus.name(), lane.bus.kind()));
+    let mut buses = start::open(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;
+    for bus_link in buses.bus_links.iter() {
+        progress.note(&format!("{} is {}", bus_link.bus.name(), bus_link.bus.kind()));
     }
     let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let heard = if speaks { buses.listen()? } else { Vec::new() };
     let checks = Checks { options: options.clone(), survey, routes, name };
-    if let (Some(spawn), Some(wearing)) = (&options.spawn, &wearing) {
-        buses.start_cells(spawn, wearing, &heard)?;
+    if let (Some(spawn), Some(skin_override)) = (&options.spawn, &skin_override) {
+        buses.start_cells(spawn, skin_override, &heard)?;
     } else if options.only == Only::All {
         warn_of_doubles(&checks, &heard, &progress);
     }
-    let hall = Arc::new(Hall::new(checks));
-    Session { hall, buses, signalled, progress, measuring: Vec::new() }.run(idle.as_ref(), wearing.as_ref())
+    let shared_state = Arc::new(SharedState::new(checks));
+    Session { shared_state, buses, signalled, progress, measuring: Vec::new() }
+        .run(idle.as_ref(), skin_override.as_ref())
 }
 
 /// Reads the capture once, from end to end; also what it is called.
@@ -162,10 +164,10 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let few = |buses| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     let note = |text: String| progress.note(&format!("{name}: {text}"));
     // What was in force stands before the first frame, and is known when it is open.
-    let in_force = &reader.extras().in_force;
-    let buses: BTreeSet<_> = in_force.iter().map(|frame| frame.bus.as_str()).collect();
+    let latched = &reader.extras().latched;
+    let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     few(buses.len())?;
-    survey.begin(in_force);
+    survey.begin(latched);
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
         match entry {
@@ -222,7 +224,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
 
 /// Cells that speak already are about to hear themselves.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
-    for ((name, bus), heard) in checks.lanes().zip(heard) {
+    for ((name, bus), heard) in checks.bus_links().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.note(&format!(

@@ -15,7 +15,7 @@ use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::ReplayError;
-use super::reel::{Due, Open, Role, Step};
+use super::replay_plan::{Due, Open, Role, Step};
 use model::quantiles::histogram;
 
 /// From the decision to begin to the first frame, in ns.
@@ -32,16 +32,16 @@ pub trait Stage {
     /// Whether somebody has said stop.
     fn is_over(&self) -> bool;
     /// Joints are about to be sent.
-    fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch);
+    fn announce(&mut self, bus_link: usize, round: Option<u64>, epoch: Epoch);
     /// Sends frames, waiting for room for a while.
     ///
     /// # Errors
     /// When the bus stays full, is down or has ended.
-    fn send(&mut self, lane: usize, frames: &[Frame]) -> Result<(), SendError>;
+    fn send(&mut self, bus_link: usize, frames: &[Frame]) -> Result<(), SendError>;
     /// A bus did not take the joints of a round.
-    fn was_not_sent(&mut self, lane: usize, round: u64);
+    fn was_not_sent(&mut self, bus_link: usize, round: u64);
     /// Waits until the cells of a bus have answered.
-    fn wait_for_answers(&mut self, lane: usize, open: &Open);
+    fn wait_for_answers(&mut self, bus_link: usize, open: &Open);
     /// Brings about a state, bus by bus.
     ///
     /// # Errors
@@ -62,7 +62,7 @@ pub enum Pace {
 
 /// What became of one bus' frames.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct LaneTally {
+pub struct BusLinkTally {
     /// Taken by the bus.
     pub sent: u64,
     /// Not taken, because it stayed full.
@@ -77,7 +77,7 @@ pub struct LaneTally {
 #[derive(Debug)]
 pub struct Played {
     /// Bus by bus.
-    pub lanes: Vec<LaneTally>,
+    pub bus_links: Vec<BusLinkTally>,
     /// How late frames were sent, in ns; without those that were to be sent at once.
     pub late: Histogram<u64>,
     /// Whether somebody said stop before the end.
@@ -106,15 +106,15 @@ pub struct Player {
 impl Player {
     /// For some buses; `syncs` has the frames of a sync on each, when the next joints shall wait for all answers.
     #[must_use]
-    pub fn new(lanes: usize, pace: Pace, syncs: Option<Vec<Vec<Frame>>>) -> Self {
+    pub fn new(bus_links: usize, pace: Pace, syncs: Option<Vec<Vec<Frame>>>) -> Self {
         Self {
             pace,
             syncs,
-            open: vec![None; lanes],
-            down: vec![false; lanes],
+            open: vec![None; bus_links],
+            down: vec![false; bus_links],
             origin: None,
             played: Played {
-                lanes: vec![LaneTally::default(); lanes],
+                bus_links: vec![BusLinkTally::default(); bus_links],
                 late: histogram(),
                 was_stopped: false,
                 failure: None,
@@ -153,14 +153,14 @@ impl Player {
     }
 
     fn wait_for_all(&mut self, stage: &mut impl Stage) {
-        for lane in 0..self.open.len() {
-            self.wait_for_answers(lane, stage);
+        for bus_link in 0..self.open.len() {
+            self.wait_for_answers(bus_link, stage);
         }
     }
 
-    fn wait_for_answers(&mut self, lane: usize, stage: &mut impl Stage) {
-        if let Some(open) = self.open.get_mut(lane).and_then(Option::take) {
-            stage.wait_for_answers(lane, &open);
+    fn wait_for_answers(&mut self, bus_link: usize, stage: &mut impl Stage) {
+        if let Some(open) = self.open.get_mut(bus_link).and_then(Option::take) {
+            stage.wait_for_answers(bus_link, &open);
         }
     }
 
@@ -182,9 +182,9 @@ impl Player {
 
     /// Sends a frame when it is due, and with it those behind it that are due by then on the same bus.
     fn frames_from(&mut self, first: &Due, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) {
-        let lane = first.lane;
+        let bus_link = first.bus_link;
         if self.syncs.is_some() && is_joints(first) {
-            self.wait_for_answers(lane, stage);
+            self.wait_for_answers(bus_link, stage);
         }
         self.batch.clear();
         self.rounds.clear();
@@ -201,10 +201,11 @@ impl Player {
         // In lockstep joints end a batch: what comes next has to wait, or belongs to the next ones.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
             let Ok(&Step::Frame(next)) = steps.peek() else { break };
-            let waits =
-                self.syncs.is_some() && is_joints(&next) && self.open.get(lane).is_some_and(Option::is_some);
+            let waits = self.syncs.is_some()
+                && is_joints(&next)
+                && self.open.get(bus_link).is_some_and(Option::is_some);
             let deadline = self.deadline(&next, now);
-            if next.lane != lane || waits || deadline.is_some_and(|deadline| deadline > now) {
+            if next.bus_link != bus_link || waits || deadline.is_some_and(|deadline| deadline > now) {
                 break;
             }
             self.was_late(deadline, now);
@@ -212,12 +213,12 @@ impl Player {
             let _ = steps.pop();
         }
         let frames = self.batch.len();
-        let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(lane)).filter(|_| open.is_some());
+        let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(bus_link)).filter(|_| open.is_some());
         self.batch.extend(sync.into_iter().flatten());
-        let sent = stage.send(lane, &self.batch);
-        self.account(lane, frames, sent, stage);
-        let is_down = self.down.get(lane).copied().unwrap_or(false);
-        if let Some(place) = self.open.get_mut(lane).filter(|_| self.syncs.is_some() && !is_down) {
+        let sent = stage.send(bus_link, &self.batch);
+        self.account(bus_link, frames, sent, stage);
+        let is_down = self.down.get(bus_link).copied().unwrap_or(false);
+        if let Some(place) = self.open.get_mut(bus_link).filter(|_| self.syncs.is_some() && !is_down) {
             *place = open.or(*place);
         }
     }
@@ -225,7 +226,7 @@ impl Player {
     fn push(&mut self, due: &Due, stage: &mut impl Stage) -> Option<Open> {
         self.batch.push(due.frame);
         let Role::Joints(open) = due.role else { return None };
-        stage.announce(due.lane, open.round, open.epoch);
+        stage.announce(due.bus_link, open.round, open.epoch);
         self.rounds.extend(open.round.map(|round| (self.batch.len(), round)));
         Some(open)
     }
@@ -237,8 +238,16 @@ impl Player {
         }
     }
 
-    fn account(&mut self, lane: usize, frames: usize, sent: Result<(), SendError>, stage: &mut impl Stage) {
-        let (Some(tally), Some(down)) = (self.played.lanes.get_mut(lane), self.down.get_mut(lane)) else {
+    fn account(
+        &mut self,
+        bus_link: usize,
+        frames: usize,
+        sent: Result<(), SendError>,
+        stage: &mut impl Stage,
+    ) {
+        let (Some(tally), Some(down)) =
+            (self.played.bus_links.get_mut(bus_link), self.down.get_mut(bus_link))
+        else {
             return;
         };
         // A sync may be behind them.
@@ -256,7 +265,7 @@ impl Player {
         *down = is_down;
         for (behind, round) in &self.rounds {
             if *behind > taken {
-                stage.was_not_sent(lane, *round);
+                stage.was_not_sent(bus_link, *round);
             }
         }
         self.played.failure = cause.filter(|cause| !cause.may_pass()).map(ReplayError::from);
@@ -264,7 +273,7 @@ impl Player {
 }
 
 const fn is_joints(due: &Due) -> bool {
-    matches!(due.role, Role::Joints(_) | Role::HalfOfJoints)
+    matches!(due.role, Role::Joints(_) | Role::SegmentOfJoints)
 }
 
 #[cfg(test)]

@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::comparator::{Lacking, Tally};
 use super::difference::Difference;
-use super::judge::{Lacking, Tally};
-use super::player::LaneTally;
+use super::player::BusLinkTally;
 use model::quantiles::Quantiles;
 
 /// A whole replay.
@@ -61,7 +61,7 @@ pub struct BusSummary {
     pub kind: String,
     /// Its frames.
     #[serde(flatten)]
-    pub frames: LaneTally,
+    pub frames: BusLinkTally,
     /// Replies that came faster than they were heard.
     pub unheard: u64,
 }
@@ -72,7 +72,7 @@ pub struct Lockstep {
     /// Cells that did not answer in time, as people read it.
     pub silent_cells: Vec<String>,
     /// Joints that were asked again, because a cell was too late for them.
-    pub asked_again: u64,
+    pub retried: u64,
 }
 
 /// How replies compare with recorded ones.
@@ -104,10 +104,10 @@ impl Lacking {
             ("no counters tell whether the cell took the joints", self.uncounted),
             ("the joints were not recorded", self.joints_unrecorded),
             ("the joints are in the part before", self.joints_earlier),
-            ("the configure is in the part before", self.asked_earlier),
+            ("the configure is in the part before", self.requested_earlier),
             ("the cell measured", self.measured),
             ("what a cell felt was said at other joints", self.sensed_otherwise),
-            ("the cell did not come to its slot", self.slot_missed),
+            ("the cell did not come to its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
             ("a cell had not said where its sums go", self.tree_unknown),
             ("a sum lacked one of its children's", self.sums_not_taken),
@@ -129,12 +129,12 @@ impl Summary {
         }
         let mut wrong = Vec::new();
         if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.is_good()) {
-            let Tally { different, missing, extra, not_asked, .. } = expect.tally;
+            let Tally { different, missing, extra, not_requested, .. } = expect.tally;
             let counts = nonzero([
                 ("different", different),
                 ("missing", missing),
                 ("extra", extra),
-                ("not asked for", not_asked),
+                ("not asked for", not_requested),
             ]);
             let counts: Vec<_> = counts.iter().map(|(what, count)| format!("{count} {what}")).collect();
             if !counts.is_empty() {
@@ -181,10 +181,10 @@ mod tests {
             uncounted: 1,
             joints_unrecorded: 1,
             joints_earlier: 1,
-            asked_earlier: 1,
+            requested_earlier: 1,
             measured: 1,
             sensed_otherwise: 1,
-            slot_missed: 1,
+            slot_skipped: 1,
             parent_changing: 1,
             tree_unknown: 1,
             sums_not_taken: 1,

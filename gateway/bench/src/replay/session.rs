@@ -13,13 +13,13 @@ use protocol::message::Message;
 
 use super::ReplayError;
 use super::checks::Checks;
-use super::hall::Hall;
 use super::live::Live;
-use super::player::{LaneTally, Played, Player};
-use super::reel::Cut;
+use super::player::{BusLinkTally, Played, Player};
+use super::replay_plan::PlanSummary;
 use super::report::{BusSummary, Expect, Lockstep, Summary};
+use super::shared_state::SharedState;
 use super::source::{self, AHEAD};
-use super::start::{Buses, Wearing};
+use super::start::{Buses, SkinOverride};
 use super::survey::Bus;
 use crate::run::RunError;
 use crate::run::progress::Progress;
@@ -32,7 +32,7 @@ const LOOK: Duration = Duration::from_millis(20);
 
 /// A replay that is ready.
 pub(super) struct Session {
-    pub(super) hall: Arc<Hall>,
+    pub(super) shared_state: Arc<SharedState>,
     pub(super) buses: Buses,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) progress: Progress,
@@ -41,29 +41,32 @@ pub(super) struct Session {
 }
 
 impl Session {
-    /// `idle` is how late the idle machine wakes a thread, `wearing` the skin of the cells that were started.
+    /// `idle` is how late the idle machine wakes a thread, `skin_override` the skin of the cells that were started.
     pub(super) fn run(
         mut self,
         idle: Option<&Histogram<u64>>,
-        wearing: Option<&Wearing>,
+        skin_override: Option<&SkinOverride>,
     ) -> Result<Summary, ReplayError> {
         let mut receivers = Vec::new();
-        if self.hall.checks.options.hears() {
+        if self.shared_state.checks.options.hears() {
             let roots = std::mem::take(&mut self.buses.roots);
-            for ((index, lane), roots) in self.buses.lanes.iter().enumerate().zip(roots) {
-                let (lanes, hall) = (Arc::clone(&self.buses.lanes), Arc::clone(&self.hall));
-                let hear = move || lanes.get(index).map_or(0, |lane| hall.hear(index, lane, roots));
-                receivers.push(spawn(&format!("rx {}", lane.bus.name()), hear)?);
+            for ((index, bus_link), roots) in self.buses.bus_links.iter().enumerate().zip(roots) {
+                let (bus_links, shared_state) =
+                    (Arc::clone(&self.buses.bus_links), Arc::clone(&self.shared_state));
+                let hear = move || {
+                    bus_links.get(index).map_or(0, |bus_link| shared_state.hear(index, bus_link, roots))
+                };
+                receivers.push(spawn(&format!("rx {}", bus_link.bus.name()), hear)?);
             }
         }
-        let mut outcome = self.meet(wearing).and_then(|()| self.play(idle));
+        let mut outcome = self.meet(skin_override).and_then(|()| self.play(idle));
         if let Err(error) = self.leave() {
             self.progress.note(&error.to_string());
         }
-        self.hall.deaf.store(true, Ordering::Relaxed);
-        for (lane, receiver) in receivers.into_iter().enumerate() {
+        self.shared_state.deaf.store(true, Ordering::Relaxed);
+        for (bus_link, receiver) in receivers.into_iter().enumerate() {
             let unheard = receiver.join().unwrap_or(0);
-            if let Some(bus) = outcome.as_mut().ok().and_then(|summary| summary.buses.get_mut(lane)) {
+            if let Some(bus) = outcome.as_mut().ok().and_then(|summary| summary.buses.get_mut(bus_link)) {
                 bus.unheard = unheard;
             }
         }
@@ -74,93 +77,95 @@ impl Session {
     /// Sends everything; the summary is yet without what the receivers have not heard.
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
-        let hall = Arc::clone(&self.hall);
-        let reader = spawn("reader", move || source::read(&hall, queue))?;
-        while !self.hall.ready.load(Ordering::Relaxed) && !reader.is_finished() {
+        let shared_state = Arc::clone(&self.shared_state);
+        let reader = spawn("reader", move || source::read(&shared_state, queue))?;
+        while !self.shared_state.ready.load(Ordering::Relaxed) && !reader.is_finished() {
             thread::sleep(Duration::from_millis(1));
         }
 
-        let options = &self.hall.checks.options;
+        let options = &self.shared_state.checks.options;
         let hears = options.hears();
-        let (voice, said) = mpsc::channel();
-        let lanes = Arc::clone(&self.buses.lanes);
-        let sync = || lanes.iter().map(|lane| lane.frames(&Message::Sync).collect()).collect();
-        let player = Player::new(lanes.len(), options.pace, options.lockstep.then(sync));
+        let (log_sender, said) = mpsc::channel();
+        let bus_links = Arc::clone(&self.buses.bus_links);
+        let sync = || bus_links.iter().map(|bus_link| bus_link.frames(&Message::Sync).collect()).collect();
+        let player = Player::new(bus_links.len(), options.pace, options.lockstep.then(sync));
         let mut live = Live {
-            hall: Arc::clone(&self.hall),
-            voice,
+            shared_state: Arc::clone(&self.shared_state),
+            log_sender,
             lockstep: Lockstep::default(),
             in_vain: BTreeSet::new(),
             down: BTreeSet::new(),
-            lanes,
+            bus_links,
         };
         let began = Instant::now();
         let player = spawn("player", move || {
             let granted = realtime::prepare();
             if hears {
-                for lane in 0..live.lanes.len() {
+                for bus_link in 0..live.bus_links.len() {
                     // Where the counters begin; a bus that is down says so at the first frame.
-                    let _ = live.report(lane);
+                    let _ = live.report(bus_link);
                 }
-                live.hall.judge().mute(false);
+                live.shared_state.comparator().mute(false);
             }
             let played = player.play(&mut steps, &mut live);
             (played, live, granted)
         })?;
-        let rival = self.watch(&said, || player.is_finished());
+        let other_gateway = self.watch(&said, || player.is_finished());
         let (mut played, mut live, granted) = player.join().map_err(|_| RunError::Panicked("player"))?;
         let duration_s = began.elapsed().as_secs_f64();
-        let cut = reader.join().map_err(|_| RunError::Panicked("reader"))?;
-        played.failure = rival.or(played.failure);
+        let plan_summary = reader.join().map_err(|_| RunError::Panicked("reader"))?;
+        played.failure = other_gateway.or(played.failure);
         // What a signal has ended is judged as far as it went.
-        self.hall.over.store(false, Ordering::Relaxed);
-        let lanes = self.hall.checks.lanes().enumerate();
-        for (lane, (name, _)) in lanes.filter(|_| hears && played.failure.is_none()) {
-            if let Err(why) = live.report(lane) {
+        self.shared_state.over.store(false, Ordering::Relaxed);
+        let bus_links = self.shared_state.checks.bus_links().enumerate();
+        for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
+            if let Err(why) = live.report(bus_link) {
                 self.progress.note(&format!("{name}: no last words of its cells: {why}"));
             }
         }
-        self.hall.judge().finish(!played.was_stopped && played.failure.is_none());
+        self.shared_state.comparator().finish(!played.was_stopped && played.failure.is_none());
         for line in said.try_iter() {
             self.progress.note(&line);
         }
-        let cut = cut.unwrap_or_else(|error| {
+        let plan_summary = plan_summary.unwrap_or_else(|error| {
             played.failure.get_or_insert(ReplayError::Read(error));
-            Cut::default()
+            PlanSummary::default()
         });
-        Ok(self.summary(played, cut, live, duration_s, granted, idle))
+        Ok(self.summary(played, plan_summary, live, duration_s, granted, idle))
     }
 
     /// Shows how it goes, until it is over; whether there is another gateway.
     fn watch(&mut self, said: &mpsc::Receiver<String>, is_over: impl Fn() -> bool) -> Option<ReplayError> {
         let bar = self.progress.bar(self.length());
-        let mut rival = None;
+        let mut other_gateway = None;
         while !is_over() {
             thread::sleep(LOOK);
-            bar.set_position(self.hall.at.load(Ordering::Relaxed) / 1_000_000);
-            bar.set_message(self.hall.sent.load(Ordering::Relaxed).to_string());
+            bar.set_position(self.shared_state.at.load(Ordering::Relaxed) / 1_000_000);
+            bar.set_message(self.shared_state.sent.load(Ordering::Relaxed).to_string());
             for line in said.try_iter() {
                 self.progress.note(&line);
             }
             for ended in self.buses.processes.ended() {
                 self.progress.note(&format!("the process of {ended} ended ({})", ended.status));
             }
-            if self.hall.checks.options.hears() && rival.is_none() {
-                let lane = self.hall.judge().rival();
-                rival = lane.map(|lane| ReplayError::Rival(self.hall.checks.lane(lane).to_owned()));
+            if self.shared_state.checks.options.hears() && other_gateway.is_none() {
+                let bus_link = self.shared_state.comparator().other_gateway();
+                other_gateway = bus_link.map(|bus_link| {
+                    ReplayError::OtherGateway(self.shared_state.checks.bus_link(bus_link).to_owned())
+                });
             }
-            if rival.is_some() || self.signalled.load(Ordering::Relaxed) {
-                self.hall.over.store(true, Ordering::Relaxed);
-                self.hall.has_heard();
+            if other_gateway.is_some() || self.signalled.load(Ordering::Relaxed) {
+                self.shared_state.over.store(true, Ordering::Relaxed);
+                self.shared_state.has_heard();
             }
         }
         bar.finish_and_clear();
-        rival
+        other_gateway
     }
 
     /// How long it is, in ms of the capture; none when it has no end.
     fn length(&self) -> Option<u64> {
-        let Checks { survey, options, .. } = &self.hall.checks;
+        let Checks { survey, options, .. } = &self.shared_state.checks;
         let (from, to) = survey.bounds();
         let from = from.max(survey.first.unwrap_or(0));
         let one = to.min(survey.last).saturating_sub(from) / 1_000_000;
@@ -170,21 +175,21 @@ impl Session {
     fn summary(
         &self,
         played: Played,
-        cut: Cut,
+        plan_summary: PlanSummary,
         live: Live,
         duration_s: f64,
         granted: Granted,
         idle: Option<&Histogram<u64>>,
     ) -> Summary {
-        let checks = &self.hall.checks;
+        let checks = &self.shared_state.checks;
         let options = &checks.options;
-        let total = |of: fn(&LaneTally) -> u64| played.lanes.iter().map(of).sum();
+        let total = |of: fn(&BusLinkTally) -> u64| played.bus_links.iter().map(of).sum();
         let bus = |(index, (name, bus)): (usize, (&str, &Bus))| {
             Some(BusSummary {
                 capture: bus.name.clone(),
                 name: name.to_owned(),
-                kind: self.buses.lanes.get(index)?.bus.kind().to_string(),
-                frames: *played.lanes.get(index)?,
+                kind: self.buses.bus_links.get(index)?.bus.kind().to_string(),
+                frames: *played.bus_links.get(index)?,
                 unheard: 0,
             })
         };
@@ -194,12 +199,12 @@ impl Session {
             file: checks.name.clone(),
             duration_s,
             interrupted: played.was_stopped && self.signalled.load(Ordering::Relaxed),
-            sent: total(|lane| lane.sent),
-            refused: total(|lane| lane.refused),
-            lost: total(|lane| lane.lost),
-            skipped: cut.skipped,
-            sent_at_once: cut.late,
-            buses: checks.lanes().enumerate().filter_map(bus).collect(),
+            sent: total(|bus_link| bus_link.sent),
+            refused: total(|bus_link| bus_link.refused),
+            lost: total(|bus_link| bus_link.lost),
+            skipped: plan_summary.skipped,
+            sent_at_once: plan_summary.late,
+            buses: checks.bus_links().enumerate().filter_map(bus).collect(),
             late_us: idle.map(|_| Quantiles::of(&played.late, 1e-3)),
             idle_late_us: idle.map(|idle| Quantiles::of(idle, 1e-3)),
             spin_us: options.spin.as_secs_f64() * 1e6,
@@ -212,18 +217,18 @@ impl Session {
     }
 
     fn expectation(&self) -> Expect {
-        let (judge, checks) = (self.hall.judge(), &self.hall.checks);
-        let present = (0..self.buses.lanes.len()).flat_map(|lane| judge.present(lane));
+        let (comparator, checks) = (self.shared_state.comparator(), &self.shared_state.checks);
+        let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present(bus_link));
         let late = present.filter_map(|(_, cell)| {
             let (first, last) = cell.heard?;
             Some(u64::from(last.joints_late.wrapping_sub(first.joints_late)))
         });
         Expect {
-            tally: *judge.tally(),
+            tally: *comparator.tally(),
             joints_skipped: late.sum(),
             recording_dropped: checks.survey.dropped,
             unchecked_cells: checks.unchecked(),
-            first: judge.first().cloned(),
+            first: comparator.first().cloned(),
         }
     }
 }

@@ -4,8 +4,8 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::checks::Checks;
-use super::hall::Hall;
-use super::reel::{Cut, Reel, Selection, Step, reason};
+use super::replay_plan::{PlanSummary, ReplayPlan, Selection, Step, reason};
+use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 
 /// Steps that are read ahead: some tenths of a second of a full bus.
@@ -15,65 +15,68 @@ const PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture, as often as it is replayed, and hands on what is to be done.
 struct Source<'a> {
-    hall: &'a Hall,
-    reel: Reel<'a>,
+    shared_state: &'a SharedState,
+    replay_plan: ReplayPlan<'a>,
     queue: rtrb::Producer<Step>,
 }
 
 /// Reads to the end, or until nobody wants more.
-pub(super) fn read(hall: &Hall, queue: rtrb::Producer<Step>) -> Result<Cut, CaptureError> {
-    let Checks { options, survey, routes, .. } = &hall.checks;
-    let (lanes, hears) = (routes.lanes.clone(), options.hears());
-    let selection = Selection { only: options.only, pick: options.pick.clone(), lanes, reads: hears };
-    let mut source = Source { hall, reel: Reel::new(survey, &selection), queue };
+pub(super) fn read(
+    shared_state: &SharedState,
+    queue: rtrb::Producer<Step>,
+) -> Result<PlanSummary, CaptureError> {
+    let Checks { options, survey, routes, .. } = &shared_state.checks;
+    let (bus_links, hears) = (routes.bus_links.clone(), options.hears());
+    let selection = Selection { only: options.only, pick: options.pick.clone(), bus_links, reads: hears };
+    let mut source = Source { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {
-        if hears && (pass > 0 || !hall.checks.are_fresh()) {
-            source.push(source.reel.restoring());
+        if hears && (pass > 0 || !shared_state.checks.are_fresh()) {
+            source.push(source.replay_plan.restoring());
         }
-        let mut judge = hall.judge();
-        judge.record_begin();
-        for (bus, lane) in survey.buses.iter().zip(&routes.lanes) {
-            let Some(lane) = *lane else { continue };
-            bus.in_force.iter().for_each(|message| judge.record(lane, message, false));
+        let mut comparator = shared_state.comparator();
+        comparator.record_begin();
+        for (bus, bus_link) in survey.buses.iter().zip(&routes.bus_links) {
+            let Some(bus_link) = *bus_link else { continue };
+            bus.latched.iter().for_each(|message| comparator.record(bus_link, message, false));
         }
-        drop(judge);
+        drop(comparator);
         source.pass()?;
         pass = pass.saturating_add(1);
     }
-    hall.judge().record_end();
-    hall.ready.store(true, Ordering::Relaxed);
-    Ok(source.reel.into_cut())
+    shared_state.comparator().record_end();
+    shared_state.ready.store(true, Ordering::Relaxed);
+    Ok(source.replay_plan.into_summary())
 }
 
 impl Source<'_> {
     fn pass(&mut self) -> Result<(), CaptureError> {
-        let mut reader = Reader::open_all(&self.hall.checks.options.files)?;
+        let mut reader = Reader::open_all(&self.shared_state.checks.options.files)?;
         while let Some(entry) = reader.next()? {
             let Entry::Frame(record) = entry else {
-                self.reel.skip(reason::NOTE);
+                self.replay_plan.skip(reason::NOTE);
                 continue;
             };
-            let flow = self.reel.take(&record, &mut self.hall.judge());
+            let flow = self.replay_plan.take(&record, &mut self.shared_state.comparator());
             self.push_steps();
             if flow.is_break() || self.is_over() {
                 break;
             }
         }
-        self.reel.end_pass(&mut self.hall.judge());
+        self.replay_plan.end_pass(&mut self.shared_state.comparator());
         self.push_steps();
         Ok(())
     }
 
     fn push_steps(&mut self) {
-        while let Some(step) = self.reel.next_step() {
+        while let Some(step) = self.replay_plan.next_step() {
             self.push(step);
         }
     }
 
     fn push(&mut self, mut step: Step) {
         while let Err(rtrb::PushError::Full(back)) = self.queue.push(step) {
-            self.hall.ready.store(true, Ordering::Relaxed);
+            self.shared_state.ready.store(true, Ordering::Relaxed);
             if self.is_over() {
                 return;
             }
@@ -83,6 +86,6 @@ impl Source<'_> {
     }
 
     fn is_over(&self) -> bool {
-        self.hall.is_over() || self.queue.is_abandoned()
+        self.shared_state.is_over() || self.queue.is_abandoned()
     }
 }

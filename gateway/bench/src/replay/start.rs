@@ -12,12 +12,12 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::Message;
 use protocol::skin::Skin;
 
-use super::reel::Only;
+use super::replay_plan::Only;
 use super::survey::Survey;
 use super::{Options, ReplayError, Spawn};
 use crate::listen::{self, Listener};
 use crate::run::launch::{LISTEN, Plan, Processes, ServedBus, in_memory, open_or_serve, program};
-use crate::run::roots::{Ears, Roots};
+use crate::run::roots::{ReceiveFilter, Roots};
 use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{Extras, SKIN};
@@ -29,7 +29,7 @@ const LOOK: Duration = Duration::from_millis(5);
 #[derive(Clone, Debug)]
 pub(super) struct Routes {
     /// By the capture's buses: the lane, if its frames are sent.
-    pub(super) lanes: Vec<Option<usize>>,
+    pub(super) bus_links: Vec<Option<usize>>,
     /// By lane: which of the capture's buses it is, and what it is called now.
     pub(super) names: Vec<(usize, String)>,
 }
@@ -42,9 +42,9 @@ impl Routes {
             let bus = name.to_owned();
             survey.bus_named(name).ok_or(ReplayError::NoBus { option, capture, bus, buses })
         };
-        let mut wanted = BTreeSet::new();
+        let mut selected = BTreeSet::new();
         for name in &options.buses {
-            wanted.insert(known(name, format!("--bus {name}"))?);
+            selected.insert(known(name, format!("--bus {name}"))?);
         }
         let mut targets: Vec<_> = survey.buses.iter().map(|bus| bus.name.clone()).collect();
         let mut mapped = BTreeSet::new();
@@ -57,10 +57,10 @@ impl Routes {
                 target.clone_from(to);
             }
         }
-        let mut routes = Self { lanes: Vec::new(), names: Vec::new() };
+        let mut routes = Self { bus_links: Vec::new(), names: Vec::new() };
         for (bus, target) in targets.into_iter().enumerate() {
-            let goes = wanted.is_empty() || wanted.contains(&bus);
-            routes.lanes.push(goes.then_some(routes.names.len()));
+            let goes = selected.is_empty() || selected.contains(&bus);
+            routes.bus_links.push(goes.then_some(routes.names.len()));
             if goes {
                 routes.names.push((bus, target));
             }
@@ -77,7 +77,7 @@ impl Routes {
 
 /// One bus.
 #[derive(Debug)]
-pub(super) struct Lane {
+pub(super) struct LinkId {
     pub(super) bus: Bus,
     pub(super) format: Format,
     /// Whether nobody served it before.
@@ -86,7 +86,7 @@ pub(super) struct Lane {
     pub(super) wired: bool,
 }
 
-impl Lane {
+impl LinkId {
     pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
         message.encode().frames(self.format)
     }
@@ -101,7 +101,7 @@ impl Lane {
 /// Buses, and the processes that were started for them.
 #[derive(Debug)]
 pub(super) struct Buses {
-    pub(super) lanes: Arc<Vec<Lane>>,
+    pub(super) bus_links: Arc<Vec<LinkId>>,
     /// The gateway's side of the wires to their roots, where there are such; taken by who hears.
     pub(super) roots: Vec<Option<Roots>>,
     // In this order they end: the cells before their buses.
@@ -111,7 +111,7 @@ pub(super) struct Buses {
 
 /// The skin of the cells that are started.
 #[derive(Debug)]
-pub(super) struct Wearing {
+pub(super) struct SkinOverride {
     pub(super) skin: Skin,
     pub(super) file: PathBuf,
     /// Where an attached one is kept, so that cells can read it.
@@ -119,14 +119,14 @@ pub(super) struct Wearing {
 }
 
 /// The skin of the cells that are started: the one that is named, or the one that the recording has.
-pub(super) fn wearing(
+pub(super) fn skin_override(
     spawn: &Spawn,
     routes: &Routes,
     extras: &Extras,
     file: &str,
-) -> Result<Wearing, ReplayError> {
-    let mut wearing = if let Some(path) = &spawn.skin {
-        Wearing { skin: Skin::read(path)?, file: path.clone(), _memory: None }
+) -> Result<SkinOverride, ReplayError> {
+    let mut skin_override = if let Some(path) = &spawn.skin {
+        SkinOverride { skin: Skin::read(path)?, file: path.clone(), _memory: None }
     } else {
         let attached = extras.attachments.iter().find(|(name, _)| name == SKIN);
         let Some((_, bytes)) = attached else {
@@ -135,21 +135,22 @@ pub(super) fn wearing(
         let text = String::from_utf8_lossy(bytes);
         let skin = Skin::parse(&format!("the skin in {file}"), &text)?;
         let (memory, file) = in_memory(bytes)?;
-        Wearing { skin, file, _memory: Some(memory) }
+        SkinOverride { skin, file, _memory: Some(memory) }
     };
     for (_, name) in &routes.names {
-        if wearing.skin.bus_named(name).is_none() {
-            let buses = wearing.skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
-            let (bus, skin) = (name.clone(), wearing.skin.name);
+        if skin_override.skin.bus_named(name).is_none() {
+            let buses =
+                skin_override.skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
+            let (bus, skin) = (name.clone(), skin_override.skin.name);
             return Err(ReplayError::NotOfSkin { bus, skin, buses });
         }
     }
     // Cells on other buses would have nobody to hear.
-    let buses = wearing.skin.buses.clone();
+    let buses = skin_override.skin.buses.clone();
     let goes =
         |bus: usize| buses.get(bus).is_some_and(|bus| routes.names.iter().any(|(_, name)| *name == bus.name));
-    wearing.skin.cells.retain(|cell| goes(cell.bus));
-    Ok(wearing)
+    skin_override.skin.cells.retain(|cell| goes(cell.bus));
+    Ok(skin_override)
 }
 
 /// The skin that a recording has, if it has one that can be read.
@@ -162,51 +163,55 @@ pub(super) fn open(
     options: &Options,
     survey: &Survey,
     routes: &Routes,
-    wearing: Option<&Wearing>,
+    skin_override: Option<&SkinOverride>,
     recorded: Option<&Skin>,
 ) -> Result<Buses, ReplayError> {
-    let (mut lanes, mut roots, mut served) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut bus_links, mut roots, mut served) = (Vec::new(), Vec::new(), Vec::new());
     for (bus, name) in &routes.names {
         let Some(surveyed) = survey.buses.get(*bus) else { continue };
-        let described = wearing.and_then(|wearing| wearing.skin.buses.iter().find(|bus| bus.name == *name));
+        let described = skin_override
+            .and_then(|skin_override| skin_override.skin.buses.iter().find(|bus| bus.name == *name));
         let format = described.map(|bus| bus.format).or(surveyed.format);
-        let worn = wearing.map(|wearing| (&wearing.skin, name)).or_else(|| Some((recorded?, &surveyed.name)));
-        let worn = worn.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
-        let ears = worn.map_or_else(|| vec![Filter::ALL], |(skin, bus)| Ears::of(skin, bus, true).filters);
-        let wanted = BusOptions {
+        let spawned_skin = skin_override
+            .map(|skin_override| (&skin_override.skin, name))
+            .or_else(|| Some((recorded?, &surveyed.name)));
+        let spawned_skin = spawned_skin.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
+        let receive_filter = spawned_skin
+            .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::of(skin, bus, true).filters);
+        let selected = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
-            filters: if options.hears() { ears } else { Vec::new() },
+            filters: if options.hears() { receive_filter } else { Vec::new() },
             receive_buffer: options.receive_buffer,
-            send_patience: options.patience,
+            send_timeout: options.timeout,
             ..BusOptions::default()
         };
-        let (bus, of_ours) = match wearing {
-            Some(_) => open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?,
-            None => (Bus::open(name, options.kinds.of(name), &wanted)?, None),
+        let (bus, of_ours) = match skin_override {
+            Some(_) => open_or_serve(name, options.kinds.of(name), &selected, options.vcan_setup.as_deref())?,
+            None => (Bus::open(name, options.kinds.of(name), &selected)?, None),
         };
         // On a real bus the wires are real.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
-        let root = worn.filter(|_| has_wires).and_then(|(skin, bus)| Roots::of(skin, bus));
+        let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| Roots::of(skin, bus));
         let (own, wired) = (of_ours.is_some(), root.is_some());
         roots.push(root);
         served.extend(of_ours);
-        lanes.push(Lane { bus, format: format.unwrap_or(Format::Fd), own, wired });
+        bus_links.push(LinkId { bus, format: format.unwrap_or(Format::Fd), own, wired });
     }
-    Ok(Buses { lanes: Arc::new(lanes), roots, processes: Processes::default(), _served: served })
+    Ok(Buses { bus_links: Arc::new(bus_links), roots, processes: Processes::default(), _served: served })
 }
 
 impl Buses {
     /// Listens on the buses that were there before, as long as two gateways need to notice each other.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
-        let mut heard = vec![BTreeSet::new(); self.lanes.len()];
+        let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
         let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)];
-        let again = |(index, lane): (usize, &Lane)| {
+        let again = |(index, bus_link): (usize, &LinkId)| {
             let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
-            let kind = Choice::Only(lane.bus.kind());
-            let bus = listen::open(lane.bus.name(), kind, Some(lane.format), options)?;
+            let kind = Choice::Only(bus_link.bus.kind());
+            let bus = listen::open(bus_link.bus.name(), kind, Some(bus_link.format), options)?;
             Ok((index, Listener::new(bus, None)))
         };
-        let others = self.lanes.iter().enumerate().filter(|(_, lane)| !lane.own);
+        let others = self.bus_links.iter().enumerate().filter(|(_, bus_link)| !bus_link.own);
         let mut open = others.map(again).collect::<Result<Vec<_>, BusError>>()?;
         let until = Instant::now() + LISTEN;
         while !open.is_empty() && Instant::now() < until {
@@ -218,7 +223,7 @@ impl Buses {
                 for speaker in speakers {
                     match (speaker, heard.get_mut(*index)) {
                         (Node::Gateway, _) => {
-                            return Err(ReplayError::Rival(listener.bus().name().to_owned()));
+                            return Err(ReplayError::OtherGateway(listener.bus().name().to_owned()));
                         }
                         (Node::Cell(cell), Some(cells)) => _ = cells.insert(cell),
                         (Node::Cell(_), None) | (Node::Everyone, _) => {}
@@ -233,20 +238,21 @@ impl Buses {
     pub(super) fn start_cells(
         &mut self,
         spawn: &Spawn,
-        wearing: &Wearing,
+        skin_override: &SkinOverride,
         heard: &[BTreeSet<CellId>],
     ) -> Result<(), ReplayError> {
-        let there = self.lanes.iter().zip(heard).find(|(_, cells)| !cells.is_empty());
-        if let Some((lane, cells)) = there {
+        let there = self.bus_links.iter().zip(heard).find(|(_, cells)| !cells.is_empty());
+        if let Some((bus_link, cells)) = there {
             let cells = names(&cells.iter().copied().collect::<Vec<_>>(), "");
-            return Err(ReplayError::CellsThere { bus: lane.bus.name().to_owned(), cells });
+            return Err(ReplayError::CellsThere { bus: bus_link.bus.name().to_owned(), cells });
         }
-        let kinds = Kinds::exactly(self.lanes.iter().map(|lane| (lane.bus.name(), lane.bus.kind())));
+        let kinds =
+            Kinds::exactly(self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())));
         self.processes = Processes::start(&Plan {
             directory: None,
             program: &program("cell-node", spawn.cell_node.as_deref())?,
-            skin_file: &wearing.file,
-            skin: &wearing.skin,
+            skin_file: &skin_override.file,
+            skin: &skin_override.skin,
             kinds: &kinds,
             per_process: spawn.cells_per_process,
             flash: None,

@@ -23,30 +23,30 @@ use super::touched::Touched;
 const SINCE: usize = 16_384;
 
 /// What one cell feels.
-type Feeling = Contact<()>;
+type ContactState = Contact<()>;
 
 /// Nothing touches it, in either mode.
-fn clear(feeling: &mut Feeling, obeys: bool) {
-    feeling.reset();
-    feeling.set_obeys(obeys);
+fn clear(contact_state: &mut ContactState, obeys: bool) {
+    contact_state.reset();
+    contact_state.set_obeys(obeys);
 }
 
 /// Whether something touches it from the joints of an epoch on, if that is known.
-fn is_touched_from(feeling: &Feeling, epoch: Epoch) -> Option<bool> {
+fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
-    if feeling.waiting().is_empty() {
-        return feeling.skin().map(touches);
+    if contact_state.waiting().is_empty() {
+        return contact_state.skin().map(touches);
     }
-    let mut then = feeling.clone();
+    let mut then = contact_state.clone();
     then.latch(epoch, |()| {});
     then.skin().map(touches)
 }
 
 /// The pages that are latched, without those that say what every cell feels at its start.
-fn pages(feeling: &Feeling) -> impl Iterator<Item = SensorPage> {
+fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
     let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
-    feeling.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
+    contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 
 /// What held on a bus before its last joints.
@@ -55,7 +55,7 @@ struct Before {
     /// Parameters that were written, in order, without those that were written over.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
-    cells: PerCell<Feeling>,
+    cells: PerCell<ContactState>,
 }
 
 /// What holds on one bus.
@@ -182,8 +182,8 @@ impl State {
     pub fn touched(&self) -> Touched {
         let mut touched = Touched::default();
         let Some((epoch, _)) = self.joints else { return touched };
-        for (cell, feeling) in self.before.cells.iter() {
-            if let Some(is_touched) = is_touched_from(feeling, epoch) {
+        for (cell, contact_state) in self.before.cells.iter() {
+            if let Some(is_touched) = is_touched_from(contact_state, epoch) {
                 touched.insert(cell, is_touched);
             }
         }
@@ -194,8 +194,9 @@ impl State {
     #[must_use]
     pub fn is_fresh(&self) -> bool {
         let Before { writes, halted, cells } = &self.before;
-        let felt = cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.waiting().is_empty());
-        !felt && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
+        let contact =
+            cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.waiting().is_empty());
+        !contact && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
     }
 
     /// Whether new parameters were taken into use.
@@ -210,17 +211,20 @@ impl State {
     /// that has had none yet: the cells then forget the epoch of whoever spoke to them before.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
-        let Before { writes, halted, cells: feelings } = &self.before;
+        let Before { writes, halted, cells: contact_states } = &self.before;
         // Ports are cut in test mode only, and the mode may have been written again since.
-        let cuts = |write: &&(Node, u8, Message)| write.1 == Parameter::Cuts.number();
-        let (cut, others): (Vec<_>, Vec<_>) = writes.iter().partition(cuts);
-        let mut messages: Vec<_> = others.iter().chain(&cut).map(|(_, _, message)| *message).collect();
+        let links_down = |write: &&(Node, u8, Message)| write.1 == Parameter::LinksDown.number();
+        let (plan_summary, others): (Vec<_>, Vec<_>) = writes.iter().partition(links_down);
+        let mut messages: Vec<_> =
+            others.iter().chain(&plan_summary).map(|(_, _, message)| *message).collect();
         messages.push(Message::Resume);
-        let known: Vec<_> = feelings.iter().filter(|(cell, _)| cells(*cell)).collect();
+        let known: Vec<_> = contact_states.iter().filter(|(cell, _)| cells(*cell)).collect();
         let stimulus = |cell, from, page| Message::Stimulus { to: Node::Cell(cell), from, page };
-        let felt: Vec<_> = known
+        let contact: Vec<_> = known
             .iter()
-            .flat_map(|(cell, feeling)| pages(feeling).map(|page| stimulus(*cell, From::Next, page)))
+            .flat_map(|(cell, contact_state)| {
+                pages(contact_state).map(|page| stimulus(*cell, From::Next, page))
+            })
             .collect();
         let pending = known
             .iter()
@@ -231,13 +235,13 @@ impl State {
             joints,
         };
         let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.plus(u8::MAX), joints)));
-        if let Some(last) = last.filter(|_| !felt.is_empty() || !pending.is_empty()) {
+        if let Some(last) = last.filter(|_| !contact.is_empty() || !pending.is_empty()) {
             // Joints of a cell's last epoch would be dropped, and so those that matter may not be the first.
             messages.push(steps_before(2, last));
-            messages.extend(felt);
+            messages.extend(contact);
             messages.push(steps_before(1, last));
         } else {
-            messages.extend(felt);
+            messages.extend(contact);
         }
         messages.extend(pending);
         if *halted {
@@ -285,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_in_force_what_waited_and_what_was_said_since_are_told_apart() {
+    fn what_was_latched_what_waited_and_what_was_said_since_are_told_apart() {
         let at = |epoch| From::Epoch(Epoch(epoch));
         let said = [
             joints(10),
@@ -327,11 +331,11 @@ mod tests {
     }
 
     #[test]
-    fn who_has_let_go_started_anew_or_measures_feels_nothing() {
+    fn who_has_released_restarted_or_measures_feels_nothing() {
         let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
-        let anew = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
-        for end in [to(1, From::Next, 0.0), anew] {
+        let restarted = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
+        for end in [to(1, From::Next, 0.0), restarted] {
             let said = [to(1, From::Next, 1.0), joints(1), end, joints(2), joints(3)];
             assert_eq!(restored(&said), [Message::Resume, joints(3)]);
         }
@@ -364,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_switched_last_is_switched_again_and_cuts_come_after_the_mode() {
+    fn what_was_switched_last_is_switched_again_and_links_down_come_after_the_mode() {
         let write = |to, number, word| Message::Configure {
             to,
             tag: 0,
@@ -394,10 +398,10 @@ mod tests {
         ];
         assert_eq!(restored(&said), expected);
         let page = NetworkPage::Heartbeat(Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() });
-        let anew = Message::Network { from: one, epoch: Epoch(0), page };
+        let restarted = Message::Network { from: one, epoch: Epoch(0), page };
         let expected = [write(all, 7, 2), commit, write(all, 6, 0), mode(all, 1), Message::Resume, joints(1)];
-        assert_eq!(restored(&[&said[..], &[anew]].concat()), expected);
-        assert_eq!(restored(&[&said[..7], &[anew, joints(1)]].concat()), expected);
+        assert_eq!(restored(&[&said[..], &[restarted]].concat()), expected);
+        assert_eq!(restored(&[&said[..7], &[restarted, joints(1)]].concat()), expected);
     }
 
     #[test]

@@ -14,7 +14,7 @@ use protocol::time::Micros;
 
 use super::state::State;
 use model::decode::{Decoded, Decoder};
-use trace::capture::InForce;
+use trace::capture::Latched;
 
 /// A cell that says nothing for so long is not there, in ns.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
@@ -66,7 +66,7 @@ pub struct Bus {
     /// recording, or one that was cut off, may lack what its counters would account for.
     is_accounted: bool,
     /// What was said before the capture began and is in force at its beginning, as it has it.
-    pub in_force: Vec<Message>,
+    pub latched: Vec<Message>,
     /// The state in force where the part begins.
     pub state: State,
     /// The first joints in the part.
@@ -145,15 +145,15 @@ impl Survey {
     }
 
     /// Takes what was in force when the capture began, before its first frame.
-    pub fn begin(&mut self, in_force: &[InForce]) {
+    pub fn begin(&mut self, latched: &[Latched]) {
         let mut decoder = Decoder::new(None);
-        for InForce { bus, frame, nanos, .. } in in_force {
+        for Latched { bus, frame, nanos, .. } in latched {
             if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
                 let bus = self.bus(bus);
                 bus.is_accounted = true;
                 bus.state.take(&message);
                 bus.take_before(&message, *nanos);
-                bus.in_force.push(message);
+                bus.latched.push(message);
             }
         }
     }
@@ -374,8 +374,8 @@ impl Cell {
 
     /// Counters that were asked for at some joints. When that was before the capture, nobody knows which joints they
     /// account for.
-    fn report(&mut self, heard: Heard, asked: Option<(u64, u64)>) {
-        let Some((joints, last)) = asked else { return };
+    fn report(&mut self, heard: Heard, requested: Option<(u64, u64)>) {
+        let Some((joints, last)) = requested else { return };
         if let Some((before, joints_before, from)) = self.report {
             let taken = heard.joints.wrapping_sub(before.joints);
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);

@@ -15,8 +15,8 @@ use super::RunError;
 use super::bench::{Bench, LOOK};
 use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, program};
 use super::progress::say;
-use super::receiver::News;
-use crate::setup::Patience;
+use super::receiver::BusEvent;
+use crate::setup::Timeout;
 use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
@@ -27,7 +27,7 @@ pub(super) const SHOWING: Duration = Duration::from_secs(2);
 pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
 
 /// Cells that are told what they are to be switched to, by bus and number.
-pub(super) type Told = Repeats<(usize, CellId)>;
+pub(super) type Announced = Repeats<(usize, CellId)>;
 
 impl Bench<'_> {
     /// Starts the cells, listens for another gateway, and waits until all cells are ready.
@@ -35,7 +35,7 @@ impl Bench<'_> {
         let options = self.options;
         let listened = Instant::now() + LISTEN;
         if options.spawn {
-            if self.served.len() < self.lanes.len() {
+            if self.served.len() < self.bus_links.len() {
                 self.find_alone(listened)?;
             }
             let program = program("cell-node", options.cell_node.as_deref())?;
@@ -44,7 +44,7 @@ impl Bench<'_> {
                 skin_file: &options.skin_file,
                 skin: &options.skin,
                 kinds: &Kinds::exactly(
-                    self.lanes.iter().map(|lane| (lane.link.name.as_str(), lane.link.kind)),
+                    self.bus_links.iter().map(|bus_link| (bus_link.link.name.as_str(), bus_link.link.kind)),
                 ),
                 directory: options.directory.as_deref(),
                 per_process: options.cells_per_process,
@@ -52,35 +52,39 @@ impl Bench<'_> {
             })?;
         }
         let cells = options.skin.cells.len();
-        self.wait(self.patience(), |bench, patience| {
+        self.wait(self.timeout(), |bench, timeout| {
             // Who has no parameters will not get any by waiting.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
-            let is_over = patience.is_over(ready);
+            let is_over = timeout.is_over(ready);
             // Where the machine was away for a moment, all may look dead that were ready before it: they speak again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
-        self.judge_start()?;
+        self.rate_start()?;
         self.wake_up()?;
         self.go_on_after_others();
         self.switch_cells()?;
         // What they have counted and feel, and where they are in their networks.
         self.say(&Message::Report)?;
-        if self.lanes.iter().any(|lane| lane.network.is_some()) { self.organise() } else { Ok(()) }
+        if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
+            self.organise()
+        } else {
+            Ok(())
+        }
     }
 
     /// How long cells may make no progress.
-    pub(super) const fn patience(&self) -> Duration {
+    pub(super) const fn timeout(&self) -> Duration {
         if self.options.spawn { STARTING } else { SHOWING }
     }
 
     /// Looks again and again, until a look is the last one.
     pub(super) fn wait(
         &mut self,
-        patience: Duration,
-        mut is_last: impl FnMut(&mut Self, &mut Patience) -> Result<bool, RunError>,
+        timeout: Duration,
+        mut is_last: impl FnMut(&mut Self, &mut Timeout) -> Result<bool, RunError>,
     ) -> Result<(), RunError> {
-        let mut patience = Patience::new(patience);
-        while !is_last(self, &mut patience)? {
+        let mut timeout = Timeout::new(timeout);
+        while !is_last(self, &mut timeout)? {
             thread::sleep(LOOK);
             self.hear_while_starting()?;
         }
@@ -96,7 +100,7 @@ impl Bench<'_> {
         }
         // Their next heartbeats say so.
         self.say(&Message::Sync)?;
-        self.wait(SHOWING, |bench, patience| Ok(halted(bench) == 0 || patience.is_over(0)))
+        self.wait(SHOWING, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
     /// A bus that was there before may have a gateway, or cells whose numbers ours would take: nobody is
@@ -107,7 +111,7 @@ impl Bench<'_> {
         if cells.is_empty() {
             return Ok(());
         }
-        let embedded = self.lanes.iter().any(|lane| lane.link.kind == BusKind::Embedded);
+        let embedded = self.bus_links.iter().any(|bus_link| bus_link.link.kind == BusKind::Embedded);
         Err(RunError::CellsThere { cells, embedded })
     }
 
@@ -126,7 +130,7 @@ impl Bench<'_> {
         }
     }
 
-    fn judge_start(&self) -> Result<(), RunError> {
+    fn rate_start(&self) -> Result<(), RunError> {
         let spawned = self.options.spawn;
         let silent = self.names(|cell| !cell.ready && !cell.unconfigured);
         let unconfigured = self.names(|cell| cell.unconfigured);
@@ -154,11 +158,13 @@ impl Bench<'_> {
         if self.signalled.load(Ordering::Relaxed) {
             return Err(RunError::Interrupted);
         }
-        for (bus, news) in self.news.try_iter() {
-            match news {
-                News::Notice(Notice::Rival) => return Err(self.rival(bus)),
-                News::Down(why) | News::Lost(why) | News::Refused(why) => return Err(RunError::Lost(why)),
-                News::Notice(_) | News::Up => {}
+        for (bus, bus_event) in self.bus_event.try_iter() {
+            match bus_event {
+                BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway(bus)),
+                BusEvent::Down(why) | BusEvent::Lost(why) | BusEvent::Refused(why) => {
+                    return Err(RunError::Lost(why));
+                }
+                BusEvent::Notice(_) | BusEvent::Up => {}
             }
         }
         match self.processes.ended().first() {
@@ -168,9 +174,9 @@ impl Bench<'_> {
     }
 
     /// Another gateway is on a bus.
-    pub(super) fn rival(&self, bus: usize) -> RunError {
-        let link = self.lanes.get(bus).map(|lane| &lane.link);
-        RunError::Rival(link.map(|link| (link.name.clone(), link.kind)))
+    pub(super) fn other_gateway(&self, bus: usize) -> RunError {
+        let link = self.bus_links.get(bus).map(|bus_link| &bus_link.link);
+        RunError::OtherGateway(link.map(|link| (link.name.clone(), link.kind)))
     }
 
     /// The cells of a process that has ended, for people.
@@ -180,9 +186,9 @@ impl Bench<'_> {
 
     /// Sends a command on every bus.
     pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
-        for lane in &self.lanes {
-            if lane.send(message)? {
-                lane.link.state.commands.fetch_add(1, Ordering::Relaxed);
+        for bus_link in &self.bus_links {
+            if bus_link.send(message)? {
+                bus_link.link.state.commands.fetch_add(1, Ordering::Relaxed);
             }
         }
         Ok(())
@@ -190,33 +196,33 @@ impl Bench<'_> {
 
     /// Switches all cells to what they forget at each start, before the first joints.
     fn switch_cells(&mut self) -> Result<(), RunError> {
-        let mut told = Told::new(SWITCH_AGAIN);
+        let mut announced = Announced::new(SWITCH_AGAIN);
         let lacking = self.lacking();
-        for (bus, (lane, described)) in self.lanes.iter().zip(&self.options.skin.buses).enumerate() {
+        for (bus, (bus_link, described)) in self.bus_links.iter().zip(&self.options.skin.buses).enumerate() {
             // Cells that were there before may be in any mode; those that have just started are in none.
             let off = (!self.options.spawn && described.sensing == Sensing::Off)
                 .then(|| (Parameter::Sensing.number(), Sensing::Off.words()));
             let first = lacking.iter().find(|((of, _), _)| *of == bus).map(|(_, switches)| switches.clone());
             for switch in off.into_iter().chain(first.unwrap_or_default()) {
-                lane.switch(Node::Everyone, switch)?;
+                bus_link.switch(Node::Everyone, switch)?;
             }
         }
-        told.said_to_all(self.now());
-        self.wait(SHOWING, |bench, patience| {
-            bench.switch_again(&mut told)?;
+        announced.said_to_all(self.now());
+        self.wait(SHOWING, |bench, timeout| {
+            bench.switch_again(&mut announced)?;
             // Who has not answered by then is told later.
-            Ok(bench.lacking().is_empty() || patience.is_over(0))
+            Ok(bench.lacking().is_empty() || timeout.is_over(0))
         })
     }
 
     /// Tells those that have not confirmed, for which time has passed: they started anew, or a word was lost.
-    pub(super) fn switch_again(&self, told: &mut Told) -> Result<(), RunError> {
+    pub(super) fn switch_again(&self, announced: &mut Announced) -> Result<(), RunError> {
         let lacking = self.lacking();
-        let due = told.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
+        let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
         for ((bus, cell), switches) in lacking.into_iter().filter(|(cell, _)| due.contains(cell)) {
-            let Some(lane) = self.lanes.get(bus) else { continue };
+            let Some(bus_link) = self.bus_links.get(bus) else { continue };
             for switch in switches {
-                lane.switch(Node::Cell(cell), switch)?;
+                bus_link.switch(Node::Cell(cell), switch)?;
             }
         }
         Ok(())
@@ -225,8 +231,10 @@ impl Bench<'_> {
     /// The cells that can hear and have not confirmed something, and what.
     fn lacking(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
-        for (bus, lane) in self.lanes.iter().enumerate().filter(|(_, lane)| lane.link.state.is_there()) {
-            let Ok(view) = lane.view.lock() else { continue };
+        for (bus, bus_link) in
+            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
+        {
+            let Ok(view) = bus_link.view.lock() else { continue };
             for cell in view.cells.iter().filter(|cell| cell.ready || cell.unconfigured) {
                 let switches: Vec<_> = cell.lacks.into_iter().flatten().collect();
                 if !switches.is_empty() {

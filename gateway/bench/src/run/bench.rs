@@ -18,7 +18,7 @@ use super::Options;
 use super::launch::{Processes, ServedBus};
 use super::link::{Link, Slot, may_return};
 use super::network::Network;
-use super::receiver::{Left, News};
+use super::receiver::{BusEvent, ReceiverResult};
 use crate::record::Recorder;
 use crate::setup::{names, since};
 use crate::view::{CellView, View};
@@ -34,19 +34,19 @@ const SWITCH: u8 = 0x5E;
 
 /// One bus of a bench.
 #[derive(Debug)]
-pub(super) struct Lane {
+pub(super) struct LinkId {
     pub(super) link: Arc<Link>,
     pub(super) format: Format,
     /// What the loop has of the bus, until it begins.
     pub(super) line: Option<(Line, Slot)>,
     pub(super) view: Arc<Mutex<View>>,
-    pub(super) receiver: Option<JoinHandle<Left>>,
+    pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
     /// Its cells' network, where they answer with sums.
     pub(super) network: Option<Network>,
     pub(super) shared: Arc<Shared>,
 }
 
-impl Lane {
+impl LinkId {
     /// Sends a message. A bus that is lost for a while does not take it, which is counted, and costs no run its end.
     pub(super) fn send(&self, message: &Message) -> Result<bool, BusError> {
         let frames: Vec<Frame> = message.encode().frames(self.format).collect();
@@ -74,8 +74,8 @@ pub(super) struct Bench<'a> {
     /// What the kernel's backlog had dropped before the first bus was opened.
     pub(super) backlog_dropped: Option<u64>,
     pub(super) shared: Arc<Shared>,
-    pub(super) lanes: Vec<Lane>,
-    pub(super) news: Inlet<(usize, News)>,
+    pub(super) bus_links: Vec<LinkId>,
+    pub(super) bus_event: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
     /// The epoch of the first broadcast.
@@ -100,15 +100,15 @@ impl Bench<'_> {
     }
 
     /// What each receiver shows.
-    pub(super) fn views(&self) -> impl Iterator<Item = (&Lane, MutexGuard<'_, View>)> {
-        self.lanes.iter().filter_map(|lane| Some((lane, lane.view.lock().ok()?)))
+    pub(super) fn views(&self) -> impl Iterator<Item = (&LinkId, MutexGuard<'_, View>)> {
+        self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
     /// The networks of the cells that answer with sums, with what their receivers show.
     pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
-        self.lanes
+        self.bus_links
             .iter_mut()
-            .filter_map(|Lane { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
+            .filter_map(|LinkId { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
     }
 
     /// How many cells are so.
@@ -117,10 +117,10 @@ impl Bench<'_> {
     }
 
     /// The names of some cells, for people: `1, 2, 5 on vcan0`.
-    pub(super) fn names(&self, wanted: impl Fn(&CellView) -> bool) -> String {
-        let names = self.views().filter_map(|(lane, view)| {
-            let nodes: Vec<_> = view.cells.iter().filter(|cell| wanted(cell)).map(|cell| cell.node).collect();
-            (!nodes.is_empty()).then(|| names(&nodes, &format!(" on {}", lane.link.name)))
+    pub(super) fn names(&self, target: impl Fn(&CellView) -> bool) -> String {
+        let names = self.views().filter_map(|(bus_link, view)| {
+            let nodes: Vec<_> = view.cells.iter().filter(|cell| target(cell)).map(|cell| cell.node).collect();
+            (!nodes.is_empty()).then(|| names(&nodes, &format!(" on {}", bus_link.link.name)))
         });
         names.collect::<Vec<_>>().join("; ")
     }

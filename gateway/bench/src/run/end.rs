@@ -9,11 +9,11 @@ use protocol::message::Message;
 use protocol::time::Micros;
 
 use super::RunError;
-use super::bench::{Bench, Lane};
+use super::bench::{Bench, LinkId};
 use super::measured::Measured;
 use super::progress::say;
 use super::realtime::wall;
-use super::receiver::Left;
+use super::receiver::ReceiverResult;
 use super::watch::LOOK;
 use crate::record::feed::Unrecorded;
 use crate::record::{Recorder, backlog};
@@ -37,7 +37,7 @@ impl Bench<'_> {
         if failure.is_some() {
             self.say_what_is_kept(summary.recording.as_ref());
         }
-        self.summarise(summary, &measured, &received).judged(failure)
+        self.summarise(summary, &measured, &received).rated(failure)
     }
 
     /// Ends a bench whose loop never began.
@@ -49,7 +49,7 @@ impl Bench<'_> {
         if error.exit_code() != 1 {
             return Err(error);
         }
-        Ok(self.summarise(summary, &Measured::new(), &received).judged(Some(error.to_string())))
+        Ok(self.summarise(summary, &Measured::new(), &received).rated(Some(error.to_string())))
     }
 
     /// Where the frames are that were heard before a failure.
@@ -80,17 +80,17 @@ impl Bench<'_> {
     /// Whether the receivers have read everything that was sent; what came before it they have read too. Of a bus
     /// that is lost nothing is waited for.
     fn has_caught_up(&self) -> bool {
-        self.lanes.iter().all(|lane| {
-            let read = lane.view.lock().map_or(u64::MAX, |view| view.commands);
-            !lane.link.state.is_there() || read >= lane.link.state.commands.load(Ordering::Relaxed)
+        self.bus_links.iter().all(|bus_link| {
+            let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
+            !bus_link.link.state.is_there() || read >= bus_link.link.state.commands.load(Ordering::Relaxed)
         })
     }
 
     /// Whether all cells have said it that can be expected to, on buses that work.
     fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
-        self.lanes.iter().filter(|lane| lane.link.state.is_there()).all(|lane| {
+        self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
             let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
-            lane.view.lock().map_or(true, |view| all(&view))
+            bus_link.view.lock().map_or(true, |view| all(&view))
         })
     }
 
@@ -103,15 +103,15 @@ impl Bench<'_> {
     }
 
     /// Lets the receivers end and takes what they leave.
-    fn stop_receivers(&mut self) -> Vec<Option<Left>> {
+    fn stop_receivers(&mut self) -> Vec<Option<ReceiverResult>> {
         self.shared.stop.store(true, Ordering::Relaxed);
-        let end = |lane: &mut Lane| lane.receiver.take().and_then(|thread| thread.join().ok());
-        self.lanes.iter_mut().map(end).collect()
+        let end = |bus_link: &mut LinkId| bus_link.receiver.take().and_then(|thread| thread.join().ok());
+        self.bus_links.iter_mut().map(end).collect()
     }
 
     /// Ends the recording, when nobody hands over more.
-    fn finish_recording(&mut self, received: &[Option<Left>]) -> Option<Recording> {
-        let add = |all: Unrecorded, one: &Left| Unrecorded {
+    fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<Recording> {
+        let add = |all: Unrecorded, one: &ReceiverResult| Unrecorded {
             frames: all.frames + one.unrecorded.frames,
             epochs: all.epochs + one.unrecorded.epochs,
         };
@@ -121,7 +121,12 @@ impl Bench<'_> {
     }
 
     /// Adds what was measured and received.
-    fn summarise(&self, summary: Summary, measured: &Measured, received: &[Option<Left>]) -> Summary {
+    fn summarise(
+        &self,
+        summary: Summary,
+        measured: &Measured,
+        received: &[Option<ReceiverResult>],
+    ) -> Summary {
         let backlog_dropped =
             backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
         let all = received.iter().flatten().map(|received| received.table.accuracy());
@@ -160,20 +165,20 @@ impl Bench<'_> {
 
     fn bus_summaries(
         &self,
-        received: &[Option<Left>],
+        received: &[Option<ReceiverResult>],
         backlog_dropped: Option<u64>,
         measured: &Measured,
     ) -> Vec<BusSummary> {
         let now = Micros(wall() / 1_000);
-        let summary = |(index, (lane, received)): (usize, (&Lane, &Option<Left>))| {
-            let Left { table, outages, dropped, .. } = received.as_ref()?;
-            let link = &lane.link;
-            let network = lane.network.as_ref().map(|network| NetworkSummary {
-                organised_s: network.organised.map(protocol::time::Span::seconds),
+        let summary = |(index, (bus_link, received)): (usize, (&LinkId, &Option<ReceiverResult>))| {
+            let ReceiverResult { table, outages, dropped, .. } = received.as_ref()?;
+            let link = &bus_link.link;
+            let network = bus_link.network.as_ref().map(|network| NetworkSummary {
+                tree_ready_s: network.tree_ready.map(protocol::time::Span::seconds),
                 deepest: network.deepest(),
                 differences: network.differences.iter().map(ToString::to_string).collect(),
-                without_way: network.without_way().collect(),
-                longest_without_way_s: network.longest.seconds(),
+                unreachable: network.unreachable().collect(),
+                longest_unreachable_s: network.longest.seconds(),
                 parent_changes: table.parent_changes(),
             });
             let outages = OutagesSummary {
@@ -186,7 +191,8 @@ impl Bench<'_> {
             let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, *dropped, now);
             Some(BusSummary { outages, network, ..summary })
         };
-        let mut summaries: Vec<_> = self.lanes.iter().zip(received).enumerate().filter_map(summary).collect();
+        let mut summaries: Vec<_> =
+            self.bus_links.iter().zip(received).enumerate().filter_map(summary).collect();
         // Nobody knows of which bus they were, but of the kernel's own.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {

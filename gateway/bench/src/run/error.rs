@@ -75,8 +75,8 @@ pub enum RunError {
     #[error(transparent)]
     Lost(BusError),
     /// Another gateway is on a bus.
-    #[error("{}", rival(.0.as_ref()))]
-    Rival(Option<(String, BusKind)>),
+    #[error("{}", other_gateway(.0.as_ref()))]
+    OtherGateway(Option<(String, BusKind)>),
     /// Cells are on a bus on which some were to be started.
     #[error(
         "cells are on the bus already: {cells}; use them with --no-spawn, {}",
@@ -158,7 +158,7 @@ impl RunError {
             | Self::Thread { .. }
             | Self::Memory(_)
             | Self::Lost(_)
-            | Self::Rival(_)
+            | Self::OtherGateway(_)
             | Self::CellsThere { .. }
             | Self::Unconfigured(_)
             | Self::NotReady { .. }
@@ -172,7 +172,7 @@ impl RunError {
     }
 }
 
-fn rival(link: Option<&(String, BusKind)>) -> String {
+fn other_gateway(link: Option<&(String, BusKind)>) -> String {
     match link {
         None => "another gateway is on the bus".to_owned(),
         Some((name, BusKind::SocketCan)) => {

@@ -26,7 +26,7 @@ pub const LISTEN: Duration = Duration::from_millis(500);
 /// Cells that were started and make no progress for so long are given up.
 pub const STARTING: Duration = Duration::from_secs(15);
 /// How long processes may take to end when asked to.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Why a process could not be started.
 #[derive(Debug, Error)]
@@ -144,14 +144,14 @@ impl ServedBus {
 pub fn open_or_serve(
     name: &str,
     kind: Choice,
-    wanted: &Options,
+    target: &Options,
     vcan_setup: Option<&Path>,
 ) -> Result<(Bus, Option<ServedBus>), RunError> {
-    match Bus::open(name, kind, wanted) {
+    match Bus::open(name, kind, target) {
         Err(BusError::NotServed { .. }) => {
             let served =
-                ServedBus::start(&program("vcan-setup", vcan_setup)?, name, wanted.directory.as_deref())?;
-            Ok((Bus::open(name, kind, wanted)?, Some(served)))
+                ServedBus::start(&program("vcan-setup", vcan_setup)?, name, target.directory.as_deref())?;
+            Ok((Bus::open(name, kind, target)?, Some(served)))
         }
         opened => Ok((opened?, None)),
     }
@@ -357,7 +357,7 @@ fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
 
 /// Waits for processes that were asked to end, and kills those that do not.
 fn end(children: &mut [&mut Child]) {
-    let give_up = Instant::now() + PATIENCE;
+    let give_up = Instant::now() + TIMEOUT;
     loop {
         let running = children
             .iter_mut()
@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_is_named_with_the_remedy() {
+    fn a_missing_program_is_named_with_the_hint() {
         let error = program("cell-node", Some(Path::new("/nowhere/cell-node"))).unwrap_err().to_string();
         assert!(error.starts_with("cell-node is not at /nowhere/cell-node: build it with"), "{error}");
     }

@@ -24,7 +24,7 @@ pub struct Link {
     /// How it is.
     pub state: Arc<BusState>,
     /// How it was opened, and is again.
-    wanted: Options,
+    target: Options,
     bus: Mutex<Arc<Bus>>,
     gone: AtomicBool,
 }
@@ -34,7 +34,7 @@ pub type Slot = triple_buffer::Output<Arc<Bus>>;
 
 /// The receiver's end of a link.
 #[derive(Debug)]
-pub struct Ear {
+pub struct ReceiveEnd {
     /// The link.
     pub link: Arc<Link>,
     /// The bus, as it was opened last.
@@ -45,19 +45,19 @@ pub struct Ear {
 impl Link {
     /// A bus that was opened so.
     #[must_use]
-    pub fn new(bus: Bus, wanted: Options) -> (Arc<Self>, Ear, Slot) {
+    pub fn new(bus: Bus, target: Options) -> (Arc<Self>, ReceiveEnd, Slot) {
         let bus = Arc::new(bus);
         let link = Arc::new(Self {
             name: bus.name().to_owned(),
             kind: bus.kind(),
             receive_buffer: bus.receive_buffer(),
             state: Arc::default(),
-            wanted,
+            target,
             bus: Mutex::new(Arc::clone(&bus)),
             gone: AtomicBool::new(false),
         });
         let (slot, output) = triple_buffer::triple_buffer(&bus);
-        (Arc::clone(&link), Ear { link, bus, slot }, output)
+        (Arc::clone(&link), ReceiveEnd { link, bus, slot }, output)
     }
 
     /// Whether it has to be opened anew.
@@ -82,11 +82,11 @@ pub const fn may_return(error: &BusError) -> bool {
     error.may_pass() || error.is_closed()
 }
 
-impl Ear {
+impl ReceiveEnd {
     /// Notes that it does not work; `gone` if it has to be opened anew. Whether that is news.
     pub fn lose(&self, gone: bool) -> bool {
-        let news = gone && !self.link.gone.swap(true, Ordering::Relaxed);
-        self.link.state.works.swap(false, Ordering::Relaxed) || news
+        let bus_event = gone && !self.link.gone.swap(true, Ordering::Relaxed);
+        self.link.state.works.swap(false, Ordering::Relaxed) || bus_event
     }
 
     /// Notes that it works. Whether that is news.
@@ -99,8 +99,8 @@ impl Ear {
     /// # Errors
     /// When it does not open yet.
     pub fn reopen(&mut self) -> Result<(), BusError> {
-        let Link { name, kind, wanted, .. } = &*self.link;
-        self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), wanted)?);
+        let Link { name, kind, target, .. } = &*self.link;
+        self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), target)?);
         *self.link.bus.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(&self.bus);
         self.slot.write(Arc::clone(&self.bus));
         self.link.gone.store(false, Ordering::Relaxed);

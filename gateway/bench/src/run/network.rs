@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
-use protocol::parameters::{Cuts, Parameter, Reply as Words, Slots};
+use protocol::parameters::{LinksDown, Parameter, Reply as Words, Slots};
 use protocol::skin::{Reply, Skin, Wires};
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
@@ -30,10 +30,10 @@ pub(super) struct Network {
     slots: Slots,
     period_us: u16,
     /// Cells that are told when they speak.
-    told: Repeats<CellId>,
+    announced: Repeats<CellId>,
     /// Ports that are to hear nothing, a bit each, and cells that are told so.
     deaf: BTreeMap<CellId, u8>,
-    told_cuts: Repeats<CellId>,
+    reported_links_down: Repeats<CellId>,
     /// Cells that speak and have no way, and since when.
     without: BTreeMap<CellId, Micros>,
     /// Cells that people have heard of as without a way, and since when they are; until they have one again.
@@ -42,7 +42,7 @@ pub(super) struct Network {
     /// How long a cell was without a way, at most.
     pub(super) longest: Span,
     /// From the time when all cells were ready until all had a way.
-    pub(super) organised: Option<Span>,
+    pub(super) tree_ready: Option<Span>,
     /// What was different from the description at the start.
     pub(super) differences: Vec<Difference>,
 }
@@ -88,14 +88,14 @@ impl Network {
             wires: skin.wires(bus),
             slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
-            told: Repeats::new(AGAIN),
+            announced: Repeats::new(AGAIN),
             deaf: BTreeMap::new(),
-            told_cuts: Repeats::new(AGAIN),
+            reported_links_down: Repeats::new(AGAIN),
             without: BTreeMap::new(),
             said: BTreeMap::new(),
             said_too_deep: false,
             longest: Span(0),
-            organised: None,
+            tree_ready: None,
             differences: Vec::new(),
         })
     }
@@ -111,7 +111,7 @@ impl Network {
     }
 
     /// Cells that speak and have no way, at the last look.
-    pub(super) fn without_way(&self) -> impl Iterator<Item = u8> {
+    pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
         self.without.keys().map(|cell| cell.get())
     }
 
@@ -122,7 +122,7 @@ impl Network {
     /// How many cells have a way, and whether all do that speak, with pages that agree.
     pub(super) fn progress(view: &View) -> (usize, bool) {
         let places = Self::places(view);
-        (places.depths.len(), places.without_way.is_empty() && places.agree)
+        (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
 
     /// What is different from the description.
@@ -155,8 +155,8 @@ impl Network {
     }
 
     /// Tells everyone how deep the tree is.
-    pub(super) fn tell_everyone(&mut self, now: Micros) -> Message {
-        self.told.said_to_all(now);
+    pub(super) fn announce(&mut self, now: Micros) -> Message {
+        self.announced.said_to_all(now);
         self.tell(Node::Everyone)
     }
 
@@ -169,30 +169,31 @@ impl Network {
 
     /// What is to be said to those who have not answered for a while.
     pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
-        let due = self.told.due(now, self.untold(view));
+        let due = self.announced.due(now, self.untold(view));
         due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
     }
 
     /// Cuts the wires from one cell to another, or mends them.
-    pub(super) fn set_cut(&mut self, cut: bool, from: CellId, to: CellId) {
+    pub(super) fn set_link_down(&mut self, link_down: bool, from: CellId, to: CellId) {
         let ends = (0_u8..)
             .zip(0..PORTS)
             .filter(|&(_, port)| self.wires.other_end(to, port).is_some_and(|(other, _)| other == from));
         let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
         let deaf = self.deaf.entry(to).or_default();
-        *deaf = if cut { *deaf | bits } else { *deaf & !bits };
-        self.told_cuts.renew(to);
+        *deaf = if link_down { *deaf | bits } else { *deaf & !bits };
+        self.reported_links_down.renew(to);
     }
 
     /// What is to be said to those whose ports are to hear nothing, or to hear again.
-    fn tell_cuts(&mut self, now: Micros, view: &View) -> Vec<Message> {
-        let wanted = |node: &CellId| self.deaf.get(node).copied();
+    fn report_links_down(&mut self, now: Micros, view: &View) -> Vec<Message> {
+        let target = |node: &CellId| self.deaf.get(node).copied();
         let ready = view.cells.iter().filter(|cell| cell.ready);
-        let open = ready.filter(|cell| wanted(&cell.node).is_some_and(|deaf| deaf != cell.deaf));
-        let due = self.told_cuts.due(now, open.map(|cell| cell.node));
+        let open = ready.filter(|cell| target(&cell.node).is_some_and(|deaf| deaf != cell.deaf));
+        let due = self.reported_links_down.due(now, open.map(|cell| cell.node));
         let message = |cell: CellId| {
-            let deaf = wanted(&cell)?;
-            let request = Request::Write { number: Parameter::Cuts.number(), words: Cuts { deaf }.words() };
+            let deaf = target(&cell)?;
+            let request =
+                Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
             Some(Message::Configure { to: Node::Cell(cell), tag: deaf, request })
         };
         due.into_iter().filter_map(message).collect()
@@ -204,7 +205,7 @@ impl Network {
         let places = Self::places(view);
         if places.deepest().is_some_and(|deepest| deepest > self.slots.deepest) {
             match self.fit(view) {
-                Ok(()) => look.messages.push(self.tell_everyone(now)),
+                Ok(()) => look.messages.push(self.announce(now)),
                 Err(why) if !self.said_too_deep => {
                     self.said_too_deep = true;
                     look.notes.push(format!("{why}; what is deeper speaks too early, and is late"));
@@ -213,8 +214,8 @@ impl Network {
             }
         }
         look.messages.extend(self.tell_again(now, view));
-        look.messages.extend(self.tell_cuts(now, view));
-        let without: BTreeSet<_> = places.without_way.into_iter().collect();
+        look.messages.extend(self.report_links_down(now, view));
+        let without: BTreeSet<_> = places.unreachable.into_iter().collect();
         self.without.retain(|cell, since| {
             self.longest = self.longest.max(now.since(*since));
             without.contains(cell)
@@ -230,13 +231,13 @@ impl Network {
         for &cell in &without {
             self.without.entry(cell).or_insert(now);
         }
-        let news = |(cell, since): (&CellId, &Micros)| {
+        let bus_event = |(cell, since): (&CellId, &Micros)| {
             (now.since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
         };
-        let news: Vec<_> = self.without.iter().filter_map(news).collect();
-        if let Some(oldest) = news.iter().map(|(_, since)| now.since(*since)).max() {
-            self.said.extend(news.iter().copied());
-            let cells: Vec<_> = news.into_iter().map(|(cell, _)| cell).collect();
+        let bus_event: Vec<_> = self.without.iter().filter_map(bus_event).collect();
+        if let Some(oldest) = bus_event.iter().map(|(_, since)| now.since(*since)).max() {
+            self.said.extend(bus_event.iter().copied());
+            let cells: Vec<_> = bus_event.into_iter().map(|(cell, _)| cell).collect();
             let (has, them) = if cells.len() == 1 { ("has", "it") } else { ("have", "them") };
             look.notes.push(format!(
                 "{} on {} {has} no way to a root: no sum holds {them} since {:.1} s",
@@ -353,7 +354,7 @@ mod tests {
             now = now + AGAIN;
             let mut view = view(&trees, words);
             view.cells[1].deaf = deaf;
-            let told = |message: &Message| {
+            let announced = |message: &Message| {
                 let Message::Configure {
                     to: Node::Cell(to),
                     request: Request::Write { number: 9, words },
@@ -362,24 +363,24 @@ mod tests {
                 else {
                     panic!("{message:?}")
                 };
-                (to.get(), Cuts::from_words(words).deaf)
+                (to.get(), LinksDown::from_words(words).deaf)
             };
-            network.look(now, &view).messages.iter().map(told).collect::<Vec<_>>()
+            network.look(now, &view).messages.iter().map(announced).collect::<Vec<_>>()
         };
-        network.set_cut(true, cell(3), cell(2));
+        network.set_link_down(true, cell(3), cell(2));
         assert_eq!(look(&mut network, 0), [(2, 0b10)]);
         assert_eq!(look(&mut network, 0), [(2, 0b10)], "it did not answer");
         assert_eq!(look(&mut network, 0b10), []);
-        network.set_cut(true, cell(1), cell(2));
+        network.set_link_down(true, cell(1), cell(2));
         assert_eq!(look(&mut network, 0b10), [(2, 0b11)]);
-        network.set_cut(false, cell(3), cell(2));
+        network.set_link_down(false, cell(3), cell(2));
         assert_eq!(look(&mut network, 0b11), [(2, 0b01)]);
         assert_eq!(look(&mut network, 0b01), []);
         assert_eq!(look(&mut network, 0), [(2, 0b01)], "it started anew");
     }
 
     #[test]
-    fn who_has_no_way_is_named_once_and_again_when_it_has_one() {
+    fn who_is_unreachable_is_named_once_and_again_when_it_has_one() {
         let mut network = network();
         let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&whole, None)).unwrap();
@@ -390,19 +391,19 @@ mod tests {
             network.look(at, &view(trees, words)).notes
         };
         assert_eq!(look(&mut network, &whole), Vec::<String>::new());
-        let cut = [Some((Some(0), 0)), Some((None, 0)), Some((Some(2), 1))];
-        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
-        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
+        let link_down = [Some((Some(0), 0)), Some((None, 0)), Some((Some(2), 1))];
+        assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
+        assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(
-            look(&mut network, &cut),
+            look(&mut network, &link_down),
             ["cells 2, 3 on vcan0 have no way to a root: no sum holds them since 0.4 s"]
         );
-        assert_eq!(look(&mut network, &cut), Vec::<String>::new());
-        assert_eq!(network.without_way().collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
+        assert_eq!(network.unreachable().collect::<Vec<_>>(), [2, 3]);
         // One dies, which somebody else says; the other is there again.
-        let half = [Some((Some(0), 0)), None, Some((Some(1), 1))];
-        assert_eq!(look(&mut network, &half), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
-        assert_eq!(network.without_way().count(), 0);
+        let segment = [Some((Some(0), 0)), None, Some((Some(1), 1))];
+        assert_eq!(look(&mut network, &segment), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
+        assert_eq!(network.unreachable().count(), 0);
         assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a way to a root again, after 1.0 s"]);
         assert_eq!(network.longest, Span::from_millis(800));
     }

@@ -22,27 +22,30 @@ impl Bench<'_> {
     pub(super) fn organise(&mut self) -> Result<(), RunError> {
         self.shared.explore.store(true, Ordering::Relaxed);
         let began = self.now();
-        self.wait(self.patience(), |bench, patience| {
+        self.wait(self.timeout(), |bench, timeout| {
             let (mut have_ways, mut whole, now) = (0, true, bench.now());
             for (network, view) in bench.networks() {
                 let (count, all) = Network::progress(&view);
                 have_ways += count;
                 whole &= all;
-                network.organised = all.then(|| network.organised.unwrap_or_else(|| now.since(began)));
+                network.tree_ready = all.then(|| network.tree_ready.unwrap_or_else(|| now.since(began)));
             }
-            Ok(whole || patience.is_over(have_ways))
+            Ok(whole || timeout.is_over(have_ways))
         })?;
         self.check_networks()?;
         for (network, view) in self.networks() {
             network.fit(&view)?;
         }
         self.tell_networks()?;
-        for network in
-            self.lanes.iter().filter_map(|lane| lane.network.as_ref()).filter(|_| !self.options.quiet)
+        for network in self
+            .bus_links
+            .iter()
+            .filter_map(|bus_link| bus_link.network.as_ref())
+            .filter(|_| !self.options.quiet)
         {
             let (name, deepest) = (network.name(), network.deepest());
-            let organised = network.organised.unwrap_or_default().seconds();
-            say(&format!("the cells of {name} are a tree, {deepest} wires deep, after {organised:.2} s"));
+            let tree_ready = network.tree_ready.unwrap_or_default().seconds();
+            say(&format!("the cells of {name} are a tree, {deepest} wires deep, after {tree_ready:.2} s"));
         }
         Ok(())
     }
@@ -52,7 +55,7 @@ impl Bench<'_> {
         // Pages of ports come with heartbeats, if they are not asked for.
         self.say(&Message::Report)?;
         let mut changes = 0;
-        self.wait(SETTLING, |bench, patience| {
+        self.wait(SETTLING, |bench, timeout| {
             let mut none = true;
             for (network, view) in bench.networks() {
                 let differences = network.check(&view);
@@ -60,10 +63,10 @@ impl Bench<'_> {
                 changes += usize::from(differences != network.differences);
                 network.differences = differences;
             }
-            Ok(none || patience.is_over(changes))
+            Ok(none || timeout.is_over(changes))
         })?;
         let mut broken = None;
-        for network in self.lanes.iter().filter_map(|lane| lane.network.as_ref()) {
+        for network in self.bus_links.iter().filter_map(|bus_link| bus_link.network.as_ref()) {
             for difference in &network.differences {
                 let line = format!("{}: {difference}", network.name());
                 if !self.options.quiet {
@@ -79,15 +82,15 @@ impl Bench<'_> {
 
     /// Tells all cells in which slots they speak, and sees that they have heard it.
     fn tell_networks(&mut self) -> Result<(), RunError> {
-        self.send_to_networks(|network, now, _| vec![network.tell_everyone(now)])?;
+        self.send_to_networks(|network, now, _| vec![network.announce(now)])?;
         let mut untold = Vec::new();
-        self.wait(SHOWING, |bench, patience| {
+        self.wait(SHOWING, |bench, timeout| {
             untold.clear();
             for (network, view) in bench.networks() {
                 untold
                     .extend(network.untold(&view).iter().map(|cell| format!("{cell} on {}", network.name())));
             }
-            let is_last = untold.is_empty() || patience.is_over(0);
+            let is_last = untold.is_empty() || timeout.is_over(0);
             if !is_last {
                 bench.send_to_networks(Network::tell_again)?;
             }
@@ -110,13 +113,13 @@ impl Bench<'_> {
         mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,
     ) -> Result<(), RunError> {
         let now = self.now();
-        for lane in &mut self.lanes {
-            let messages = match (&mut lane.network, lane.view.lock()) {
+        for bus_link in &mut self.bus_links {
+            let messages = match (&mut bus_link.network, bus_link.view.lock()) {
                 (Some(network), Ok(view)) => messages(network, now, &view),
                 _ => continue,
             };
             for message in messages {
-                lane.send(&message)?;
+                bus_link.send(&message)?;
             }
         }
         Ok(())

@@ -11,7 +11,7 @@ use protocol::id::Kind;
 use protocol::packet::{Epoch, WORDS};
 use protocol::time::Micros;
 
-use super::link::{Ear, Outages};
+use super::link::{Outages, ReceiveEnd};
 use super::realtime::wall;
 use super::roots::Roots;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
@@ -29,7 +29,7 @@ const REOPEN: Duration = Duration::from_millis(100);
 
 /// What a receiver tells the main thread at once.
 #[derive(Debug)]
-pub enum News {
+pub enum BusEvent {
     /// Of a cell, or another gateway.
     Notice(Notice),
     /// The bus does not work for now.
@@ -48,7 +48,7 @@ pub struct Receiver {
     /// Where this bus stands among the skin's.
     pub index: usize,
     /// The bus.
-    pub ear: Ear,
+    pub receive_end: ReceiveEnd,
     /// So long frames are left to gather, so that one wake-up takes many: a tick, as nobody looks more often.
     pub gather: Duration,
     /// What is known of it.
@@ -66,12 +66,12 @@ pub struct Receiver {
     /// What the main thread sees.
     pub view: Arc<Mutex<View>>,
     /// What it is told at once.
-    pub news: Sender<(usize, News)>,
+    pub bus_event: Sender<(usize, BusEvent)>,
 }
 
 /// What a receiver leaves at the end.
 #[derive(Debug)]
-pub struct Left {
+pub struct ReceiverResult {
     /// All that is known of the bus.
     pub table: Table,
     /// Frames that the bus dropped because we did not take them in time.
@@ -88,7 +88,7 @@ struct Account {
     /// Frames that the bus dropped on sockets before this one.
     dropped_before: u64,
     /// What this socket had dropped when it was last told to the recorder.
-    told: u32,
+    announced: u32,
     /// The newest joints whose feelings the recorder has.
     newest: Option<u64>,
     outages: Outages,
@@ -103,7 +103,7 @@ struct Account {
 impl Receiver {
     /// Receives until someone says stop. A bus that is lost is waited for, and opened again when it is gone.
     #[must_use]
-    pub fn run(mut self) -> Left {
+    pub fn run(mut self) -> ReceiverResult {
         super::realtime::prepare_receiver();
         let mut inbox = Inbox::new();
         let mut account = Account::default();
@@ -116,16 +116,16 @@ impl Receiver {
             } else {
                 self.take(&mut inbox, &mut account)
             };
-            if count > 0 && self.ear.regain() {
+            if count > 0 && self.receive_end.regain() {
                 account.outages.end(Instant::now());
-                self.tell(News::Up);
+                self.tell(BusEvent::Up);
             }
             self.hear(&inbox);
             if let Some(roots) = &mut self.roots {
                 if self.shared.explore.load(Ordering::Relaxed) {
                     roots.explore();
                 }
-                roots.speak(&self.ear.bus);
+                roots.speak(&self.receive_end.bus);
             }
             self.record(&inbox, &mut account);
             if count == 0 || looked.elapsed() >= LOOK {
@@ -141,15 +141,15 @@ impl Receiver {
         self.table.finish();
         let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
         let dropped = account.dropped_before + u64::from(inbox.dropped());
-        Left { table: self.table, dropped, unrecorded, outages: account.outages }
+        ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages }
     }
 
     /// Waits for frames and takes them; how many.
     fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
-        let bus = &self.ear.bus;
+        let bus = &self.receive_end.bus;
         inbox.clear();
-        let patience = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
-        let came = bus.wait(Some(patience)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
+        let timeout = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.timeout()));
+        let came = bus.wait(Some(timeout)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
         came.unwrap_or_else(|error| {
             self.lose(inbox, account, error);
             0
@@ -163,9 +163,9 @@ impl Receiver {
             account.retry = Some(Instant::now());
             account.refused.clear();
         }
-        if self.ear.lose(gone) {
+        if self.receive_end.lose(gone) {
             account.outages.begin(Instant::now());
-            self.tell(if gone { News::Lost(error) } else { News::Down(error) });
+            self.tell(if gone { BusEvent::Lost(error) } else { BusEvent::Down(error) });
         }
         if gone {
             inbox.clear();
@@ -174,7 +174,7 @@ impl Receiver {
         std::thread::sleep(DOWN);
         // What stood on it before is no sign that it works again.
         loop {
-            match self.ear.bus.receive(inbox) {
+            match self.receive_end.bus.receive(inbox) {
                 Ok(1..) => {
                     self.hear(inbox);
                     self.record(inbox, account);
@@ -194,17 +194,17 @@ impl Receiver {
         if now < retry {
             return std::thread::sleep(LOOK.min(retry - now));
         }
-        match self.ear.reopen() {
+        match self.receive_end.reopen() {
             Ok(()) => {
                 account.dropped_before += u64::from(inbox.dropped());
                 *inbox = Inbox::new();
-                (account.told, account.retry) = (0, None);
+                (account.announced, account.retry) = (0, None);
             }
             Err(error) => {
                 account.retry = Some(now + REOPEN);
                 let why = error.to_string();
                 if !is_absent(&error) && account.refused != why {
-                    self.tell(News::Refused(error));
+                    self.tell(BusEvent::Refused(error));
                 }
                 account.refused = why;
             }
@@ -237,14 +237,14 @@ impl Receiver {
     /// Hands on what is no frame: what the bus dropped, and once an epoch what cells feel.
     fn record(&mut self, inbox: &Inbox, account: &mut Account) {
         let Some(outlet) = &mut self.outlet else { return };
-        let more = inbox.dropped().wrapping_sub(account.told);
+        let more = inbox.dropped().wrapping_sub(account.announced);
         if more > 0 {
-            account.told = inbox.dropped();
+            account.announced = inbox.dropped();
             outlet.dropped(wall(), more.into());
         }
         let Some((number, epoch, at)) = self.table.newest() else { return };
         if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
-            let cells = self.table.felt(at).collect();
+            let cells = self.table.reference_torque(at).collect();
             outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
         }
     }
@@ -261,13 +261,14 @@ impl Receiver {
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
-            self.tell(News::Notice(notice));
+            self.tell(BusEvent::Notice(notice));
         }
         let cells = self.table.statuses(now).map(|(cell, status)| CellView::of(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
-        if !self.ear.link.state.is_there() {
+        if !self.receive_end.link.state.is_there() {
             // What it took and has not carried by now it will not carry.
-            account.unread = self.ear.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
+            account.unread =
+                self.receive_end.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
         }
         let commands = read + account.unread;
         let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
@@ -276,9 +277,9 @@ impl Receiver {
         }
     }
 
-    fn tell(&self, news: News) {
+    fn tell(&self, bus_event: BusEvent) {
         // Nobody listens any more when the run ends.
-        let _ = self.news.send((self.index, news));
+        let _ = self.bus_event.send((self.index, bus_event));
     }
 }
 

@@ -9,7 +9,7 @@ use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
-use protocol::wire::{FLAG, Lane};
+use protocol::wire::{FLAG, LinkId};
 
 use model::network::Uplinks;
 
@@ -18,7 +18,7 @@ use model::network::Uplinks;
 pub struct Roots {
     uplinks: Uplinks,
     /// Each root, with the lane on which the gateway speaks to it, and whether its sums are for the gateway.
-    roots: Vec<(CellId, Lane, bool)>,
+    roots: Vec<(CellId, LinkId, bool)>,
     began: Instant,
     /// Whether the gateway speaks: where it begins before its cells are all there, the first ones make a tree
     /// that is deeper than it has to be.
@@ -26,21 +26,21 @@ pub struct Roots {
 }
 
 /// A bus' roots and the lanes on which the gateway speaks to them; none where cells answer with their own torques.
-fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, Lane)> {
+fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
     if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
 }
 
 /// What a gateway receives of a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Ears {
+pub struct ReceiveFilter {
     /// What its socket lets pass.
     pub filters: Vec<Filter>,
     /// Whether sums of cells that are no roots pass.
     pub all_sums: bool,
 }
 
-impl Ears {
+impl ReceiveFilter {
     /// Everything, but of simulated wires only those that lead to the gateway; and unless `everything` is wanted, of
     /// sums only those of roots.
     #[must_use]
@@ -59,7 +59,7 @@ impl Ears {
         };
         // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
-        let wires = roots.iter().map(|(_, lane)| Filter::lane(lane.reversed()));
+        let wires = roots.iter().map(|(_, link_id)| Filter::link_id(link_id.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
         let all_sums = everything || few.len() + others.len() > Filter::MAX;
@@ -72,7 +72,8 @@ impl Roots {
     /// Those of a bus; `None` where cells answer with their own torques.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
-        let roots: Vec<_> = roots(skin, bus).into_iter().map(|(root, lane)| (root, lane, false)).collect();
+        let roots: Vec<_> =
+            roots(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
         // Whoever was there before counted its walks too, and nobody knows how far; process ids are often neighbours.
         let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
         (!roots.is_empty()).then(|| Self {
@@ -85,7 +86,7 @@ impl Roots {
 
     /// What of the wires has to pass to hear the roots.
     pub fn filters(&self) -> impl Iterator<Item = Filter> {
-        self.roots.iter().map(|(_, lane, _)| Filter::lane(lane.reversed()))
+        self.roots.iter().map(|(_, link_id, _)| Filter::link_id(link_id.reversed()))
     }
 
     /// The gateway speaks from now on.
@@ -108,7 +109,7 @@ impl Roots {
 
     /// Takes a frame that came from the bus; whether it was one of a wire, which nobody else is to see.
     pub fn take(&mut self, frame: &Frame) -> bool {
-        let Some(lane) = Lane::from_raw_id(frame.raw_id()) else {
+        let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
                 && let Node::Cell(cell) = Node::from_byte(node)
             {
@@ -116,9 +117,9 @@ impl Roots {
             }
             return false;
         };
-        let root = self.roots.iter().position(|(_, own, _)| own.reversed() == lane);
+        let root = self.roots.iter().position(|(_, own, _)| own.reversed() == link_id);
         if let Some((root, message)) =
-            root.filter(|_| self.explores).and_then(|root| Some((root, lane.read(frame)?)))
+            root.filter(|_| self.explores).and_then(|root| Some((root, link_id.read(frame)?)))
         {
             let now = self.now();
             self.uplinks.handle(now, root, message);
@@ -134,16 +135,16 @@ impl Roots {
         let now = self.now();
         self.uplinks.handle_time(now);
         while let Some((root, message)) = self.uplinks.poll_transmit() {
-            if let Some((_, lane, _)) = self.roots.get(root) {
+            if let Some((_, link_id, _)) = self.roots.get(root) {
                 // What the bus does not take is asked for again.
-                let _ = bus.offer(&[lane.frame(message)]);
+                let _ = bus.offer(&[link_id.frame(message)]);
             }
         }
     }
 
     /// How long nothing has to be said, if nothing comes.
     #[must_use]
-    pub fn patience(&self) -> Duration {
+    pub fn timeout(&self) -> Duration {
         if !self.explores {
             return Duration::MAX;
         }
@@ -157,7 +158,7 @@ mod tests {
     use protocol::can::Format;
     use protocol::message::{Message, VERSION};
     use protocol::packet::Epoch;
-    use protocol::wire::{Hello, Label};
+    use protocol::wire::{Hello, Rank};
 
     fn skin(reply: &str) -> Skin {
         let head = model::testing::SKIN.replace("reply = \"torque\"", reply);
@@ -167,9 +168,9 @@ mod tests {
         Skin::parse("skin.toml", &format!("{head}{first}{second}")).unwrap()
     }
 
-    fn passes(ears: &Ears, frame: &Frame) -> bool {
+    fn passes(receive_filter: &ReceiveFilter, frame: &Frame) -> bool {
         let id = frame.raw_id();
-        ears.filters.iter().any(|filter| id & filter.mask == filter.id & filter.mask)
+        receive_filter.filters.iter().any(|filter| id & filter.mask == filter.id & filter.mask)
     }
 
     fn sum(node: i64) -> Frame {
@@ -186,18 +187,18 @@ mod tests {
     fn a_gateway_takes_sums_of_roots_and_its_own_wires_and_all_that_is_no_wire() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         // Wire 0 is between the cells, wire 1 is the root's.
-        let wire = |wire, back| Lane { wire, back }.frame(protocol::wire::PortMessage::Join);
+        let wire = |wire, back| LinkId { wire, back }.frame(protocol::wire::PortMessage::Join);
         for everything in [false, true] {
-            let ears = Ears::of(&skin, 0, everything);
-            assert_eq!(ears.all_sums, everything);
-            assert!(passes(&ears, &sum(1)) && passes(&ears, &wire(1, false)));
-            assert_eq!(passes(&ears, &sum(2)), everything);
+            let receive_filter = ReceiveFilter::of(&skin, 0, everything);
+            assert_eq!(receive_filter.all_sums, everything);
+            assert!(passes(&receive_filter, &sum(1)) && passes(&receive_filter, &wire(1, false)));
+            assert_eq!(passes(&receive_filter, &sum(2)), everything);
             for other in [wire(0, false), wire(0, true), wire(1, true)] {
-                assert!(!passes(&ears, &other), "{other:?}");
+                assert!(!passes(&receive_filter, &other), "{other:?}");
             }
             for kind in [0, 2, 3, 4, 5, 6, 7] {
                 let frame = Frame::classic(kind << 8 | 2, &[]).unwrap();
-                assert!(passes(&ears, &frame), "kind {kind}");
+                assert!(passes(&receive_filter, &frame), "kind {kind}");
             }
             for foreign in [EXTENDED | 0x0FFF_FFFF, REMOTE | 0x102, EXTENDED | REMOTE | 5] {
                 let frame = if foreign & REMOTE == 0 {
@@ -205,24 +206,24 @@ mod tests {
                 } else {
                     Frame::remote(foreign & !REMOTE, 0).unwrap()
                 };
-                assert!(passes(&ears, &frame), "{foreign:08X}");
+                assert!(passes(&receive_filter, &frame), "{foreign:08X}");
             }
         }
-        let torque = Ears::of(&self::skin("reply = \"torque\""), 0, false);
-        assert_eq!(torque, Ears { filters: vec![Filter::ALL], all_sums: true });
+        let torque = ReceiveFilter::of(&self::skin("reply = \"torque\""), 0, false);
+        assert_eq!(torque, ReceiveFilter { filters: vec![Filter::ALL], all_sums: true });
     }
 
     #[test]
     fn a_roots_question_is_answered_and_other_wires_are_kept_from_the_table() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         let mut roots = Roots::of(&skin, 0).unwrap();
-        let leave = Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
+        let leave = LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
         assert!(roots.take(&leave));
         assert_eq!(roots.uplinks.poll_transmit(), None, "it does not speak yet");
         roots.explore();
-        assert!(roots.take(&Lane { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
+        assert!(roots.take(&LinkId { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
         assert_eq!(roots.uplinks.poll_transmit(), None);
-        assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Join)));
+        assert!(roots.take(&LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Join)));
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::wire::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
@@ -234,9 +235,11 @@ mod tests {
             hears: true,
             up: true,
             unnumbered: false,
-            label: Some(Label { round: 1, depth: 1 }),
+            rank: Some(Rank { round: 1, depth: 1 }),
         };
-        assert!(roots.take(&Lane { wire: 1, back: false }.frame(protocol::wire::PortMessage::Hello(hello))));
+        assert!(
+            roots.take(&LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Hello(hello)))
+        );
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
         assert_eq!(roots.changes().collect::<Vec<_>>(), []);
         assert!(roots.take(&leave));

@@ -12,13 +12,13 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::skin::{self, Reply};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
-use super::bench::{Bench, Lane};
+use super::bench::{Bench, LinkId};
 use super::launch::{Processes, ServedBus, open_or_serve, program};
-use super::link::{Ear, Link, Slot};
+use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
 use super::progress::say;
-use super::receiver::{News, Receiver};
-use super::roots::{Ears, Roots};
+use super::receiver::{BusEvent, Receiver};
+use super::roots::{ReceiveFilter, Roots};
 use super::{Options, RunError, realtime};
 use crate::record::feed::{self, Feed, Outlet};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
@@ -36,7 +36,7 @@ use trace::recording::layout::Layout;
 use trace::recording::series::Head;
 
 /// How long stimuli and commands may wait for a full bus; the loop's own frames never wait.
-const SEND_PATIENCE: Duration = Duration::from_millis(10);
+const SEND_TIMEOUT: Duration = Duration::from_millis(10);
 /// Frames gather for a tick, and no longer than this.
 const GATHER: Duration = Duration::from_millis(10);
 /// Said when a receive buffer is smaller than it should be.
@@ -66,29 +66,30 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let backlog_dropped = backlog::dropped();
     let mut served = Vec::new();
     let opened = skin.buses.iter().enumerate().map(|(index, bus)| {
-        let ears = Ears::of(skin, index, !outputs.is_empty());
-        open(options, bus, ears.filters, &mut served)
+        let receive_filter = ReceiveFilter::of(skin, index, !outputs.is_empty());
+        open(options, bus, receive_filter.filters, &mut served)
     });
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
     let shared = Arc::new(Shared::default());
-    let (tell, news) = mpsc::channel();
-    let (mut lanes, mut feeds) = (Vec::new(), Vec::new());
-    for (index, (ear, slot)) in opened.into_iter().enumerate() {
+    let (tell, bus_event) = mpsc::channel();
+    let (mut bus_links, mut feeds) = (Vec::new(), Vec::new());
+    for (index, (receive_end, slot)) in opened.into_iter().enumerate() {
         let view = Arc::new(Mutex::new(View::default()));
-        let recorded = || feed::lane(outputs.wants_all(), Arc::clone(&view), Arc::clone(&ear.link.state));
+        let recorded =
+            || feed::bus_feed(outputs.wants_all(), Arc::clone(&view), Arc::clone(&receive_end.link.state));
         let (outlet, feed) = (!outputs.is_empty()).then(recorded).unzip();
         feeds.extend(feed);
-        lanes.push(listen(options, index, (ear, slot), view, outlet, &shared, tell.clone())?);
+        bus_links.push(listen(options, index, (receive_end, slot), view, outlet, &shared, tell.clone())?);
     }
-    let (recorder, recorded) = record(options, outputs, feeds, &lanes, &idle)?;
+    let (recorder, recorded) = record(options, outputs, feeds, &bus_links, &idle)?;
     Ok(Bench {
         options,
         began,
         idle,
         backlog_dropped,
         shared,
-        lanes,
-        news,
+        bus_links,
+        bus_event,
         signalled,
         cycle,
         first_epoch: Epoch(0),
@@ -119,18 +120,18 @@ fn open(
     described: &skin::Bus,
     filters: Vec<Filter>,
     served: &mut Vec<ServedBus>,
-) -> Result<(Ear, Slot), RunError> {
+) -> Result<(ReceiveEnd, Slot), RunError> {
     let name = &described.name;
-    let wanted = BusOptions {
+    let target = BusOptions {
         fd: described.format == Format::Fd,
         filters,
         own_frames: true,
         error_mask: u32::MAX,
         receive_buffer: options.receive_buffer,
-        send_patience: SEND_PATIENCE,
+        send_timeout: SEND_TIMEOUT,
         directory: options.directory.clone(),
     };
-    let (bus, own) = open_or_serve(name, options.kinds.of(name), &wanted, options.vcan_setup.as_deref())?;
+    let (bus, own) = open_or_serve(name, options.kinds.of(name), &target, options.vcan_setup.as_deref())?;
     served.extend(own);
     if described.reply != Reply::Torque && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
         return Err(RunError::RealWires(name.clone()));
@@ -140,36 +141,37 @@ fn open(
         let less = if bytes < options.receive_buffer { LIMITED } else { "" };
         say(&format!("{name} is {kind}, with a receive buffer of {} KiB{less}", bytes / 1_024));
     }
-    let (_, ear, slot) = Link::new(bus, wanted);
-    Ok((ear, slot))
+    let (_, receive_end, slot) = Link::new(bus, target);
+    Ok((receive_end, slot))
 }
 
 /// Starts the thread that records, if anything is to be recorded; where the loop's records go to it.
 fn record(
     options: &Options,
     outputs: Outputs,
-    lanes_of_feed: Vec<feed::Lane>,
-    lanes: &[Lane],
+    bus_links_of_feed: Vec<feed::LinkId>,
+    bus_links: &[LinkId],
     idle: &Histogram<u64>,
 ) -> Result<(Option<Recorder>, Option<rtrb::Producer<Timed>>), RunError> {
     if outputs.is_empty() {
         return Ok((None, None));
     }
     let (recorded, ticks) = outputs.wants_all().then(|| rtrb::RingBuffer::new(feed::TICKS)).unzip();
-    let head = options.record.mcap.as_ref().map(|mcap| head(options, mcap, lanes, idle)).unwrap_or_default();
-    let feed = Feed { lanes: lanes_of_feed, ticks };
+    let head =
+        options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
+    let feed = Feed { bus_feeds: bus_links_of_feed, ticks };
     Ok((Some(outputs.start(feed, Layout::new(&options.skin), head)?), recorded))
 }
 
 /// What each file of a recording begins with.
-fn head(options: &Options, mcap: &Mcap, lanes: &[Lane], idle: &Histogram<u64>) -> Head {
+fn head(options: &Options, mcap: &Mcap, bus_links: &[LinkId], idle: &Histogram<u64>) -> Head {
     let nanos = realtime::wall();
     let mut run = vec![
         ("duration_s".to_owned(), options.scenario.duration.seconds().to_string()),
         ("spawn".to_owned(), options.spawn.to_string()),
         ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
     ];
-    run.extend(lanes.iter().map(|Lane { link, format, .. }| {
+    run.extend(bus_links.iter().map(|LinkId { link, format, .. }| {
         let format = format.name();
         let how = format!("{}, {format}, receive buffer {} bytes", link.kind, link.receive_buffer);
         (format!("bus/{}", link.name), how)
@@ -187,16 +189,16 @@ fn head(options: &Options, mcap: &Mcap, lanes: &[Lane], idle: &Histogram<u64>) -
 fn listen(
     options: &Options,
     index: usize,
-    (ear, slot): (Ear, Slot),
+    (receive_end, slot): (ReceiveEnd, Slot),
     view: Arc<Mutex<View>>,
     outlet: Option<Outlet>,
     shared: &Arc<Shared>,
-    news: mpsc::Sender<(usize, News)>,
-) -> Result<Lane, RunError> {
+    bus_event: mpsc::Sender<(usize, BusEvent)>,
+) -> Result<LinkId, RunError> {
     let skin = &options.skin;
-    let (link, shared) = (Arc::clone(&ear.link), Arc::clone(shared));
+    let (link, shared) = (Arc::clone(&receive_end.link), Arc::clone(shared));
     let mut table = Table::new(skin, index);
-    if !Ears::of(skin, index, outlet.is_some()).all_sums {
+    if !ReceiveFilter::of(skin, index, outlet.is_some()).all_sums {
         table.hear_sums_of_roots_only();
     }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
@@ -205,7 +207,7 @@ fn listen(
     let line = Line { format, snapshot, positions, state: Arc::clone(&link.state) };
     let receiver = Receiver {
         index,
-        ear,
+        receive_end,
         gather: Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
         table,
         roots: Roots::of(skin, index),
@@ -214,9 +216,9 @@ fn listen(
         outlet,
         shared: Arc::clone(&shared),
         view: Arc::clone(&view),
-        news,
+        bus_event,
     };
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::of(skin, index);
-    Ok(Lane { link, format, line: Some((line, slot)), view, receiver, network, shared })
+    Ok(LinkId { link, format, line: Some((line, slot)), view, receiver, network, shared })
 }

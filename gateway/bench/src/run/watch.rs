@@ -14,14 +14,14 @@ use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Cell;
 
 use super::RunError;
-use super::begin::{SWITCH_AGAIN, Told};
+use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
 use super::launch::{ServedBus, program};
 use super::link::Slot;
 use super::measured::Measured;
 use super::progress::Progress;
 use super::realtime::{self, Granted};
-use super::receiver::News;
+use super::receiver::BusEvent;
 use super::usage::Spent;
 use crate::record::Recorder;
 use crate::setup::spawn;
@@ -48,7 +48,7 @@ struct Script {
     /// The next fault.
     fault: usize,
     /// Cells that were switched again.
-    told: Told,
+    announced: Announced,
     /// When the loop began.
     started: Instant,
 }
@@ -59,13 +59,13 @@ impl Bench<'_> {
         let options = self.options;
         let (records, mut inlet) = rtrb::RingBuffer::new(RECORDS);
         let cycle = self.cycle.take().expect("the loop begins once");
-        let (lines, slots) = self.lanes.iter_mut().filter_map(|lane| lane.line.take()).unzip();
+        let (lines, slots) = self.bus_links.iter_mut().filter_map(|bus_link| bus_link.line.take()).unzip();
         let scenario = Arc::new(options.scenario.clone());
         let turn = Turn::new(cycle, lines, scenario, Arc::clone(&self.shared), records);
         let turn = turn.recorded(self.recorded.take());
         let touches = Touches::new(&options.scenario, &options.skin);
-        let (told, started) = (Told::new(SWITCH_AGAIN), Instant::now());
-        let mut script = Script { touches, epoch: 0, fault: 0, told, started };
+        let (announced, started) = (Announced::new(SWITCH_AGAIN), Instant::now());
+        let mut script = Script { touches, epoch: 0, fault: 0, announced, started };
         self.press(&mut script)?;
 
         let before = Spent::by(&self.processes, &self.served);
@@ -132,28 +132,36 @@ impl Bench<'_> {
         records: &mut rtrb::Consumer<Timed>,
     ) -> Result<(), RunError> {
         self.press(script)?;
-        if self.lanes.iter().any(|lane| lane.receiver.as_ref().is_some_and(JoinHandle::is_finished)) {
+        if self
+            .bus_links
+            .iter()
+            .any(|bus_link| bus_link.receiver.as_ref().is_some_and(JoinHandle::is_finished))
+        {
             // One that loses its bus stays; one that has gone without a word must not be missed.
             return Err(RunError::ReceiverEnded);
         }
-        self.break_things(script, progress)?;
+        self.inject_faults(script, progress)?;
         self.hear(script, progress)?;
         self.serve_again(progress);
         for note in self.watch_networks()? {
             progress.note(&note);
         }
-        self.switch_again(&mut script.told)?;
+        self.switch_again(&mut script.announced)?;
         let was_halted = measured.halts.why().is_some();
         measured.take(records, self.began);
         match (was_halted, measured.halts.why()) {
             (false, Some(why)) => {
                 // One bus is enough: what is heard on it is said on the others.
-                let lane =
-                    self.lanes.iter().find(|lane| lane.link.state.is_there()).or_else(|| self.lanes.first());
-                let (bus, kind) = lane
-                    .map_or(("BUS", BusKind::SocketCan), |lane| (lane.link.name.as_str(), lane.link.kind));
-                let remedy = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
-                progress.note(&format!("the robot is halted: {why}; {remedy}"));
+                let bus_link = self
+                    .bus_links
+                    .iter()
+                    .find(|bus_link| bus_link.link.state.is_there())
+                    .or_else(|| self.bus_links.first());
+                let (bus, kind) = bus_link.map_or(("BUS", BusKind::SocketCan), |bus_link| {
+                    (bus_link.link.name.as_str(), bus_link.link.kind)
+                });
+                let hint = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
+                progress.note(&format!("the robot is halted: {why}; {hint}"));
             }
             (true, None) => progress.note("the robot goes on"),
             (true, Some(_)) | (false, None) => {}
@@ -161,9 +169,9 @@ impl Bench<'_> {
         for line in self.recorder.iter().flat_map(Recorder::said) {
             progress.note(&line);
         }
-        let lost = self.lanes.iter().filter(|lane| !lane.link.state.is_there());
+        let lost = self.bus_links.iter().filter(|bus_link| !bus_link.link.state.is_there());
         progress.show(|| {
-            let lost: Vec<_> = lost.map(|lane| lane.link.name.as_str()).collect();
+            let lost: Vec<_> = lost.map(|bus_link| bus_link.link.name.as_str()).collect();
             let comparing = self.shared.comparing.load(Ordering::Relaxed);
             let of = (self.options.scenario.duration, self.options.skin.cells.len());
             measured.line(script.started.elapsed(), of, comparing, &lost)
@@ -187,10 +195,10 @@ impl Bench<'_> {
     }
 
     /// Tells some cells again what the scenario makes them feel; what others feel is not its business.
-    fn remind(&self, script: &Script, wanted: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
+    fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
-        for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| wanted(cell)) {
+        for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| target(cell)) {
             let sensors = script.touches.sensors(cell, script.epoch.saturating_sub(1));
             self.stimulate(&Stimulus { cell, bus, node, sensors }, From::Next)?;
         }
@@ -201,20 +209,20 @@ impl Bench<'_> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
         // What the cells feel is what the bus carried.
-        self.lanes.get(stimulus.bus).map_or(Ok(true), |lane| lane.send(&message))?;
+        self.bus_links.get(stimulus.bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
         Ok(())
     }
 
     /// Does to processes what the scenario says, when it is time.
-    fn break_things(&mut self, script: &mut Script, progress: &Progress) -> Result<(), RunError> {
+    fn inject_faults(&mut self, script: &mut Script, progress: &Progress) -> Result<(), RunError> {
         let options = self.options;
         while let Some(fault) = options.scenario.faults.get(script.fault) {
             if u128::from(fault.at.0) > script.started.elapsed().as_micros() {
                 break;
             }
             script.fault += 1;
-            if let FaultKind::Wire { cut, from, to, both_ways } = fault.kind {
-                self.break_wire(cut, (from, to), both_ways, progress);
+            if let FaultKind::Wire { link_down, from, to, both_ways } = fault.kind {
+                self.break_wire(link_down, (from, to), both_ways, progress);
             }
             let FaultKind::Process { action, cells } = &fault.kind else { continue };
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
@@ -228,16 +236,22 @@ impl Bench<'_> {
     }
 
     /// Cuts the wires between two cells, or mends them; the next look at their network tells them.
-    fn break_wire(&mut self, cut: bool, (from, to): (usize, usize), both_ways: bool, progress: &Progress) {
+    fn break_wire(
+        &mut self,
+        link_down: bool,
+        (from, to): (usize, usize),
+        both_ways: bool,
+        progress: &Progress,
+    ) {
         let cells = &self.options.skin.cells;
         let (Some(from), Some(to)) = (cells.get(from), cells.get(to)) else { return };
-        let network = self.lanes.get_mut(from.bus).and_then(|lane| lane.network.as_mut());
+        let network = self.bus_links.get_mut(from.bus).and_then(|bus_link| bus_link.network.as_mut());
         let Some(network) = network else { return };
-        network.set_cut(cut, from.node, to.node);
+        network.set_link_down(link_down, from.node, to.node);
         if both_ways {
-            network.set_cut(cut, to.node, from.node);
+            network.set_link_down(link_down, to.node, from.node);
         }
-        let what = if cut { "Cut" } else { "Mend" };
+        let what = if link_down { "Cut" } else { "Mend" };
         let way = if both_ways { "between" } else { "one way, from" };
         let (from, to, bus) = (from.node, to.node, network.name());
         progress.note(&format!("scenario: {what} the wires {way} cell {from} and cell {to} on {bus}"));
@@ -245,45 +259,45 @@ impl Bench<'_> {
 
     /// What the receivers and the processes have to say.
     fn hear(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
-        let news: Vec<_> = self.news.try_iter().collect();
+        let bus_event: Vec<_> = self.bus_event.try_iter().collect();
         let mut returned = BTreeSet::new();
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
-        for (bus, news) in news {
-            match news {
-                News::Notice(Notice::Rival) => return Err(self.rival(bus)),
-                News::Notice(Notice::Dead(cell)) => {
+        for (bus, bus_event) in bus_event {
+            match bus_event {
+                BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway(bus)),
+                BusEvent::Notice(Notice::Dead(cell)) => {
                     changed.entry((bus, "fallen silent")).or_default().push(cell)
                 }
-                News::Notice(Notice::Back(cell)) => {
+                BusEvent::Notice(Notice::Back(cell)) => {
                     changed.entry((bus, "spoken again")).or_default().push(cell)
                 }
-                News::Notice(Notice::Restarted(cell)) => {
+                BusEvent::Notice(Notice::Restarted(cell)) => {
                     progress.note(&format!("cell {cell} on {} started anew", self.name(bus)));
                     // It has forgotten what it felt.
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
-                News::Notice(Notice::Returned(cell)) => {
+                BusEvent::Notice(Notice::Returned(cell)) => {
                     returned.insert((bus, cell));
                 }
-                News::Notice(Notice::Duplicate(cell)) => {
+                BusEvent::Notice(Notice::Duplicate(cell)) => {
                     progress.note(&format!(
                         "cell {cell} on {} hears another cell under its number: stop one of the two",
                         self.name(bus)
                     ));
                 }
-                News::Down(why) => progress.note(&why.to_string()),
-                News::Up => {
+                BusEvent::Down(why) => progress.note(&why.to_string()),
+                BusEvent::Up => {
                     progress.note(&format!("{} works again", self.name(bus)));
                 }
                 // Who has no bus left feels nothing.
-                News::Lost(why) if self.lanes.iter().all(|lane| lane.link.is_gone()) => {
+                BusEvent::Lost(why) if self.bus_links.iter().all(|bus_link| bus_link.link.is_gone()) => {
                     return Err(RunError::Lost(why));
                 }
-                News::Lost(why) => {
+                BusEvent::Lost(why) => {
                     progress
                         .note(&format!("{why}; the others go on, and it is opened again when it is back"));
                 }
-                News::Refused(why) => {
+                BusEvent::Refused(why) => {
                     progress.note(&format!("{} cannot be opened again yet: {why}", self.name(bus)))
                 }
             }
@@ -291,8 +305,8 @@ impl Bench<'_> {
         if !returned.is_empty() {
             // What was to change while they were away did not come to them.
             self.remind(script, |it| returned.contains(&(it.bus, it.node)))?;
-            for lane in returned.iter().filter_map(|&(bus, _)| self.lanes.get(bus)) {
-                lane.link.state.returned.store(true, Ordering::Relaxed);
+            for bus_link in returned.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
+                bus_link.link.state.returned.store(true, Ordering::Relaxed);
             }
         }
         for ((bus, how), cells) in changed {
@@ -312,10 +326,10 @@ impl Bench<'_> {
 
     /// Serves embedded buses again that were ours and whose processes have ended.
     fn serve_again(&mut self, progress: &Progress) {
-        let gone: Vec<_> = self.lanes.iter().filter(|lane| lane.link.is_gone()).collect();
+        let gone: Vec<_> = self.bus_links.iter().filter(|bus_link| bus_link.link.is_gone()).collect();
         for served in &mut self.served {
             let name = served.bus().to_owned();
-            if !gone.iter().any(|lane| lane.link.name == name) {
+            if !gone.iter().any(|bus_link| bus_link.link.name == name) {
                 continue;
             }
             let Some(status) = served.ended() else { continue };

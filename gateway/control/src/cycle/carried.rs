@@ -35,7 +35,7 @@ pub(super) struct Carried {
 impl Carried {
     /// Broadcasts that should have been read back and were not, when `last` is the last one that was, and `epoch` the
     /// newest of `broadcasts`. The newest one may still be on its way.
-    pub(super) fn missed(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
+    pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
         // Epochs come round again, so they are compared once, when they are new.
         if let Some(read) = last.filter(|_| last != self.last) {
             self.number = broadcasts.saturating_sub(u64::try_from(epoch.since(read)).unwrap_or(0));
@@ -46,17 +46,17 @@ impl Carried {
 }
 
 /// The part of the last torque that still counts.
-pub(super) fn part(missed: u64, safety: &Safety) -> f64 {
+pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
     let hold = u64::from(safety.hold_epochs);
-    if missed <= hold {
+    if unanswered <= hold {
         return 1.0;
     }
-    let over = u32::try_from(missed - hold).unwrap_or(u32::MAX);
+    let over = u32::try_from(unanswered - hold).unwrap_or(u32::MAX);
     let left = safety.decay_epochs.saturating_sub(over);
     if left == 0 { 0.0 } else { f64::from(left) / f64::from(safety.decay_epochs) }
 }
 
 /// Whether a bus that has missed so many broadcasts carries nothing any more.
-pub(super) fn is_lost(missed: u64, safety: &Safety) -> bool {
-    missed > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
+pub(super) fn is_lost(unanswered: u64, safety: &Safety) -> bool {
+    unanswered > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
 }

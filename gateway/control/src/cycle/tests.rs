@@ -40,7 +40,7 @@ fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
 }
 
 #[test]
-fn bad_cycles_in_a_row_halt_once_and_a_resume_lets_go() {
+fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     let (mut cycle, mut bus) = cycle(Box::new(Dead));
     let limit = u64::from(testing::skin().safety.bad_cycles);
     let halts: Vec<u64> = (0..limit + 10)
@@ -84,9 +84,9 @@ impl Two {
         skin.safety.lost_bus = lost_bus;
         let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
         let controller = Box::new(Kinesthetic::new(&skin).unwrap());
-        let felt = Sums { torque: [1.0; WORDS], contributing: 1, ..Sums::default() };
+        let reference_torque = Sums { torque: [1.0; WORDS], contributing: 1, ..Sums::default() };
         let cycle = Cycle::new(&skin, controller, Box::new(robot));
-        Self { cycle, buses: [felt; 2], works: [true; 2], number: 0 }
+        Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
 
     /// The ticks of an epoch, of which the last is returned; those buses that carry it read it back.
@@ -108,7 +108,7 @@ impl Two {
 }
 
 #[test]
-fn a_lost_bus_is_let_go_by_the_rule_for_cells_and_the_others_go_on() {
+fn a_lost_bus_is_released_by_the_rule_for_cells_and_the_others_go_on() {
     let mut two = Two::new(LostBus::GoOn);
     for _ in 0..5 {
         let record = two.epoch([true, true]);
@@ -116,12 +116,12 @@ fn a_lost_bus_is_let_go_by_the_rule_for_cells_and_the_others_go_on() {
     }
     two.works[1] = false;
     let mut torques = Vec::new();
-    for missed in 0..300 {
+    for unanswered in 0..300 {
         let record = two.epoch([true, false]);
         torques.push(record.torque[0]);
-        assert_eq!((record.bad, record.halted, record.missing), (None, None, 0b10), "epoch {missed}");
-        let held = missed < 6;
-        assert_eq!((record.contributing, record.age), if held { (2, missed) } else { (1, 0) });
+        assert_eq!((record.bad, record.halted, record.missing), (None, None, 0b10), "epoch {unanswered}");
+        let held = unanswered < 6;
+        assert_eq!((record.contributing, record.age), if held { (2, unanswered) } else { (1, 0) });
     }
     assert_eq!(torques[..8], [2.0, 2.0, 2.0, 1.75, 1.5, 1.25, 1.0, 1.0]);
     assert!(torques[8..].iter().all(|&torque| torque == 1.0), "epochs come round, a lost torque does not");
@@ -165,7 +165,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
 }
 
 #[test]
-fn a_halted_robot_stands_whatever_is_asked() {
+fn a_halted_robot_stands_whatever_is_requested() {
     let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
     bus.torque = [5.0; WORDS];
     for number in 0..50 {

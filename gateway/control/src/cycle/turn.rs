@@ -11,7 +11,7 @@ use protocol::packet::{Epoch, Packet, WORDS};
 
 use crate::cycle::carried::Heard;
 use crate::cycle::{Cycle, Record, Tick};
-use model::central::Felt;
+use model::central::ReferenceTorque;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
@@ -53,7 +53,7 @@ pub struct Timed {
     /// How long it took, in ns.
     pub took_ns: u64,
     /// How long the central computation took of that, in ns, and its result.
-    pub central: Option<(u64, Felt)>,
+    pub central: Option<(u64, ReferenceTorque)>,
 }
 
 /// How a bus is, for all threads.
@@ -161,9 +161,9 @@ impl Turn {
         let outcome = self.cycle.tick(tick, skipped, heard);
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
-            let felt = self.cycle.central(snapshots());
+            let reference_torque = self.cycle.central(snapshots());
             // Nobody else needs the result, and without anybody the compiler could leave out the work.
-            (now().saturating_sub(before), std::hint::black_box(felt))
+            (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
         self.owe_to_returned_buses(outcome.record.halted.is_some());
         if let Some((epoch, joints)) = outcome.joints {

@@ -17,7 +17,7 @@ pub(super) struct Counts {
     /// Second answers to the same tick.
     pub(super) repeated: u64,
     /// Datagrams of others than the peer.
-    pub(super) strangers: u64,
+    pub(super) unknown_nodes: u64,
     /// States that did not fit into the peer's queue.
     pub(super) unsent: u64,
     /// Peers that went away.
@@ -37,7 +37,7 @@ impl Counts {
             ("missing", self.missing),
             ("late", self.late),
             ("repeated", self.repeated),
-            ("strangers", self.strangers),
+            ("strangers", self.unknown_nodes),
             ("unsent", self.unsent),
             ("gone", self.gone),
             ("failed", self.failed),
@@ -60,7 +60,7 @@ impl Counts {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sender {
     Peer,
-    Stranger,
+    UnknownSender,
 }
 
 /// What became of a state.
@@ -89,14 +89,14 @@ impl Exchange {
             (Ok(Heard::Hello), _) => {
                 let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
                 // A peer that says hello again keeps what it owes.
-                if sender == Sender::Stranger || !self.connected {
+                if sender == Sender::UnknownSender || !self.connected {
                     *self = Self::default();
                 }
                 (self.connected, self.counts) = (true, counts);
                 return true;
             }
-            (_, Sender::Stranger) => {
-                self.counts.strangers += 1;
+            (_, Sender::UnknownSender) => {
+                self.counts.unknown_nodes += 1;
                 return false;
             }
             (Err(why), Sender::Peer) => {

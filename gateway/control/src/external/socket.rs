@@ -89,7 +89,7 @@ impl External {
                 continue;
             }
             let known = self.peer.as_ref().is_some_and(|peer| same(peer, &from));
-            let sender = if known { Sender::Peer } else { Sender::Stranger };
+            let sender = if known { Sender::Peer } else { Sender::UnknownSender };
             if self.exchange.handle(bytes.get(..length).unwrap_or(&bytes), sender) {
                 self.peer = Some(from);
             }

@@ -26,8 +26,8 @@ fn torques_agree_with_the_table_of_another_program() {
         // The table's n is the direction of the force: inwards.
         central.cells = vec![Place::new(joint, [tx, ty, tz], [-nx, -ny, -nz], Contact::default())];
         let torque = central.torque(0, &central.frames_at(&[q1, q2, q3, q4, q5, q6]), *f_z);
-        for (got, wanted) in torque.iter().zip(&row[14..]) {
-            worst = worst.max((got - wanted).abs());
+        for (got, target) in torque.iter().zip(&row[14..]) {
+            worst = worst.max((got - target).abs());
         }
     }
     assert_eq!(table.lines().count(), 301);
@@ -90,10 +90,10 @@ fn the_whole_skin_feels_the_sum_of_its_active_cells() {
     skin.cells = vec![cell; 3];
     let central = Central::new(&skin);
     let frames = central.frames(&[Q1_14::nearest(0.3); 6]);
-    let felt = central.feel(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
-    assert_eq!(felt.active, 2);
-    for (got, wanted) in felt.torque.iter().zip(central.torque(0, &frames, 3.0)) {
-        assert!((got - wanted).abs() < 1e-12);
+    let reference_torque = central.feel(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
+    assert_eq!(reference_torque.active, 2);
+    for (got, target) in reference_torque.torque.iter().zip(central.torque(0, &frames, 3.0)) {
+        assert!((got - target).abs() < 1e-12);
     }
 }
 

@@ -15,10 +15,10 @@
 //! the rest of each cell, some cells at a time. What was not answered is asked again. When all have committed, all is
 //! read back and compared, and so is the hash in their heartbeats.
 
-pub mod numbers;
+mod address_table;
+pub mod node_ids;
 mod outcome;
 mod report;
-mod roster;
 mod task;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -30,12 +30,12 @@ use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-use roster::Roster;
+use address_table::AddressTable;
 use task::{Stage, Task};
 
 use crate::repeat::{Attempt, Limits, Turn};
-pub use outcome::{Ask, Outcome, Reason, Trouble};
-pub use report::{CellReport, Progress, Report, Stranger};
+pub use outcome::{Outcome, Reason, Step, Trouble};
+pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::Wish;
 
 /// How long a bus is listened to before anything is said: two gateways notice each other in this time.
@@ -75,7 +75,7 @@ enum Phase {
 /// A request to everyone.
 #[derive(Clone, Copy, Debug)]
 struct Call {
-    ask: Ask,
+    step: Step,
     tag: u8,
     /// Cells that needed it at first.
     needed: usize,
@@ -93,12 +93,12 @@ pub struct Commission {
     by_serial: HashMap<u32, usize>,
     /// Serial numbers of cells on other buses, and their buses.
     elsewhere: BTreeMap<u32, String>,
-    roster: Roster,
+    address_table: AddressTable,
     phase: Phase,
-    calls: VecDeque<Ask>,
+    calls: VecDeque<Step>,
     call: Option<Call>,
     /// All requests to everyone so far, with their tags: who is late has answered all the same.
-    called: Vec<(Ask, u8)>,
+    called: Vec<(Step, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
     requests: u64,
@@ -123,7 +123,7 @@ impl Commission {
             tasks,
             by_serial,
             elsewhere,
-            roster: Roster::default(),
+            address_table: AddressTable::default(),
             phase: Phase::Listen(now + LISTEN),
             calls: VecDeque::new(),
             call: None,
@@ -151,7 +151,7 @@ impl Commission {
     /// Takes what somebody else said on the bus; [`Commission::handle_time`] says what that leads to.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
-            self.end(Trouble::Rival);
+            self.end(Trouble::OtherGateway);
         } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message
             && is_stored(number)
         {
@@ -167,7 +167,7 @@ impl Commission {
             let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
             let wish = self.wish;
             let Some(task) = self.holder(from) else { return };
-            task.answer(now, tag, answer, called.map(|(ask, _)| ask), wish);
+            task.answer(now, tag, answer, called.map(|(step, _)| step), wish);
             if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
                 call.attempt.extend(now);
             }
@@ -176,26 +176,26 @@ impl Commission {
 
     /// The described cell that has a number now.
     fn holder(&mut self, number: CellId) -> Option<&mut Task> {
-        let serial = self.roster.holder(number)?;
+        let serial = self.address_table.holder(number)?;
         let task = self.tasks.get_mut(*self.by_serial.get(&serial)?)?;
         (task.number == Some(number)).then_some(task)
     }
 
     fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) {
-        let before = self.roster.holder(number).filter(|&serial| serial != heartbeat.serial);
-        if let Some([one, other]) = self.roster.hear(number, heartbeat) {
+        let before = self.address_table.holder(number).filter(|&serial| serial != heartbeat.serial);
+        if let Some([one, other]) = self.address_table.hear(number, heartbeat) {
             for (serial, other) in [(one, other), (other, one)] {
                 self.fail(serial, Reason::Shared { number, other });
             }
             return;
         }
-        if self.roster.holder(number) != Some(heartbeat.serial) {
+        if self.address_table.holder(number) != Some(heartbeat.serial) {
             return; // it claims a number that is taken, and will give way
         }
         if let Some(loser) = before.and_then(|serial| self.task(serial))
             && loser.number == Some(number)
         {
-            loser.lose_number(now);
+            loser.lose_node_id(now);
         }
         let wish = self.wish;
         let Some(task) = self.task(heartbeat.serial) else { return };
@@ -241,9 +241,9 @@ impl Commission {
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.tasks.len() {
             let again = self.tasks.get_mut(place).and_then(|task| Some((task.number, task.time(now)?)));
-            if let Some((Some(number), (ask, tag))) = again {
+            if let Some((Some(number), (step, tag))) = again {
                 self.repeated += 1;
-                self.request(place, Node::Cell(number), ask, tag);
+                self.request(place, Node::Cell(number), step, tag);
             }
         }
         // Each turn is a phase that has nothing left to do.
@@ -283,7 +283,7 @@ impl Commission {
                 if self.works(now, |stage| stage == Stage::Write) {
                     return None;
                 }
-                self.calls = Parameter::STORED.into_iter().map(Ask::Read).collect();
+                self.calls = Parameter::STORED.into_iter().map(Step::Read).collect();
                 Some(Phase::Read)
             }
             Phase::Read => {
@@ -320,15 +320,15 @@ impl Commission {
         if self.call_everyone(now) {
             return true;
         }
-        let mut asked = self.tasks.iter().filter(|task| task.is_asked()).count();
+        let mut pending = self.tasks.iter().filter(|task| task.is_requested()).count();
         for place in 0..self.tasks.len() {
-            if asked >= WINDOW {
+            if pending >= WINDOW {
                 break;
             }
             let Some(task) = self.tasks.get_mut(place).filter(|task| is(task.stage)) else { continue };
-            if let (Some(number), Some((ask, tag))) = (task.number, task.ask(now)) {
-                asked += 1;
-                self.request(place, Node::Cell(number), ask, tag);
+            if let (Some(number), Some((step, tag))) = (task.number, task.step(now)) {
+                pending += 1;
+                self.request(place, Node::Cell(number), step, tag);
             }
         }
         self.any(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
@@ -338,47 +338,47 @@ impl Commission {
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = &mut self.call {
-                let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.ask));
+                let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.step));
                 let first = waiting.next().map(|(place, _)| place);
                 // When most have not heard it, to say it again costs less than to ask each.
                 match first.map(|place| (place, call.attempt.turn(now))) {
                     Some((_, Turn::Wait)) => return true,
                     Some((place, Turn::Again)) if 2 * (waiting.count() + 1) > call.needed => {
-                        let Call { ask, tag, .. } = *call;
+                        let Call { step, tag, .. } = *call;
                         self.repeated += 1;
-                        self.request(place, Node::Everyone, ask, tag);
+                        self.request(place, Node::Everyone, step, tag);
                         return true;
                     }
                     Some((_, Turn::Again | Turn::GiveUp)) | None => self.call = None,
                 }
             }
-            let Some(ask) = self.calls.pop_front() else { return false };
-            let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(ask));
+            let Some(step) = self.calls.pop_front() else { return false };
+            let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(step));
             // What one cell needs is asked of that cell.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
             let needed = needing.count() + 2;
-            if !self.may_call(ask) {
+            if !self.may_call(step) {
                 continue;
             }
             // There are fewer of them than tags.
             let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
-            self.called.push((ask, tag));
-            self.call = Some(Call { ask, tag, needed, attempt: Attempt::new(now, CALLS) });
-            self.request(place, Node::Everyone, ask, tag);
+            self.called.push((step, tag));
+            self.call = Some(Call { step, tag, needed, attempt: Attempt::new(now, CALLS) });
+            self.request(place, Node::Everyone, step, tag);
         }
     }
 
     /// Whether everyone may be asked this: all answers must find room, and nothing is written to cells that are
     /// not the description's.
-    fn may_call(&self, ask: Ask) -> bool {
-        let fits = self.roster.all().count() <= self.room;
+    fn may_call(&self, step: Step) -> bool {
+        let fits = self.address_table.all().count() <= self.room;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
         let ours = |serial| known(serial).is_some_and(|task| !is_failed(task.stage));
-        fits && (matches!(ask, Ask::Read(_)) || self.roster.all().all(|(_, serial)| ours(serial)))
+        fits && (matches!(step, Step::Read(_)) || self.address_table.all().all(|(_, serial)| ours(serial)))
     }
 
     /// Writes that are the same for all cells that need any.
-    fn common_writes(&self) -> VecDeque<Ask> {
+    fn common_writes(&self) -> VecDeque<Step> {
         let common = |parameter: &Parameter| {
             let mut words = self
                 .tasks
@@ -388,16 +388,16 @@ impl Commission {
             let first = words.next();
             words.all(|other| Some(other) == first)
         };
-        Parameter::STORED.into_iter().filter(common).map(Ask::Write).collect()
+        Parameter::STORED.into_iter().filter(common).map(Step::Write).collect()
     }
 
-    fn request(&mut self, place: usize, to: Node, ask: Ask, tag: u8) {
+    fn request(&mut self, place: usize, to: Node, step: Step, tag: u8) {
         let Some(task) = self.tasks.get(place) else { return };
-        let number = ask.parameter().number();
-        let request = match ask {
-            Ask::Write(parameter) => Request::Write { number, words: task.words(parameter) },
-            Ask::Commit => Request::Write { number, words: task.words(Parameter::Commit) },
-            Ask::Read(_) => Request::Read { number },
+        let number = step.parameter().number();
+        let request = match step {
+            Step::Write(parameter) => Request::Write { number, words: task.words(parameter) },
+            Step::Commit => Request::Write { number, words: task.words(Parameter::Commit) },
+            Step::Read(_) => Request::Read { number },
         };
         self.requests += 1;
         self.outbox.push_back(Message::Configure { to, tag, request });

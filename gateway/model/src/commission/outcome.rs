@@ -14,7 +14,7 @@ use crate::decode::parameter::{Name, Words};
 
 /// What a cell is asked.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Ask {
+pub enum Step {
     /// To stage a parameter.
     Write(Parameter),
     /// To take what is staged into flash and into use.
@@ -23,7 +23,7 @@ pub enum Ask {
     Read(Parameter),
 }
 
-impl Ask {
+impl Step {
     /// The parameter that it is about.
     pub(super) const fn parameter(self) -> Parameter {
         match self {
@@ -33,7 +33,7 @@ impl Ask {
     }
 }
 
-impl fmt::Display for Ask {
+impl fmt::Display for Step {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let name = Name(self.parameter().number());
         match self {
@@ -89,40 +89,40 @@ pub enum Reason {
         got: u16,
     },
     /// It said nothing to a request.
-    #[error("does not answer {ask}, asked {tries} times")]
+    #[error("does not answer {step}, asked {tries} times")]
     Silent {
         /// What it was asked.
-        ask: Ask,
+        step: Step,
         /// How often.
         tries: u8,
     },
     /// It will not.
-    #[error("refuses {ask}: {}", reason(i64::from(*.code)))]
+    #[error("refuses {step}: {}", reason(i64::from(*.code)))]
     Refused {
         /// What it was asked.
-        ask: Ask,
+        step: Step,
         /// Its reason.
         code: i16,
     },
     /// It says something else than what it was told.
     #[error(
-        "answers {ask} with {}, not {}",
-        Words(.ask.parameter().number(), *.got),
-        Words(.ask.parameter().number(), *.wanted)
+        "answers {step} with {}, not {}",
+        Words(.step.parameter().number(), *.got),
+        Words(.step.parameter().number(), *.target)
     )]
     Differs {
         /// What it was asked.
-        ask: Ask,
+        step: Step,
         /// What should be there.
-        wanted: [i16; WORDS],
+        target: [i16; WORDS],
         /// What it says.
         got: [i16; WORDS],
     },
     /// It says another hash than that of what it reads back.
-    #[error("says the configuration hash {got:04X} in its heartbeats, not {wanted:04X}")]
+    #[error("says the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
     Hash {
         /// That of the skin.
-        wanted: u16,
+        target: u16,
         /// Its own.
         got: u16,
     },
@@ -141,7 +141,7 @@ impl Serialize for Reason {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Trouble {
     /// Another gateway speaks.
-    Rival,
+    OtherGateway,
     /// Somebody else writes parameters.
     Meddler,
 }
@@ -151,7 +151,7 @@ impl Trouble {
     #[must_use]
     pub fn on(self, bus: &str) -> String {
         match self {
-            Self::Rival => format!("another gateway is on {bus}: stop it first"),
+            Self::OtherGateway => format!("another gateway is on {bus}: stop it first"),
             Self::Meddler => format!("somebody else configures cells on {bus}: let that end first"),
         }
     }

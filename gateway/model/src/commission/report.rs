@@ -38,7 +38,7 @@ pub struct CellReport {
 
 /// A cell that the description does not have on this bus.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
-pub struct Stranger {
+pub struct UnknownNode {
     /// Its number on the bus.
     #[serde(rename = "node")]
     pub number: CellId,
@@ -55,7 +55,7 @@ pub struct Report {
     /// The described cells, in the file's order.
     pub cells: Vec<CellReport>,
     /// The others, by number; they were left alone.
-    pub strangers: Vec<Stranger>,
+    pub unknown_nodes: Vec<UnknownNode>,
     /// Requests to one cell or to everyone.
     pub requests: u64,
     /// Of these, said again because nobody answered.
@@ -101,15 +101,15 @@ impl Commission {
                 }
             },
         };
-        let stranger = |(number, serial): (CellId, u32)| Stranger {
+        let unknown_node = |(number, serial): (CellId, u32)| UnknownNode {
             number,
             serial,
             belongs: self.elsewhere.get(&serial).cloned(),
         };
-        let unknown = self.roster.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
+        let unknown = self.address_table.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
         Report {
             cells: self.tasks.iter().map(cell).collect(),
-            strangers: unknown.map(stranger).collect(),
+            unknown_nodes: unknown.map(unknown_node).collect(),
             requests: self.requests,
             repeated: self.repeated,
             trouble: self.trouble,

@@ -6,7 +6,7 @@ use protocol::packet::WORDS;
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::outcome::{Ask, Outcome, Reason};
+use super::outcome::{Outcome, Reason, Step};
 use crate::repeat::{Attempt, Limits, Turn};
 
 /// How often a cell is asked the same before it is given up, and how long its answer may take.
@@ -37,8 +37,8 @@ pub(super) enum Stage {
 
 /// A request whose answer is awaited.
 #[derive(Clone, Copy, Debug)]
-struct Asked {
-    ask: Ask,
+struct Pending {
+    step: Step,
     tag: u8,
     attempt: Attempt,
 }
@@ -54,14 +54,14 @@ pub(super) struct Task {
     pub(super) number: Option<CellId>,
     /// How far it is.
     pub(super) stage: Stage,
-    wanted: Parameters,
+    target: Parameters,
     hash: u16,
     /// Whether this commissioning has changed, or would change, what it computes with.
     touched: bool,
     /// Bit i: the stored parameter i is staged, or reads back right.
     written: u16,
     read: u16,
-    asked: Option<Asked>,
+    pending: Option<Pending>,
     tag: u8,
     rounds: u8,
     /// The number that it had before this one.
@@ -96,18 +96,18 @@ fn first_missing(mask: u16) -> Option<Parameter> {
 }
 
 impl Task {
-    pub(super) fn new(serial: u32, described: CellId, wanted: Parameters) -> Self {
+    pub(super) fn new(serial: u32, described: CellId, target: Parameters) -> Self {
         Self {
             serial,
             described,
             number: None,
             stage: Stage::Missing,
-            wanted,
-            hash: wanted.hash(),
+            target,
+            hash: target.hash(),
             touched: false,
             written: 0,
             read: 0,
-            asked: None,
+            pending: None,
             tag: 0,
             rounds: 0,
             before: None,
@@ -121,25 +121,25 @@ impl Task {
         if parameter == Parameter::Commit {
             return protocol::packet::words([self.hash.cast_signed()]);
         }
-        self.wanted.words(parameter)
+        self.target.words(parameter)
     }
 
     pub(super) const fn is_done(&self) -> bool {
         matches!(self.stage, Stage::Done(_))
     }
 
-    pub(super) const fn is_asked(&self) -> bool {
-        self.asked.is_some()
+    pub(super) const fn is_requested(&self) -> bool {
+        self.pending.is_some()
     }
 
     /// Whether it waits for this of a request to everyone.
-    pub(super) fn needs(&self, ask: Ask) -> bool {
-        let missing = |mask| place(ask.parameter()).is_some_and(|place| mask & bit(place) == 0);
-        let can = self.number.is_some() && self.unsettled.is_none() && self.asked.is_none();
-        can && match ask {
-            Ask::Write(_) => self.stage == Stage::Write && missing(self.written),
-            Ask::Read(_) => self.stage == Stage::Read && missing(self.read),
-            Ask::Commit => false,
+    pub(super) fn needs(&self, step: Step) -> bool {
+        let missing = |mask| place(step.parameter()).is_some_and(|place| mask & bit(place) == 0);
+        let can = self.number.is_some() && self.unsettled.is_none() && self.pending.is_none();
+        can && match step {
+            Step::Write(_) => self.stage == Stage::Write && missing(self.written),
+            Step::Read(_) => self.stage == Stage::Read && missing(self.read),
+            Step::Commit => false,
         }
     }
 
@@ -151,7 +151,7 @@ impl Task {
                 return self.fail(Reason::Twins(old.min(number), old.max(number)));
             }
             self.before = Some(old);
-            self.start_anew();
+            self.restart();
         }
         self.number = Some(number);
         self.said_hash = heartbeat.configuration;
@@ -161,7 +161,7 @@ impl Task {
         }
         if heartbeat.state.has(State::CLAIMING) {
             self.unsettled = Some(now);
-            return self.start_anew();
+            return self.restart();
         }
         self.unsettled = None;
         match self.stage {
@@ -173,8 +173,8 @@ impl Task {
 
     /// It was switched on, or has another number now: what it had staged is gone, what it has in flash is seen
     /// when it has settled.
-    fn start_anew(&mut self) {
-        self.asked = None;
+    fn restart(&mut self) {
+        self.pending = None;
         (self.written, self.read) = (0, 0);
         if matches!(self.stage, Stage::Write | Stage::Read | Stage::Beat(_)) {
             self.stage = Stage::Missing;
@@ -193,15 +193,15 @@ impl Task {
     }
 
     /// Another cell has its number now.
-    pub(super) fn lose_number(&mut self, now: Micros) {
+    pub(super) fn lose_node_id(&mut self, now: Micros) {
         self.number = None;
         self.unsettled.get_or_insert(now);
-        self.start_anew();
+        self.restart();
     }
 
     pub(super) fn fail(&mut self, reason: Reason) {
         if !matches!(self.stage, Stage::Done(Outcome::Failed(_))) {
-            self.asked = None;
+            self.pending = None;
             self.stage = Stage::Done(Outcome::Failed(reason));
         }
     }
@@ -211,41 +211,41 @@ impl Task {
     }
 
     /// Asks the next thing, if there is one and nothing is asked; returns it with its tag.
-    pub(super) fn ask(&mut self, now: Micros) -> Option<(Ask, u8)> {
-        if self.asked.is_some() || self.unsettled.is_some() || self.number.is_none() {
+    pub(super) fn step(&mut self, now: Micros) -> Option<(Step, u8)> {
+        if self.pending.is_some() || self.unsettled.is_some() || self.number.is_none() {
             return None;
         }
-        let ask = match self.stage {
-            Stage::Write => first_missing(self.written).map_or(Ask::Commit, Ask::Write),
-            Stage::Read => Ask::Read(first_missing(self.read)?),
+        let step = match self.stage {
+            Stage::Write => first_missing(self.written).map_or(Step::Commit, Step::Write),
+            Stage::Read => Step::Read(first_missing(self.read)?),
             Stage::Missing | Stage::Beat(_) | Stage::Done(_) => return None,
         };
         // The upper half of the tags is that of requests to everyone.
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // What a commit that is not answered leads to is in use all the same.
-        self.touched |= ask == Ask::Commit;
-        let attempt = Attempt::new(now, if ask == Ask::Commit { COMMIT } else { ANSWER });
-        self.asked = Some(Asked { ask, tag: self.tag, attempt });
-        Some((ask, self.tag))
+        self.touched |= step == Step::Commit;
+        let attempt = Attempt::new(now, if step == Step::Commit { COMMIT } else { ANSWER });
+        self.pending = Some(Pending { step, tag: self.tag, attempt });
+        Some((step, self.tag))
     }
 
     /// Asks again what was not answered in time; gives up after some times, and what never settles too.
-    pub(super) fn time(&mut self, now: Micros) -> Option<(Ask, u8)> {
+    pub(super) fn time(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.unsettled.is_some_and(|since| now.since(since) >= SETTLING) && !self.is_done() {
             self.fail(Reason::Gone);
         }
         if let Stage::Beat(since) = self.stage
             && now.since(since) >= BEAT
         {
-            self.fail(Reason::Hash { wanted: self.hash, got: self.said_hash });
+            self.fail(Reason::Hash { target: self.hash, got: self.said_hash });
         }
-        let Asked { ask, tag, attempt } = self.asked.as_mut()?;
-        let (ask, tag, tries) = (*ask, *tag, attempt.tries());
+        let Pending { step, tag, attempt } = self.pending.as_mut()?;
+        let (step, tag, tries) = (*step, *tag, attempt.tries());
         match attempt.turn(now) {
             Turn::Wait => None,
-            Turn::Again => Some((ask, tag)),
+            Turn::Again => Some((step, tag)),
             Turn::GiveUp => {
-                self.fail(Reason::Silent { ask, tries });
+                self.fail(Reason::Silent { step, tries });
                 None
             }
         }
@@ -255,34 +255,34 @@ impl Task {
     pub(super) fn due(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLING);
         let beat = if let Stage::Beat(since) = self.stage { Some(since + BEAT) } else { None };
-        [self.asked.map(|asked| asked.attempt.due()), settled, beat].into_iter().flatten().min()
+        [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
     /// Takes an answer: to what it was asked itself, or to `call`, which everyone was asked with this tag.
-    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Ask>, wish: Wish) {
-        let own = self.asked.filter(|asked| asked.tag == tag).map(|asked| asked.ask);
-        let called = call.filter(|&ask| self.needs(ask));
-        let Some(ask) = own.or(called) else { return };
-        let parameter = ask.parameter();
-        let is_write = !matches!(ask, Ask::Read(_));
+    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: Wish) {
+        let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
+        let called = call.filter(|&step| self.needs(step));
+        let Some(step) = own.or(called) else { return };
+        let parameter = step.parameter();
+        let is_write = !matches!(step, Step::Read(_));
         match answer {
             Answer::Refused { number, reason } if number == parameter.number() => {
-                self.asked = None;
-                if ask == Ask::Commit && reason == Answer::WRONG_HASH {
+                self.pending = None;
+                if step == Step::Commit && reason == Answer::WRONG_HASH {
                     // It was switched off and on in the middle, and nobody heard it.
-                    return self.again(Reason::Refused { ask, code: reason });
+                    return self.again(Reason::Refused { step, code: reason });
                 }
-                self.fail(Reason::Refused { ask, code: reason });
+                self.fail(Reason::Refused { step, code: reason });
             }
             Answer::Value { number, written, words }
                 if number == parameter.number() && written == is_write =>
             {
-                self.asked = None;
-                let wanted = self.words(parameter);
-                if words == wanted {
-                    return self.is_right(now, ask);
+                self.pending = None;
+                let target = self.words(parameter);
+                if words == target {
+                    return self.is_right(now, step);
                 }
-                let differs = Reason::Differs { ask, wanted, got: words };
+                let differs = Reason::Differs { step, target, got: words };
                 if is_write {
                     self.fail(differs);
                 } else if wish.dry_run {
@@ -296,12 +296,12 @@ impl Task {
         }
     }
 
-    fn is_right(&mut self, now: Micros, ask: Ask) {
-        let bit = place(ask.parameter()).map_or(0, bit);
-        match ask {
-            Ask::Write(_) => self.written |= bit,
-            Ask::Commit => (self.stage, self.read) = (Stage::Read, 0),
-            Ask::Read(_) => {
+    fn is_right(&mut self, now: Micros, step: Step) {
+        let bit = place(step.parameter()).map_or(0, bit);
+        match step {
+            Step::Write(_) => self.written |= bit,
+            Step::Commit => (self.stage, self.read) = (Stage::Read, 0),
+            Step::Read(_) => {
                 self.read |= bit;
                 if self.read == ALL {
                     self.stage = Stage::Beat(now);

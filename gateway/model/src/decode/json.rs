@@ -8,7 +8,7 @@ use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{BYTES, PacketError};
 use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema};
-use protocol::wire::Lane;
+use protocol::wire::LinkId;
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
 use super::text::{Bits, Name};
@@ -49,7 +49,7 @@ struct Line<'a> {
 
 /// What the words say, by kind and page.
 struct Values {
-    lane: Option<Lane>,
+    link_id: Option<LinkId>,
     end: &'static [Field],
     layout: &'static Layout,
     bytes: [u8; BYTES],
@@ -58,8 +58,8 @@ struct Values {
 impl Serialize for Values {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        let Self { lane, end, layout, bytes } = self;
-        if let Some(Lane { wire, back }) = lane {
+        let Self { link_id, end, layout, bytes } = self;
+        if let Some(LinkId { wire, back }) = link_id {
             map.serialize_entry("wire", wire)?;
             map.serialize_entry("back", back)?;
             map.serialize_entry("says", &layout.name)?;
@@ -188,14 +188,14 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
             }
             line.error = Some(foreign.to_string());
         }
-        Decoded::Wire(lane, message) => {
+        Decoded::Wire(link_id, message) => {
             line.kind = Some("wire");
             line.crc = Some(word(last_word(record)));
             let (bytes, layout) = wires::said(message);
             line.epoch = wires::epoch(message);
-            line.values = Some(Values { lane: Some(lane), end: &[], layout, bytes });
+            line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes });
         }
-        Decoded::Half { id } => line.about(id),
+        Decoded::Segment { id } => line.about(id),
         Decoded::Damaged { id, fault } => {
             line.about(id);
             line.fails(fault);
@@ -253,7 +253,7 @@ impl Line<'_> {
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
-        self.values = (!is_bare).then(|| Values { lane: None, end, layout, bytes: packet.without_crc() });
+        self.values = (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.without_crc() });
     }
 }
 
@@ -323,11 +323,11 @@ mod tests {
             "state": ["configured", "active"], "joint": 2, "version": 1,
         });
         assert_eq!(heartbeat, expected);
-        let felt = json!({
+        let contact_state = json!({
             "page": "skin", "force_n": 1.998046875, "contact_n": [1.0, 0.9990234375, -0.0009765625],
             "proximity": 1.0, "temperature_c": [25.0, -40.0],
         });
-        assert_eq!(values("sensors from=12 epoch=9 contact=1,0.9990234375"), felt);
+        assert_eq!(values("sensors from=12 epoch=9 contact=1,0.9990234375"), contact_state);
         let from_next = values("stimulus to=everyone from=next acceleration=0,0,-8");
         let expected =
             json!({ "from_next": true, "page": "acceleration", "acceleration_g": [0.0, 0.0, -8.0] });
@@ -374,8 +374,8 @@ mod tests {
         let sensing = values("write to=12 tag=26 parameter=7 sensing=off");
         assert_eq!(sensing, json!({ "parameter": "sensing", "write": true, "sensing": "off" }));
         assert_eq!(values("write to=12 tag=28 parameter=8")["hysteresis"], json!(1.0));
-        let cuts = json!({ "parameter": "cuts", "write": true, "deaf_ports": [0, 2] });
-        assert_eq!(values("write to=12 tag=29 parameter=9"), cuts);
+        let links_down = json!({ "parameter": "cuts", "write": true, "deaf_ports": [0, 2] });
+        assert_eq!(values("write to=12 tag=29 parameter=9"), links_down);
     }
 
     #[test]
@@ -388,9 +388,9 @@ mod tests {
             "up": true, "unnumbered": false, "round": 3, "depth": 1,
         });
         assert_eq!(hello["values"], expected);
-        let missed = object(WIRE, "missed wire=12 back=1 epoch=9");
-        assert_eq!(missed["epoch"], json!(9));
-        assert_eq!(missed["values"], json!({ "wire": 12, "back": true, "says": "missed" }));
+        let nack = object(WIRE, "missed wire=12 back=1 epoch=9");
+        assert_eq!(nack["epoch"], json!(9));
+        assert_eq!(nack["values"], json!({ "wire": 12, "back": true, "says": "missed" }));
     }
 
     #[test]

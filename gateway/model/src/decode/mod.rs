@@ -7,7 +7,7 @@
 //!
 //! A frame is ours as a whole packet with the right CRC, or as one of its two classic halves. Every other frame is
 //! foreign; one under an identifier that carries packets is damaged. Each line begins with a verdict of one word:
-//! `ok`, `half` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
+//! `ok`, `segment` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
 //! that says nothing known: `meaning`.
 
 pub mod json;
@@ -20,7 +20,7 @@ mod wires;
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Half, Packet, PacketError, Paired, data_id};
+use protocol::packet::{Packet, PacketError, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use protocol::wire::{self, PortMessage};
 use thiserror::Error;
@@ -36,9 +36,9 @@ pub enum Decoded {
     /// No frame of this protocol.
     Foreign(Foreign),
     /// What a cell, or the gateway's side, says over a simulated wire. It is on no real bus.
-    Wire(wire::Lane, PortMessage),
+    Wire(wire::LinkId, PortMessage),
     /// The first half of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
-    Half {
+    Segment {
         /// Its identifier.
         id: Id,
     },
@@ -95,7 +95,7 @@ impl Decoded {
     pub const fn verdict(&self) -> &'static str {
         match self {
             Self::Message(_) | Self::Wire(..) => "ok",
-            Self::Half { .. } => "half",
+            Self::Segment { .. } => "half",
             Self::Foreign(_) => "foreign",
             Self::Damaged { fault, .. } => fault.name(),
             Self::Meaningless { .. } => "meaning",
@@ -124,9 +124,9 @@ impl Decoded {
 /// What a frame says over a simulated wire. One whose identifier or CRC says otherwise is anybody's: 29 bits are
 /// common on other buses.
 #[must_use]
-pub fn wired(frame: &Frame) -> Option<(wire::Lane, PortMessage)> {
-    let lane = wire::Lane::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
-    Some((lane, lane.read(frame)?))
+pub fn wired(frame: &Frame) -> Option<(wire::LinkId, PortMessage)> {
+    let link_id = wire::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
+    Some((link_id, link_id.read(frame)?))
 }
 
 /// What has come under an identifier, and so whether it is one of ours.
@@ -180,7 +180,7 @@ struct Bus {
 /// An identifier of a bus.
 #[derive(Clone, Copy, Debug, Default)]
 struct Slot {
-    half: Half,
+    segment: Segment,
     /// The number of the frame that waits.
     waiting: Option<u64>,
     traffic: Traffic,
@@ -220,7 +220,7 @@ impl Decoder {
         Self { format, buses: Vec::new(), seen: 0 }
     }
 
-    /// Takes the next frame. What a classic frame is may come out only later: it is told as a [`Decoded::Half`]
+    /// Takes the next frame. What a classic frame is may come out only later: it is told as a [`Decoded::Segment`]
     /// until then; [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
         self.take(0, at, bus, frame).decoded
@@ -229,7 +229,7 @@ impl Decoder {
     /// Takes the next frame under a number.
     fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> Taken {
         let Ok(id) = data_id(frame) else {
-            let wired = wired(frame).map(|(lane, message)| Decoded::Wire(lane, message));
+            let wired = wired(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
             return wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame))).into();
         };
         let format = self.format.unwrap_or_else(|| frame.format());
@@ -241,14 +241,14 @@ impl Decoder {
             Format::Classic if frame.format() == Format::Fd => {
                 (Err(PacketError::Length { expected: 8, got: frame.data().len() }), None)
             }
-            Format::Classic => match slot.half.push(at, id, frame.data()) {
-                Ok(Paired::Waiting | Paired::Incomplete) => {
+            Format::Classic => match slot.segment.push(at, id, frame.data()) {
+                Ok(Reassembly::Waiting | Reassembly::Incomplete) => {
                     let older = slot.waiting.replace(number);
                     let older = older.map(|older| (older, slot.refuse(id, PacketError::Incomplete)));
-                    return Taken { decoded: Decoded::Half { id }, waits: Some(on), older };
+                    return Taken { decoded: Decoded::Segment { id }, waits: Some(on), older };
                 }
-                Ok(Paired::Whole(packet)) => {
-                    (Ok(packet), slot.waiting.take().map(|older| (older, Decoded::Half { id })))
+                Ok(Reassembly::Complete(packet)) => {
+                    (Ok(packet), slot.waiting.take().map(|older| (older, Decoded::Segment { id })))
                 }
                 Err(error) => (Err(error), None),
             },
@@ -273,7 +273,7 @@ impl Decoder {
         let Some(slot) = slot.filter(|slot| slot.waiting == Some(number)) else {
             return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
         };
-        (slot.half, slot.waiting) = (Half::NONE, None);
+        (slot.segment, slot.waiting) = (Segment::NONE, None);
         slot.refuse(id, PacketError::Incomplete)
     }
 

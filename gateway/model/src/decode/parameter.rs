@@ -10,7 +10,7 @@ use thiserror::Error;
 pub use super::text::{Name, Words};
 
 /// The greatest number that a parameter can have: the bit above it says that it is written.
-const GREATEST: u8 = 127;
+const MAX: u8 = 127;
 
 /// Why text is no parameter, or no value of one.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -19,7 +19,7 @@ pub enum ParameterTextError {
     /// No such name.
     #[error(
         "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to \
-         row6 and commit are, and every number from 0 to {GREATEST}"
+         row6 and commit are, and every number from 0 to {MAX}"
     )]
     Unknown {
         /// What was given instead.
@@ -32,12 +32,12 @@ pub enum ParameterTextError {
     )]
     ReadOnly,
     /// More or fewer values than it has.
-    #[error("{name} is written with {} ({fields}), not with {got}", values(*.wanted))]
+    #[error("{name} is written with {} ({fields}), not with {got}", values(*.target))]
     Count {
         /// The parameter.
         name: &'static str,
         /// How many values it has.
-        wanted: usize,
+        target: usize,
         /// Their names.
         fields: String,
         /// How many came.
@@ -73,7 +73,7 @@ fn values(count: usize) -> String {
 /// When it is neither a name nor a number up to 127.
 pub fn number(text: &str) -> Result<u8, ParameterTextError> {
     let named = schema::parameter_named(text).map(|layout| layout.number);
-    let number = || text.parse().ok().filter(|&number| number <= GREATEST);
+    let number = || text.parse().ok().filter(|&number| number <= MAX);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
 }
 
@@ -104,8 +104,8 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
     let fields: Vec<_> = written(layout, values).collect();
     if values.len() != fields.len() {
         let names: Vec<_> = fields.iter().map(|(_, name)| name.as_str()).collect();
-        let (name, wanted, got) = (&layout.name, fields.len(), values.len());
-        return Err(ParameterTextError::Count { name, wanted, fields: names.join(" "), got });
+        let (name, target, got) = (&layout.name, fields.len(), values.len());
+        return Err(ParameterTextError::Count { name, target, fields: names.join(" "), got });
     }
     for (word, ((field, name), text)) in words.iter_mut().zip(fields.into_iter().zip(values)) {
         *word = read(field, text).map_err(|allowed| wrong(name, text, allowed))?;
@@ -131,9 +131,7 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
 pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     let allowed = || field.allowed.clone();
     let known = |number: &i16| match field.range {
-        Range::Within(least, greatest) => {
-            (i32::from(least)..=i32::from(greatest)).contains(&i32::from(*number))
-        }
+        Range::Within(min, max) => (i32::from(min)..=i32::from(max)).contains(&i32::from(*number)),
         Range::All | Range::NotNegative | Range::NotNegativeAtCommit => {
             field.name_of(i64::from(*number)).is_some()
         }
@@ -153,13 +151,11 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
             match field.range {
                 Range::All | Range::NotNegativeAtCommit => word,
                 Range::NotNegative => {
-                    let greatest = field.real(i64::from(i16::MAX));
-                    word.ok()
-                        .filter(|word| *word >= 0)
-                        .ok_or_else(|| format!("it must be in [0, {greatest}]"))
+                    let max = field.real(i64::from(i16::MAX));
+                    word.ok().filter(|word| *word >= 0).ok_or_else(|| format!("it must be in [0, {max}]"))
                 }
-                Range::Within(least, greatest) => {
-                    let bounds = [least, greatest].map(|bound| i64::from(bound) << fraction);
+                Range::Within(min, max) => {
+                    let bounds = [min, max].map(|bound| i64::from(bound) << fraction);
                     word.ok()
                         .filter(|word| (bounds[0]..=bounds[1]).contains(&i64::from(*word)))
                         .ok_or_else(allowed)
@@ -206,8 +202,7 @@ pub fn angle(text: &str) -> Result<i16, String> {
 /// A number as steps of 2^-fraction; scaling by a power of two is exact.
 fn step(text: &str, fraction: u32, round: fn(f64) -> Result<Q<0>, OutOfRange>) -> Result<i16, String> {
     let scale = f64::from(1_u32 << fraction);
-    let range =
-        |error: OutOfRange| format!("it must be in [{}, {})", error.least / scale, error.bound / scale);
+    let range = |error: OutOfRange| format!("it must be in [{}, {})", error.min / scale, error.bound / scale);
     round(real(text)? * scale).map(Q::to_bits).map_err(range)
 }
 
@@ -235,7 +230,7 @@ mod tests {
 
     #[test]
     fn every_parameter_has_a_name_that_leads_back() {
-        for byte in 0..=GREATEST {
+        for byte in 0..=MAX {
             let name = Name(byte).to_string();
             let known = Parameter::from_number(byte).is_some();
             assert_eq!(known, !name.starts_with("parameter "), "{byte}");

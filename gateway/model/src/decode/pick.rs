@@ -11,7 +11,7 @@ use super::Decoded;
 
 /// A kind of frame that is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Wanted {
+pub enum Selector {
     /// A kind of packet.
     Kind(Kind),
     /// One command.
@@ -30,15 +30,15 @@ pub enum Wanted {
     "{got:?} is no kind: command, sum, torque, sensors, network, configure, configured, stimulus are; also halt, \
      joints, sync, resume, report alone, wire, foreign, and damaged"
 )]
-pub struct UnknownWanted {
+pub struct UnknownSelector {
     /// The word.
     pub got: String,
 }
 
-impl FromStr for Wanted {
-    type Err = UnknownWanted;
+impl FromStr for Selector {
+    type Err = UnknownSelector;
 
-    fn from_str(word: &str) -> Result<Self, UnknownWanted> {
+    fn from_str(word: &str) -> Result<Self, UnknownSelector> {
         let kind = Kind::ALL.into_iter().find(|kind| kind.name() == word).map(Self::Kind);
         let command = || Command::ALL.into_iter().find(|command| command.name() == word).map(Self::Command);
         let other = || match word {
@@ -47,7 +47,7 @@ impl FromStr for Wanted {
             "damaged" => Some(Self::Damaged),
             _ => None,
         };
-        kind.or_else(command).or_else(other).ok_or_else(|| UnknownWanted { got: word.to_owned() })
+        kind.or_else(command).or_else(other).ok_or_else(|| UnknownSelector { got: word.to_owned() })
     }
 }
 
@@ -70,7 +70,7 @@ pub fn node(word: &str) -> Result<Node, String> {
 #[derive(Clone, Debug, Default)]
 pub struct Pick {
     /// Any of these; all when empty.
-    pub kinds: Vec<Wanted>,
+    pub kinds: Vec<Selector>,
     /// Any of these, as sender or addressee; all when empty. Commands are the gateway's.
     pub nodes: Vec<Node>,
     /// From so many nanoseconds after the first frame on.
@@ -97,12 +97,12 @@ impl Pick {
     fn takes_kind(&self, id: Option<Id>, decoded: &Decoded) -> bool {
         let is_damaged = matches!(decoded, Decoded::Damaged { .. });
         self.kinds.is_empty()
-            || self.kinds.iter().any(|wanted| match wanted {
-                Wanted::Kind(kind) => id.is_some_and(|id| id.kind == *kind),
-                Wanted::Command(command) => id == Some(Id::command(*command)),
-                Wanted::Foreign => is_damaged || matches!(decoded, Decoded::Foreign(_)),
-                Wanted::Damaged => is_damaged,
-                Wanted::Wire => matches!(decoded, Decoded::Wire(..)),
+            || self.kinds.iter().any(|selector| match selector {
+                Selector::Kind(kind) => id.is_some_and(|id| id.kind == *kind),
+                Selector::Command(command) => id == Some(Id::command(*command)),
+                Selector::Foreign => is_damaged || matches!(decoded, Decoded::Foreign(_)),
+                Selector::Damaged => is_damaged,
+                Selector::Wire => matches!(decoded, Decoded::Wire(..)),
             })
     }
 
@@ -159,7 +159,7 @@ mod tests {
         assert_eq!(taken(&["configure"], &["12", "everyone"]), [0x50C, 0x5FF]);
         assert_eq!(taken(&[], &["gateway"]), [0x000, 0x001, 0x400]);
         assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
-        let wire = wire::Lane { wire: 3, back: true }.frame(wire::PortMessage::Join);
+        let wire = wire::LinkId { wire: 3, back: true }.frame(wire::PortMessage::Join);
         let kinds = ["wire", "foreign", "command"];
         let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
         assert_eq!(kinds.map(|kind| takes(&of(kind), &wire)), [true, false, false]);
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn words_that_are_none_say_which_are() {
-        let kind = "torqe".parse::<Wanted>().unwrap_err().to_string();
+        let kind = "torqe".parse::<Selector>().unwrap_err().to_string();
         assert!(kind.starts_with("\"torqe\" is no kind: command, sum, torque, "), "{kind}");
         let expected = "\"255\" is no node: a cell's number, 1 to 254, gateway or everyone is";
         assert_eq!(node("255"), Err(expected.to_owned()));

@@ -12,7 +12,7 @@ use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
-use protocol::packet::Half;
+use protocol::packet::Segment;
 use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
@@ -73,7 +73,7 @@ impl<T> Settler<T> {
             }
         }
         let state = match (taken.decoded, taken.waits) {
-            (Decoded::Half { id }, Some(bus)) => State::Waits(bus, id),
+            (Decoded::Segment { id }, Some(bus)) => State::Waits(bus, id),
             (decoded, _) => State::Settled(decoded),
         };
         self.now = at;
@@ -100,7 +100,7 @@ impl<T> Settler<T> {
     /// The oldest frame, if it is known what it is.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
         if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
-            let is_in_time = self.now.since(at) <= Span(Half::within(id).0 + SLACK.0);
+            let is_in_time = self.now.since(at) <= Span(Segment::within(id).0 + SLACK.0);
             if is_in_time && !self.is_at_end && self.waiting.len() < FRAMES {
                 return None;
             }

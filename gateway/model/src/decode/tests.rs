@@ -303,11 +303,11 @@ fn chance_makes_no_identifier_ours() {
 }
 
 #[test]
-fn halves_meet_by_bus_and_identifier() {
+fn segments_meet_by_bus_and_identifier() {
     let all = decoded(CLASSIC, None);
-    let (mut halves, mut packets) = (0, 0);
+    let (mut segments, mut packets) = (0, 0);
     for (comment, text) in &all {
-        halves += u32::from(text.starts_with("half    "));
+        segments += u32::from(text.starts_with("half    "));
         let expected: &[&str] = match comment.split(' ').next().unwrap() {
             "waiting" | "incomplete" => &["half    ", "foreign no packet: no other half", "incomplete "],
             "whole" => {
@@ -319,7 +319,7 @@ fn halves_meet_by_bus_and_identifier() {
         };
         assert!(expected.iter().any(|expected| text.starts_with(expected)), "{comment}: {text}");
     }
-    assert_eq!(halves, packets, "each packet has one first half: {all:#?}");
+    assert_eq!(segments, packets, "each packet has one first half: {all:#?}");
     let mut decoder = Decoder::new(None);
     let [first, second] =
         ["20C#001000F801000000", "20C#00000000070175D6"].map(|text| candump::parse_frame(text).unwrap());

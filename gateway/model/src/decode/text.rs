@@ -16,8 +16,8 @@ impl Display for Decoded {
         write!(f, "{:<7} ", self.verdict())?;
         match *self {
             Self::Foreign(foreign) => write!(f, "{foreign}"),
-            Self::Wire(lane, message) => write!(f, "{}", Said(lane, message)),
-            Self::Half { id } => write!(f, "{}", Subject(id)),
+            Self::Wire(link_id, message) => write!(f, "{}", Said(link_id, message)),
+            Self::Segment { id } => write!(f, "{}", Subject(id)),
             Self::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
             Self::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
             Self::Message(message) => write!(f, "{}", Meaning(&message)),

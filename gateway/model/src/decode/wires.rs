@@ -5,7 +5,7 @@ use core::fmt::{self, Display, Formatter};
 use protocol::message::VERSION;
 use protocol::packet::BYTES;
 use protocol::schema::{self, Field, Layout};
-use protocol::wire::{Hello, Label, Lane, PortMessage, UPLINK, Walk};
+use protocol::wire::{Hello, LinkId, PortMessage, Rank, UPLINK, Walk};
 
 use super::text;
 
@@ -24,15 +24,15 @@ pub(super) fn said(message: PortMessage) -> ([u8; BYTES], &'static Layout) {
 
 /// The epoch that a message speaks of, if it does.
 pub(super) const fn epoch(message: PortMessage) -> Option<u8> {
-    if let PortMessage::State(epoch) | PortMessage::Missed(epoch) = message { Some(epoch.0) } else { None }
+    if let PortMessage::State(epoch) | PortMessage::Nack(epoch) = message { Some(epoch.0) } else { None }
 }
 
 /// A message over a wire, with the wire and the direction in it: `wire 12 ->: join`.
-pub(super) struct Said(pub(super) Lane, pub(super) PortMessage);
+pub(super) struct Said(pub(super) LinkId, pub(super) PortMessage);
 
 impl Display for Said {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let Self(Lane { wire, back }, message) = *self;
+        let Self(LinkId { wire, back }, message) = *self;
         let (bytes, layout) = said(message);
         write!(f, "wire {wire} {}: {}", if back { "<-" } else { "->" }, layout.name)?;
         if let PortMessage::Hello(hello) = message {
@@ -47,7 +47,7 @@ impl Display for Said {
 }
 
 fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
-    let Hello { version, number, port, hears, up, unnumbered, label } = hello;
+    let Hello { version, number, port, hears, up, unnumbered, rank } = hello;
     if version != VERSION {
         write!(f, ", version {version}")?;
     }
@@ -61,16 +61,16 @@ fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
             write!(f, ", {word}")?;
         }
     }
-    write!(f, ", {}", Far(label))
+    write!(f, ", {}", Far(rank))
 }
 
 /// How far somebody is from the gateway.
-struct Far(Option<Label>);
+struct Far(Option<Rank>);
 
 impl Display for Far {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self.0 {
-            Some(Label { round, depth }) => write!(f, "round {round} depth {depth}"),
+            Some(Rank { round, depth }) => write!(f, "round {round} depth {depth}"),
             None => f.write_str("no way up"),
         }
     }

@@ -20,7 +20,7 @@ use super::GenerateError;
 /// From one cell's middle to the next one's, in mm: that of the real skin's cells.
 const PITCH_MM: usize = 28;
 /// Cells that are closer than this cannot be imagined as hardware.
-const LEAST_PITCH_MM: usize = 3;
+const MIN_PITCH_MM: usize = 3;
 /// Ports of a cell.
 const PORTS: usize = 4;
 
@@ -97,10 +97,10 @@ pub(super) struct Place {
 
 /// Lays this many cells around the limbs, as far apart as real ones if they fit, else closer.
 pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, GenerateError> {
-    let (pitch_mm, shares) = (LEAST_PITCH_MM..=PITCH_MM)
+    let (pitch_mm, shares) = (MIN_PITCH_MM..=PITCH_MM)
         .rev()
         .find_map(|pitch_mm| Some((pitch_mm, share(&arm.limbs, metres(pitch_mm), cells, buses)?)))
-        .ok_or(GenerateError::NoRoom { cells, least_mm: LEAST_PITCH_MM })?;
+        .ok_or(GenerateError::NoRoom { cells, min_mm: MIN_PITCH_MM })?;
     let mut on_buses = Vec::with_capacity(buses);
     for (limb, share) in arm.limbs.iter().zip(&shares) {
         let rings = Rings::of(limb, metres(pitch_mm));

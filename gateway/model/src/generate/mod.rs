@@ -14,7 +14,7 @@ use thiserror::Error;
 
 /// What to describe.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Wanted {
+pub struct Target {
     /// The robot that wears the skin.
     pub robot: Robot,
     /// How many cells, 1 to 254 a bus.
@@ -29,7 +29,7 @@ pub struct Wanted {
     pub format: Format,
 }
 
-impl Default for Wanted {
+impl Default for Target {
     fn default() -> Self {
         Self {
             robot: Robot::Ur5,
@@ -85,12 +85,12 @@ pub enum GenerateError {
         buses: usize,
     },
     /// More cells than there is room for.
-    #[error("{cells} cells do not fit on the arm, not even {least_mm} mm apart")]
+    #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart")]
     NoRoom {
         /// Wanted cells.
         cells: usize,
         /// The least distance in mm.
-        least_mm: usize,
+        min_mm: usize,
     },
     /// What came out is no skin: a number that was asked for cannot be.
     #[error(transparent)]
@@ -101,8 +101,8 @@ pub enum GenerateError {
 ///
 /// # Errors
 /// When the cells do not fit on the buses or on the arm, or a number that was asked for cannot be.
-pub fn generate(wanted: &Wanted) -> Result<String, GenerateError> {
-    let (cells, buses) = (wanted.cells, wanted.buses);
+pub fn generate(target: &Target) -> Result<String, GenerateError> {
+    let (cells, buses) = (target.cells, target.buses);
     if buses == 0 || cells < buses {
         return Err(GenerateError::TooFew { cells, buses });
     }
@@ -110,10 +110,10 @@ pub fn generate(wanted: &Wanted) -> Result<String, GenerateError> {
     if needed > buses {
         return Err(GenerateError::TooMany { cells, buses, needed });
     }
-    let arm = match wanted.robot {
+    let arm = match target.robot {
         Robot::Ur5 => arm::cover(&arm::UR5, cells, buses)?,
     };
-    let text = text::toml(wanted, &arm);
+    let text = text::toml(target, &arm);
     Skin::parse("generated skin", &text)?;
     Ok(text)
 }

@@ -2,12 +2,12 @@ use protocol::skin::Cell;
 
 use super::*;
 
-fn wanted(cells: usize, buses: usize) -> Wanted {
-    Wanted { cells, buses, ..Wanted::default() }
+fn target(cells: usize, buses: usize) -> Target {
+    Target { cells, buses, ..Target::default() }
 }
 
-fn skin(wanted: &Wanted) -> Skin {
-    Skin::parse("generated", &generate(wanted).unwrap()).unwrap()
+fn skin(target: &Target) -> Skin {
+    Skin::parse("generated", &generate(target).unwrap()).unwrap()
 }
 
 fn apart(one: &Cell, other: &Cell) -> f64 {
@@ -24,12 +24,12 @@ fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
 fn the_example_is_what_its_first_line_makes() {
     let example = include_str!("../../../examples/ur5-253.toml");
     assert!(example.starts_with("# gateway skin generate --robot ur5 --cells 253\n"));
-    assert!(generate(&Wanted::default()).unwrap() == example, "make it anew with that command");
+    assert!(generate(&Target::default()).unwrap() == example, "make it anew with that command");
 }
 
 #[test]
 fn wires_are_symmetric_and_lead_to_hexagon_neighbours() {
-    let skin = skin(&Wanted::default());
+    let skin = skin(&Target::default());
     let mut cables = Vec::new();
     for cell in &skin.cells {
         assert!(cell.neighbors.iter().flatten().count() >= 2, "{cell:?}");
@@ -48,7 +48,7 @@ fn wires_are_symmetric_and_lead_to_hexagon_neighbours() {
 
 #[test]
 fn cells_do_not_overlap_and_look_outwards() {
-    let skin = skin(&Wanted::default());
+    let skin = skin(&Target::default());
     for (index, cell) in skin.cells.iter().enumerate() {
         for other in skin.cells.iter().take(index).filter(|other| other.joint == cell.joint) {
             assert!(apart(cell, other) > 0.0275, "{} and {}", cell.node, other.node);
@@ -67,7 +67,7 @@ fn every_bus_is_one_connected_patch_with_one_root() {
     for (cells, buses) in
         [(1, 1), (2, 1), (3, 1), (20, 1), (254, 1), (2, 2), (253, 2), (508, 2), (700, 3), (1_016, 4)]
     {
-        let skin = skin(&wanted(cells, buses));
+        let skin = skin(&target(cells, buses));
         assert_eq!((skin.cells.len(), skin.buses.len()), (cells, buses));
         for bus in 0..buses {
             let here: Vec<&Cell> = skin.cells_of(bus).collect();
@@ -93,19 +93,19 @@ fn every_bus_is_one_connected_patch_with_one_root() {
 #[test]
 fn few_and_many_cells_make_a_skin() {
     for cells in (1..=32).chain(250..=254) {
-        assert_eq!(skin(&wanted(cells, 1)).cells.len(), cells);
+        assert_eq!(skin(&target(cells, 1)).cells.len(), cells);
     }
 }
 
 #[test]
 fn more_cells_than_the_arm_has_room_for_lie_closer() {
-    let text = generate(&wanted(10_000, 40)).unwrap();
+    let text = generate(&target(10_000, 40)).unwrap();
     assert!(text.contains("# Hexagonal cells, 4 mm apart"), "{}", text.lines().nth(2).unwrap());
 }
 
 #[test]
 fn the_reply_and_the_format_are_the_wanted_ones() {
-    let wanted = Wanted {
+    let target = Target {
         reply: Reply::Sum,
         format: Format::Classic,
         broadcast_hz: 50.0,
@@ -113,10 +113,10 @@ fn the_reply_and_the_format_are_the_wanted_ones() {
         cells: 300,
         robot: Robot::Ur5,
     };
-    let text = generate(&wanted).unwrap();
+    let text = generate(&target).unwrap();
     let first = "# gateway skin generate --robot ur5 --cells 300 --buses 2 --broadcast-hz 50 --reply sum --format classic";
     assert_eq!(text.lines().next(), Some(first));
-    let skin = skin(&wanted);
+    let skin = skin(&target);
     assert_eq!(skin.timing.ticks_per_broadcast, 10);
     for bus in &skin.buses {
         assert_eq!(bus.format, Format::Classic);
@@ -130,19 +130,19 @@ fn the_reply_and_the_format_are_the_wanted_ones() {
 
 #[test]
 fn what_cannot_be_says_what_can() {
-    let says = |wanted: Wanted| generate(&wanted).unwrap_err().to_string();
+    let says = |target: Target| generate(&target).unwrap_err().to_string();
     assert_eq!(
-        says(wanted(255, 1)),
+        says(target(255, 1)),
         "255 cells do not fit on one bus: a bus has numbers for 254; say --buses 2"
     );
     assert_eq!(
-        says(wanted(1_000, 3)),
+        says(target(1_000, 3)),
         "1000 cells do not fit on 3 buses: a bus has numbers for 254; say --buses 4"
     );
-    assert_eq!(says(wanted(0, 1)), "0 cells on 1 buses: every bus needs at least one");
-    assert_eq!(says(wanted(100_000, 400)), "100000 cells do not fit on the arm, not even 3 mm apart");
+    assert_eq!(says(target(0, 1)), "0 cells on 1 buses: every bus needs at least one");
+    assert_eq!(says(target(100_000, 400)), "100000 cells do not fit on the arm, not even 3 mm apart");
     assert_eq!(
-        says(Wanted { broadcast_hz: 60.0, ..Wanted::default() }),
+        says(Target { broadcast_hz: 60.0, ..Target::default() }),
         "generated skin:23: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"
     );
 }

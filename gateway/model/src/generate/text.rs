@@ -3,14 +3,14 @@
 use protocol::skin::DenavitHartenberg;
 
 use super::arm::{self, Covered, Place};
-use super::{Format, Reply, Wanted};
+use super::{Format, Reply, Target};
 
 /// How much of the broadcast period the slots of sums may take.
 const SLOTS_SHARE: f64 = 0.75;
 
-pub(super) fn toml(wanted: &Wanted, arm: &Covered) -> String {
-    let Wanted { robot: _, cells, buses, broadcast_hz, reply, format } = wanted;
-    let usual = Wanted::default();
+pub(super) fn toml(target: &Target, arm: &Covered) -> String {
+    let Target { robot: _, cells, buses, broadcast_hz, reply, format } = target;
+    let usual = Target::default();
     let robot = arm.name.to_lowercase();
     let [(upper, on_upper), (lower, on_lower)] = arm.limbs;
     let options = [
@@ -19,7 +19,8 @@ pub(super) fn toml(wanted: &Wanted, arm: &Covered) -> String {
         (*reply == Reply::Sum, " --reply sum".to_owned()),
         (*format == Format::Classic, " --format classic".to_owned()),
     ];
-    let options: String = options.into_iter().filter_map(|(asked, option)| asked.then_some(option)).collect();
+    let options: String =
+        options.into_iter().filter_map(|(requested, option)| requested.then_some(option)).collect();
     let is_joined = arm.buses.len() == 1 && on_upper > 0 && on_lower > 0;
     let cable = format!("# A cable leads from node {on_upper} over the elbow to node {}.\n", on_upper + 1);
     let cable = if is_joined { &cable } else { "" };

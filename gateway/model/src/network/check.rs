@@ -147,7 +147,7 @@ pub enum Difference {
         names(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]
-    NoWay(Vec<CellId>),
+    Unreachable(Vec<CellId>),
 }
 
 fn other_cell(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
@@ -188,7 +188,7 @@ impl Difference {
     #[must_use]
     pub const fn breaks_the_tree(&self) -> bool {
         match self {
-            Self::MissingCell(_) | Self::Circle(_) | Self::NoWay(_) | Self::Version { .. } => true,
+            Self::MissingCell(_) | Self::Circle(_) | Self::Unreachable(_) | Self::Version { .. } => true,
             Self::ExtraCell { .. }
             | Self::OtherCell { .. }
             | Self::Duplicate(_)
@@ -209,15 +209,15 @@ pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
     let network = Network::new(wires, cells, &versions);
     network.wires(&mut found);
-    let Places { circles, without_way, .. } =
+    let Places { circles, unreachable, .. } =
         places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
     let described = |node: &CellId| cells.iter().any(|cell| cell.node == *node && cell.serial.is_some());
     let named = |cell: &CellId| circling.contains(cell) || versions.contains_key(cell);
-    let without: Vec<_> = without_way.into_iter().filter(|cell| !named(cell) && described(cell)).collect();
+    let without: Vec<_> = unreachable.into_iter().filter(|cell| !named(cell) && described(cell)).collect();
     if !without.is_empty() {
-        found.push(Difference::NoWay(without));
+        found.push(Difference::Unreachable(without));
     }
     found
 }

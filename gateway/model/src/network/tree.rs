@@ -15,7 +15,7 @@ pub struct Places {
     /// Whether each of them says the same of itself.
     pub agree: bool,
     /// Cells that speak and have no way, those of circles among them.
-    pub without_way: Vec<CellId>,
+    pub unreachable: Vec<CellId>,
     /// Parents in a circle.
     pub circles: Vec<Vec<CellId>>,
 }
@@ -39,16 +39,16 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
     let mut places = Places { agree: true, ..Places::default() };
     let mut circling = BTreeSet::new();
     for &node in alive.keys() {
-        let (mut way, mut at, mut steps) = (Vec::new(), node, 0_u8);
+        let (mut route, mut at, mut steps) = (Vec::new(), node, 0_u8);
         loop {
-            if way.contains(&at) {
-                let circle: Vec<_> = way.iter().copied().skip_while(|&cell| cell != at).collect();
+            if route.contains(&at) {
+                let circle: Vec<_> = route.iter().copied().skip_while(|&cell| cell != at).collect();
                 if circle.iter().all(|&cell| circling.insert(cell)) {
                     places.circles.push(from_the_least(circle));
                 }
-                break places.without_way.push(node);
+                break places.unreachable.push(node);
             }
-            way.push(at);
+            route.push(at);
             match parent(&at) {
                 Some((tree, _)) if is_root(&tree) => {
                     let says = alive.get(&node).copied().flatten().map(|tree| tree.depth);
@@ -57,7 +57,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
                     break;
                 }
                 Some((_, Some(next))) => (at, steps) = (next, steps.saturating_add(1)),
-                Some((_, None)) | None => break places.without_way.push(node),
+                Some((_, None)) | None => break places.unreachable.push(node),
             }
         }
     }
@@ -65,8 +65,8 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
 }
 
 fn from_the_least(mut circle: Vec<CellId>) -> Vec<CellId> {
-    let least = circle.iter().enumerate().min_by_key(|(_, cell)| **cell).map_or(0, |(place, _)| place);
-    circle.rotate_left(least);
+    let min = circle.iter().enumerate().min_by_key(|(_, cell)| **cell).map_or(0, |(place, _)| place);
+    circle.rotate_left(min);
     circle
 }
 
@@ -87,14 +87,14 @@ mod tests {
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 1), says(3, Some(2), 1, 2)];
         let found = places(cells.into_iter());
         assert_eq!((found.deepest(), found.agree), (Some(2), true));
-        assert_eq!((found.without_way, found.circles), (vec![], vec![]));
+        assert_eq!((found.unreachable, found.circles), (vec![], vec![]));
         // One that says another depth has old news.
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
         assert!(!places(cells.into_iter()).agree);
     }
 
     #[test]
-    fn who_has_no_parent_or_one_that_does_not_speak_or_a_circle_above_it_has_no_way() {
+    fn who_has_no_parent_or_one_that_does_not_speak_or_a_circle_above_it_is_unreachable() {
         let cells = [
             says(1, Some(0), 4, 0),
             says(2, None, 0, 0),
@@ -110,7 +110,7 @@ mod tests {
             says(13, Some(12), 0, 2),
         ];
         let found = places(cells.into_iter());
-        let without: Vec<_> = found.without_way.iter().map(|cell| cell.get()).collect();
+        let without: Vec<_> = found.unreachable.iter().map(|cell| cell.get()).collect();
         assert_eq!(without, [2, 3, 4, 6, 7, 8, 10, 11, 12, 13]);
         assert_eq!(found.circles, [vec![cell(10), cell(12), cell(11)]]);
         assert_eq!(found.depths.keys().collect::<Vec<_>>(), [&cell(1)]);

@@ -11,7 +11,7 @@ use std::collections::{BTreeSet, VecDeque};
 use protocol::id::CellId;
 use protocol::message::VERSION;
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, Label, PortMessage, Walk};
+use protocol::wire::{Hello, PortMessage, Rank, Walk};
 
 /// From one hello to the next.
 const HELLO: Span = Span::from_millis(250);
@@ -102,34 +102,34 @@ impl Uplinks {
 
     /// Takes what a root said over its wire.
     pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
-        let label = Label { round: self.round, depth: 0 };
+        let rank = Rank { round: self.round, depth: 0 };
         let Some(wire) = self.wires.get_mut(root) else { return };
         match message {
             PortMessage::Hello(hello) => {
-                let anew = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
+                let restarted = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
                 wire.heard = Some((hello, now));
                 // Only the root knows whether a grant came, and whether it is still where an earlier gateway let it in.
                 wire.is_child = hello.up;
-                if hello.up && hello.label.is_some_and(|own| own.is_better_than(label.below())) {
-                    self.renew(now, hello.label.map_or(self.round, |own| own.round));
-                } else if anew || !hello.hears {
+                if hello.up && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
+                    self.renew(now, hello.rank.map_or(self.round, |own| own.round));
+                } else if restarted || !hello.hears {
                     self.hello(now, root);
                 }
             }
-            PortMessage::Join => self.outbox.push_back((root, PortMessage::Grant(label))),
+            PortMessage::Join => self.outbox.push_back((root, PortMessage::Grant(rank))),
             PortMessage::Leave => {
                 wire.is_child = false;
-                self.outbox.push_back((root, PortMessage::Left));
+                self.outbox.push_back((root, PortMessage::LeaveAck));
             }
-            PortMessage::Seek(round) => self.renew(now, round),
-            PortMessage::Ask => self.hello(now, root),
+            PortMessage::Repair(round) => self.renew(now, round),
+            PortMessage::Probe => self.hello(now, root),
             PortMessage::Return(walk) => self.end_walk(now, root, walk),
             PortMessage::Grant(_)
             | PortMessage::Refuse
-            | PortMessage::Left
+            | PortMessage::LeaveAck
             | PortMessage::State(_)
-            | PortMessage::Missed(_)
-            | PortMessage::Number(_) => {}
+            | PortMessage::Nack(_)
+            | PortMessage::NodeId(_) => {}
         }
         self.walk(now);
     }
@@ -151,7 +151,7 @@ impl Uplinks {
             hears: heard.is_some_and(|(_, at)| now.since(at) <= SILENT),
             up: false,
             unnumbered: false,
-            label: Some(Label { round: self.round, depth: 0 }),
+            rank: Some(Rank { round: self.round, depth: 0 }),
         };
         self.outbox.push_back((root, PortMessage::Hello(hello)));
     }
@@ -165,8 +165,8 @@ impl Uplinks {
     /// Takes in that time has passed.
     pub fn handle_time(&mut self, now: Micros) {
         if now >= self.next_hello {
-            let missed = now.since(self.next_hello).0 / HELLO.0;
-            self.next_hello = self.next_hello + Span((missed + 1) * HELLO.0);
+            let nack = now.since(self.next_hello).0 / HELLO.0;
+            self.next_hello = self.next_hello + Span((nack + 1) * HELLO.0);
             for wire in &mut self.wires {
                 wire.is_child &= wire.heard.is_some_and(|(_, at)| now.since(at) <= SILENT);
             }
@@ -194,7 +194,7 @@ impl Uplinks {
         self.walks = self.walks.wrapping_add(1);
         let walk = Walk { walk: self.walks, first, last };
         self.walking = Some(Walking { root, walk, since: now });
-        self.outbox.push_back((root, PortMessage::Number(walk)));
+        self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
 
     /// The first numbers in a row that nobody has.

@@ -10,7 +10,7 @@ use protocol::skin::{Reply, Skin};
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
 
-use super::touches::GREATEST_FORCE_N;
+use super::touches::MAX_FORCE_N;
 use super::{Mode, ModeChange, Motion, MotionKind, Profile, Scenario, Touch, faults, raw};
 
 pub(super) type Checked<T> = Result<T, Wrong>;
@@ -87,13 +87,13 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
             (MotionKind::Sine { amplitude_rad, period_s }, amplitude_rad.map(f64::abs))
         }
     };
-    for (index, ((start, reach), [least, greatest])) in
+    for (index, ((start, reach), [min, max])) in
         start_rad.iter().zip(reach).zip(&robot.limits_rad).enumerate()
     {
         // Written so that NaN is refused too.
-        if !(start - reach >= *least && start + reach <= *greatest) {
+        if !(start - reach >= *min && start + reach <= *max) {
             let why = format!(
-                "joint {} may go from {least} to {greatest}, and comes as far as {reach} from its start",
+                "joint {} may go from {min} to {max}, and comes as far as {reach} from its start",
                 index + 1
             );
             return Err(at.key("start_rad").nth(index).fault(start, why));
@@ -104,12 +104,11 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
 
 /// Whether every joint may be as quick as its swing is at the start.
 fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_JOINTS], period_s: f64) -> Checked<()> {
-    for (index, (amplitude, &greatest)) in amplitude.iter().zip(&skin.controller.max_speed_rad_s).enumerate()
-    {
+    for (index, (amplitude, &max)) in amplitude.iter().zip(&skin.controller.max_speed_rad_s).enumerate() {
         let speed = TAU * amplitude.abs() / period_s;
-        if speed.is_nan() || speed > greatest {
+        if speed.is_nan() || speed > max {
             let why = format!(
-                "in {period_s} s this takes {speed:.3} rad/s, and joint {} may make {greatest}",
+                "in {period_s} s this takes {speed:.3} rad/s, and joint {} may make {max}",
                 index + 1
             );
             return Err(at.nth(index).fault(amplitude, why));
@@ -143,8 +142,8 @@ fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touc
 }
 
 fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
-    if !(0.0..=GREATEST_FORCE_N).contains(&raw.force_n) {
-        let why = format!("0 to {GREATEST_FORCE_N:.3} N are possible, what three contact words can say");
+    if !(0.0..=MAX_FORCE_N).contains(&raw.force_n) {
+        let why = format!("0 to {MAX_FORCE_N:.3} N are possible, what three contact words can say");
         return Err(at.key("force_n").fault(raw.force_n, why));
     }
     if !(0.0..=1.0).contains(&raw.proximity) {
@@ -180,10 +179,10 @@ fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
         for cell in &last.cells {
             let others = at_once.iter().filter(|touch| touch.cells.binary_search(cell).is_ok());
             let force = last.force_n + others.map(|touch| touch.force_n).sum::<f64>();
-            if force > GREATEST_FORCE_N {
+            if force > MAX_FORCE_N {
                 let why = format!(
                     "with the touches before it that makes {force} N on {}, more than the \
-                     {GREATEST_FORCE_N:.3} N that three contact words can say",
+                     {MAX_FORCE_N:.3} N that three contact words can say",
                     names.name(*cell)
                 );
                 return Err(at.fault(last.force_n, why));
@@ -270,8 +269,8 @@ impl<'a> Names<'a> {
             None => {
                 let bus = bus.map(|name| self.bus(at, Some(name))).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
-                let wanted = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
-                return Ok(wanted.map(|(index, _)| index).collect());
+                let target = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
+                return Ok(target.map(|(index, _)| index).collect());
             }
             Some([]) => return Err(path.fault("[]", "at least one cell is needed")),
             Some(nodes) => nodes,

@@ -72,22 +72,22 @@ impl Entry<'_> {
         Ok(FaultKind::Process { action, cells: self.cells()? })
     }
 
-    fn wire(&self, cut: bool, keys: &[&str]) -> Checked<FaultKind> {
+    fn wire(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
         self.only(keys)?;
         if self.raw.all {
             return Err(self.at.key("all").fault(true, "the two cells of a wire are needed"));
         }
         let (from, to) = self.names.wired(&self.at, self.raw.bus.as_deref(), self.raw.cells.as_deref())?;
-        Ok(FaultKind::Wire { cut, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
+        Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
     /// A cut that lasts for some time ends with a mend.
     fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
-        let FaultKind::Wire { cut: true, from, to, both_ways } = fault.kind else { return Ok(None) };
+        let FaultKind::Wire { link_down: true, from, to, both_ways } = fault.kind else { return Ok(None) };
         if self.raw.for_s.is_none() {
             return Ok(None);
         }
-        let kind = FaultKind::Wire { cut: false, from, to, both_ways };
+        let kind = FaultKind::Wire { link_down: false, from, to, both_ways };
         Ok(Some(Fault { at: fault.at + self.length()?, kind }))
     }
 
@@ -127,12 +127,12 @@ impl Entry<'_> {
     }
 
     /// A number that this kind of fault needs.
-    fn given(&self, key: &'static str, value: Option<f64>, least: f64, greatest: f64) -> Checked<f64> {
-        let why = || match (least, greatest) {
+    fn given(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
+        let why = || match (min, max) {
             (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
-            _ => format!("{least} to {greatest} are needed with kind = {:?}", self.raw.kind),
+            _ => format!("{min} to {max} are needed with kind = {:?}", self.raw.kind),
         };
-        let given = value.filter(|value| value.is_finite() && (least..=greatest).contains(value));
+        let given = value.filter(|value| value.is_finite() && (min..=max).contains(value));
         given
             .ok_or_else(|| self.at.key(key).fault(value.map_or_else(String::new, |it| it.to_string()), why()))
     }

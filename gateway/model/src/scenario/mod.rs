@@ -141,7 +141,7 @@ pub enum FaultKind {
     /// Something is done to the wires between two cells.
     Wire {
         /// Whether they are cut; else they work again.
-        cut: bool,
+        link_down: bool,
         /// The cell that is not heard any more.
         from: usize,
         /// The cell that does not hear it.

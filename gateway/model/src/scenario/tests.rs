@@ -276,8 +276,8 @@ proptest! {
     #[test]
     fn three_words_add_up_exactly_to_the_rounded_force(force_n in -96.0_f64..96.0) {
         let words = contact_words(force_n).map(|word| i32::from(word.to_bits()));
-        let wanted = (force_n * 1_024.0).round().clamp(3.0 * -32_768.0, 3.0 * 32_767.0);
-        prop_assert_eq!(f64::from(words.iter().sum::<i32>()), wanted);
+        let target = (force_n * 1_024.0).round().clamp(3.0 * -32_768.0, 3.0 * 32_767.0);
+        prop_assert_eq!(f64::from(words.iter().sum::<i32>()), target);
         prop_assert!(words.iter().max().unwrap() - words.iter().min().unwrap() <= 1);
     }
 
@@ -316,7 +316,7 @@ fn words_saturate_beyond_what_they_can_say() {
 }
 
 #[test]
-fn a_wire_is_cut_between_two_cells_that_it_leads_between_and_mended_in_time() {
+fn a_wire_is_link_down_between_two_cells_that_it_leads_between_and_repaired_in_time() {
     let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
     let cell = cell.split("[[cell]]").nth(1).unwrap();
     let described = |reply: &str, neighbors: [&str; 3]| {
@@ -335,9 +335,9 @@ fn a_wire_is_cut_between_two_cells_that_it_leads_between_and_mended_in_time() {
             .map(|scenario| scenario.faults)
             .map_err(|error| error.to_string())
     };
-    let wire = |at, cut, from, to, both_ways| Fault {
+    let wire = |at, link_down, from, to, both_ways| Fault {
         at: Micros(at),
-        kind: FaultKind::Wire { cut, from, to, both_ways },
+        kind: FaultKind::Wire { link_down, from, to, both_ways },
     };
     assert_eq!(
         fault(&sums, "kind = \"cut\"\ncells = [3, 2]\none_way = true\nfor_s = 1.0").unwrap(),

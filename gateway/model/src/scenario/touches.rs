@@ -35,12 +35,12 @@ pub struct Touches {
     touches: Vec<Touch>,
     /// The touches' forces in N before and now: scratch of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,
-    cells: Vec<Felt>,
+    cells: Vec<Touched>,
 }
 
 /// Something that happens to a cell at some time.
 #[derive(Clone, Debug)]
-struct Felt {
+struct Touched {
     cell: usize,
     bus: usize,
     node: CellId,
@@ -60,30 +60,30 @@ impl Touches {
     /// What happens to which cell.
     #[must_use]
     pub fn new(scenario: &Scenario, skin: &Skin) -> Self {
-        let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| Felt {
+        let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| Touched {
             cell: index,
             bus: cell.bus,
             node: cell.node,
             touches: Vec::new(),
             faults: Vec::new(),
         };
-        let mut cells: Vec<Felt> = skin.cells.iter().enumerate().map(of_cell).collect();
+        let mut cells: Vec<Touched> = skin.cells.iter().enumerate().map(of_cell).collect();
         for (index, touch) in scenario.touches.iter().enumerate() {
             for &cell in &touch.cells {
-                if let Some(felt) = cells.get_mut(cell) {
-                    felt.touches.push(index);
+                if let Some(touched) = cells.get_mut(cell) {
+                    touched.touches.push(index);
                 }
             }
         }
         for fault in &scenario.faults {
             let FaultKind::Sensor { fault: wrong, length, cells: hit } = &fault.kind else { continue };
             for &cell in hit {
-                if let Some(felt) = cells.get_mut(cell) {
-                    felt.faults.push(Wrong { at: fault.at, length: *length, fault: *wrong });
+                if let Some(touched) = cells.get_mut(cell) {
+                    touched.faults.push(Wrong { at: fault.at, length: *length, fault: *wrong });
                 }
             }
         }
-        cells.retain(|felt| !felt.touches.is_empty() || !felt.faults.is_empty());
+        cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         Self {
             period_us: 1e6 / skin.timing.broadcast_hz(),
             levels: vec![[None; 2]; scenario.touches.len()],
@@ -107,30 +107,31 @@ impl Touches {
             *levels = times.map(|time| time.and_then(|time| touch.level(time)));
         }
         let this = &*self;
-        this.cells.iter().filter_map(move |felt| {
-            let [before, now] = if felt.faults.is_empty() {
-                this.words_of_levels(felt)?
+        this.cells.iter().filter_map(move |touched| {
+            let [before, now] = if touched.faults.is_empty() {
+                this.words_of_levels(touched)?
             } else {
-                times.map(|time| time.map_or_else(SkinSensors::default, |time| this.words_at(felt, time)))
+                times.map(|time| time.map_or_else(SkinSensors::default, |time| this.words_at(touched, time)))
             };
-            let stimulus = Stimulus { cell: felt.cell, bus: felt.bus, node: felt.node, sensors: now };
+            let stimulus =
+                Stimulus { cell: touched.cell, bus: touched.bus, node: touched.node, sensors: now };
             (before != now).then_some(stimulus)
         })
     }
 
     /// The cells that are ever touched, by their places in the skin.
     pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
-        self.cells.iter().map(|felt| felt.cell)
+        self.cells.iter().map(|touched| touched.cell)
     }
 
     /// What a cell feels in an epoch: for one that was started anew.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
-        match self.cells.binary_search_by_key(&cell, |felt| felt.cell) {
+        match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
             Ok(at) => self
                 .cells
                 .get(at)
-                .map_or_else(SkinSensors::default, |felt| self.words_at(felt, self.time_of(epoch))),
+                .map_or_else(SkinSensors::default, |touched| self.words_at(touched, self.time_of(epoch))),
             Err(_) => SkinSensors::default(),
         }
     }
@@ -148,8 +149,8 @@ impl Touches {
     }
 
     /// Before and now, from the scratch; `None` when no touch of this cell changed.
-    fn words_of_levels(&self, felt: &Felt) -> Option<[SkinSensors; 2]> {
-        let levels = || felt.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
+    fn words_of_levels(&self, touched: &Touched) -> Option<[SkinSensors; 2]> {
+        let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
         }
@@ -159,17 +160,17 @@ impl Touches {
     }
 
     /// What a cell says at a time, with its faults.
-    fn words_at(&self, felt: &Felt, time: Micros) -> SkinSensors {
-        let faults = || felt.faults.iter().filter(|wrong| wrong.holds_at(time));
+    fn words_at(&self, touched: &Touched, time: Micros) -> SkinSensors {
+        let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
         // A stuck sensor says what it felt when it got stuck.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
-        let drift = felt.faults.iter().map(|wrong| match wrong.fault {
+        let drift = touched.faults.iter().map(|wrong| match wrong.fault {
             SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.since(wrong.at)),
             SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
         });
         let levels =
-            felt.touches.iter().filter_map(|&index| Some((index, self.touches.get(index)?.level(time))));
+            touched.touches.iter().filter_map(|&index| Some((index, self.touches.get(index)?.level(time))));
         self.words(levels, drift.sum())
     }
 
@@ -213,7 +214,7 @@ impl Touch {
 }
 
 /// The greatest force that three contact words can say together, in N.
-pub(super) const GREATEST_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
+pub(super) const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
 
 /// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
 /// rounded to a word's step. Beyond what three words can say they saturate.

@@ -5,7 +5,7 @@ use serde::ser::{Serialize, SerializeStruct, Serializer};
 
 use super::held::word_to_nm;
 use super::replies::Expected;
-use super::trunk;
+use super::root_totals;
 
 /// Epochs over which errors of sums are averaged.
 const AVERAGED: u32 = 32;
@@ -153,7 +153,7 @@ pub(super) struct SumError {
 
 impl SumError {
     /// Compares the sum of a complete epoch, in steps of Q7.8.
-    pub(super) fn take(&mut self, words: &[i32; WORDS], saturated: bool, expected: &trunk::Expected) {
+    pub(super) fn take(&mut self, words: &[i32; WORDS], saturated: bool, expected: &root_totals::Expected) {
         if !expected.constant {
             self.interrupt();
         }

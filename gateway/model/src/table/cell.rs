@@ -3,16 +3,16 @@
 use protocol::id::CellId;
 use protocol::message::{Answer, From, Heard, Heartbeat, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::{Cuts, Events, Parameter, Parameters};
+use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
 use super::held::{Change, Held};
 use super::replies::{Owed, Replies};
+use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::switched::{SWITCHES, Switch, Switched};
-use super::trunk::RootSums;
-use crate::tracker::{Contact, News, Pages, Tracked, Uplink, Word};
+use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
 /// How a cell is.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
@@ -175,9 +175,9 @@ impl Cell {
     }
 
     /// Takes its heartbeat, which was taken for this.
-    pub(super) fn take_heartbeat(&mut self, news: &News, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
+    pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
         // Of a claimant: it is not this number's cell, and may never be.
-        let Some(word) = news.word.filter(|word| *word != Word::Claimant) else { return Change::default() };
+        let Some(word) = update.word.filter(|word| *word != Word::Claimant) else { return Change::default() };
         let started = matches!(word, Word::Started { .. } | Word::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != Word::Overtaken {
@@ -187,7 +187,7 @@ impl Cell {
                 self.halt.halted = heartbeat.state.has(State::HALTED);
             }
         }
-        if news.returned {
+        if update.returned {
             self.contact.reset();
         }
         if word == Word::First && self.tracked.claim().previous().is_some() {
@@ -208,7 +208,7 @@ impl Cell {
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
             return Change::default();
         }
-        self.let_go()
+        self.released()
     }
 
     /// What it has said since it was asked.
@@ -241,8 +241,8 @@ impl Cell {
         let Answer::Value { number, written: true, words } = *answer else { return };
         if number == Parameter::Reply.number() {
             self.reply = Some(words);
-        } else if number == Parameter::Cuts.number() {
-            self.deaf = Cuts::from_words(words).deaf;
+        } else if number == Parameter::LinksDown.number() {
+            self.deaf = LinksDown::from_words(words).deaf;
         }
     }
 
@@ -253,7 +253,7 @@ impl Cell {
     }
 
     /// What it feels; `None` where only the cell knows, because it measures or nobody knows whether it is on the bus.
-    pub(super) fn feeling(&self) -> Option<SkinSensors> {
+    pub(super) fn contact_state(&self) -> Option<SkinSensors> {
         let obeys = self.tracked.claim().says(State::TEST_MODE) && !self.tracked.account.is_interrupted();
         self.contact.skin().filter(|_| obeys).map(|(skin, ())| *skin)
     }
@@ -261,7 +261,7 @@ impl Cell {
     /// What the cell feels from the joints of this epoch on; `None` where only the cell knows.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         self.contact.latch(epoch, |()| {});
-        self.feeling()
+        self.contact_state()
     }
 
     /// A new broadcast: what was not answered in three epochs is missing, and what is held grows old.
@@ -282,8 +282,8 @@ impl Cell {
             return (Change::default(), 0);
         }
         let answered = self.answered.unwrap_or(number);
-        let missed = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
-        (self.held.grow_old(missed, safety, self.sums.is_some()), missed)
+        let unanswered = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
+        (self.held.grow_old(unanswered, safety, self.sums.is_some()), unanswered)
     }
 
     /// The last broadcast came again: the cell hears and drops it, and owes nothing for it.
@@ -298,7 +298,7 @@ impl Cell {
 
     /// Whether it is in contact, as it says itself where nobody else knows.
     fn feels_something(&self) -> bool {
-        self.owed.is_due() || self.feeling().is_none() && self.tracked.claim().says(State::ACTIVE)
+        self.owed.is_due() || self.contact_state().is_none() && self.tracked.claim().says(State::ACTIVE)
     }
 
     /// A torque answers the broadcast `number`, `lag` before the newest. Returns whether it was due.
@@ -340,14 +340,14 @@ impl Cell {
     }
 
     /// Lets go of a held torque.
-    pub(super) fn let_go(&mut self) -> Change {
-        self.held.let_go()
+    pub(super) fn released(&mut self) -> Change {
+        self.held.released()
     }
 
     /// The bus carried a halt: it stops answering.
     pub(super) fn halt(&mut self) -> Change {
         self.halt = Halt { halted: true, commanded: true };
-        self.let_go()
+        self.released()
     }
 
     /// The bus carried a resume: it answers the next broadcast.
@@ -434,8 +434,8 @@ mod tests {
             let heartbeat = Heartbeat { sent, state, ..Heartbeat::default() };
             let page = NetworkPage::Heartbeat(heartbeat);
             let message = Message::Network { from: Node::Cell(cell.node), epoch: Epoch(0), page };
-            let news = cell.tracked.hear(Micros(0), &message, None);
-            cell.take_heartbeat(&news, &heartbeat, Epoch(0));
+            let update = cell.tracked.hear(Micros(0), &message, None);
+            cell.take_heartbeat(&update, &heartbeat, Epoch(0));
         };
         says(&mut cell, 1, State::CONFIGURED);
         assert!(cell.is_ready());

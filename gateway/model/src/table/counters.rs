@@ -19,7 +19,7 @@ pub enum Event {
     /// The driver's report of an error on the bus.
     ErrorFrame,
     /// From a node that the skin does not have, or of a kind that this bus does not use.
-    Stranger,
+    UnknownNode,
     /// A torque of an epoch that has passed.
     StaleTorque,
     /// A second torque of one cell for one epoch.
@@ -29,7 +29,7 @@ pub enum Event {
     /// A cell heard another one under its number.
     Duplicate,
     /// Another gateway.
-    Rival,
+    OtherGateway,
 }
 
 impl Event {
@@ -41,12 +41,12 @@ impl Event {
         Self::Incomplete,
         Self::Foreign,
         Self::ErrorFrame,
-        Self::Stranger,
+        Self::UnknownNode,
         Self::StaleTorque,
         Self::RepeatedTorque,
         Self::Saturated,
         Self::Duplicate,
-        Self::Rival,
+        Self::OtherGateway,
     ];
 
     /// The name that tables and summaries use.
@@ -59,12 +59,12 @@ impl Event {
             Self::Incomplete => "incomplete pair",
             Self::Foreign => "foreign",
             Self::ErrorFrame => "error frame",
-            Self::Stranger => "unknown node",
+            Self::UnknownNode => "unknown node",
             Self::StaleTorque => "stale torque",
             Self::RepeatedTorque => "repeated torque",
             Self::Saturated => "saturated",
             Self::Duplicate => "duplicate number",
-            Self::Rival => "second gateway",
+            Self::OtherGateway => "second gateway",
         }
     }
 }

@@ -8,7 +8,7 @@ use protocol::time::Micros;
 use super::Table;
 use super::cell::Cell;
 use super::replies::Expected as Reply;
-use super::trunk::Expected;
+use super::root_totals::Expected;
 use crate::tracker::LATEST;
 
 /// The positions in rad that the words of a broadcast were rounded from.
@@ -69,7 +69,7 @@ impl Table {
             *newest = Some(epoch);
         }
         self.close_epoch();
-        self.let_go_of_what_is_over(epoch);
+        self.release_what_is_over(epoch);
         let frames = self.comparing.then(|| {
             let q = q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians));
             (self.central.frames(&joints.positions), self.unquantised.frames_at(&q))
@@ -81,10 +81,10 @@ impl Table {
             let skin = cell.latch(epoch);
             let force = skin.map_or(0.0, |skin| self.central.force(place, &skin));
             known &= skin.is_some() || !cell.is_ready();
-            let (change, missed) = cell.open_epoch(number, force > 0.0, &self.safety);
+            let (change, unanswered) = cell.open_epoch(number, force > 0.0, &self.safety);
             due += u32::from(cell.owed.is_due());
-            stale += if missed > 0 { cell.held_cells() } else { 0 };
-            age = age.max(if cell.contributes() { missed } else { 0 });
+            stale += if unanswered > 0 { cell.held_cells() } else { 0 };
+            age = age.max(if cell.contributes() { unanswered } else { 0 });
             if let (Some((frames, exact)), Some(whole), Some(skin)) = (&frames, &mut whole, skin) {
                 if cell.sums.is_none() {
                     let quantised = self.central.torque(place, frames, force);
@@ -94,14 +94,14 @@ impl Table {
                 } else if cell.owed.is_due() {
                     whole.add(self.central.torque(place, frames, force), cell.joint);
                 }
-                if let Some(felt) = self.snapshot.felt.get_mut(place) {
-                    whole.constant &= core::mem::replace(felt, skin) == skin;
+                if let Some(reference_torque) = self.snapshot.reference_torque.get_mut(place) {
+                    whole.constant &= core::mem::replace(reference_torque, skin) == skin;
                 }
             }
             self.apply(change);
         }
-        if let Some(trunk) = &mut self.trunk {
-            trunk.open(due, known, whole);
+        if let Some(root_totals) = &mut self.root_totals {
+            root_totals.open(due, known, whole);
         }
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
@@ -116,8 +116,8 @@ impl Table {
             // The histogram grows by itself; it cannot refuse.
             let _ = self.last_reply.record(last.since(before.at).0);
         }
-        if let Some(trunk) = &mut self.trunk {
-            let (due, complete) = trunk.close();
+        if let Some(root_totals) = &mut self.root_totals {
+            let (due, complete) = root_totals.close();
             return self.counters.epoch(due, complete);
         }
         self.counters.epoch(before.due > 0, before.in_time == before.due);
@@ -127,13 +127,13 @@ impl Table {
     }
 
     /// What the loop has let go while the bus carried no joints does not come back with the next ones that it carries.
-    fn let_go_of_what_is_over(&mut self, epoch: Epoch) {
+    fn release_what_is_over(&mut self, epoch: Epoch) {
         // Broadcasts may change places on the way back: the newest is not always the last that came.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
         let gap = recent.map(|before| epoch.since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
-            self.each_cell(Cell::let_go);
+            self.each_cell(Cell::released);
         }
     }
 }

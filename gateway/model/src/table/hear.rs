@@ -8,9 +8,9 @@ use protocol::time::Micros;
 
 use super::cell::Cell;
 use super::held::Change;
-use super::trunk::{Sum, Taken, Trunk};
+use super::root_totals::{RootTotals, Sum, Taken};
 use super::{Event, Notice, Positions, Table};
-use crate::tracker::{News, Word};
+use crate::tracker::{Update, Word};
 
 impl Table {
     /// A frame of this gateway's, as it stood on the bus.
@@ -33,9 +33,9 @@ impl Table {
         // What the gateway's side sends may also come from somebody at a shell.
         match *message {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
-                self.counters.count(Event::Rival);
-                self.snapshot.sums.rivals += 1;
-                self.notices.push_back(Notice::Rival);
+                self.counters.count(Event::OtherGateway);
+                self.snapshot.sums.other_gateways += 1;
+                self.notices.push_back(Notice::OtherGateway);
             }
             Message::Halt => {
                 self.snapshot.sums.halts += 1;
@@ -64,24 +64,24 @@ impl Table {
 
     fn hear_cell(&mut self, at: Micros, id: Id, message: &Message) {
         let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
-            self.counters.count(Event::Stranger);
+            self.counters.count(Event::UnknownNode);
             if let Message::Network {
                 from: Node::Cell(node), page: NetworkPage::Heartbeat(heartbeat), ..
             } = *message
             {
-                self.strangers.insert(node, heartbeat);
+                self.unknown_nodes.insert(node, heartbeat);
             }
             return;
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let news = cell.tracked.hear(at, message, self.broadcast.map(|broadcast| broadcast.number));
-        if news.revived {
+        let update = cell.tracked.hear(at, message, self.broadcast.map(|broadcast| broadcast.number));
+        if update.revived {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
         if let Message::Network { epoch, page, .. } = *message {
             match page {
-                NetworkPage::Heartbeat(heartbeat) => self.take_heartbeat(place, &news, &heartbeat, epoch),
+                NetworkPage::Heartbeat(heartbeat) => self.take_heartbeat(place, &update, &heartbeat, epoch),
                 NetworkPage::Heard(_) => {
                     cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
                 }
@@ -99,25 +99,25 @@ impl Table {
         }
     }
 
-    fn take_heartbeat(&mut self, place: usize, news: &News, heartbeat: &Heartbeat, epoch: Epoch) {
+    fn take_heartbeat(&mut self, place: usize, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) {
         let Some(cell) = self.cells.get_mut(place) else { return };
         if heartbeat.state.has(State::DUPLICATE) {
             self.counters.count(Event::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
         }
-        if matches!(news.word, Some(Word::Started { again: true } | Word::Shared)) {
+        if matches!(update.word, Some(Word::Started { again: true } | Word::Shared)) {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
-        if news.returned {
+        if update.returned {
             self.notices.push_back(Notice::Returned(cell.node));
         }
-        let released = cell.take_heartbeat(news, heartbeat, epoch);
+        let released = cell.take_heartbeat(update, heartbeat, epoch);
         self.apply(released);
     }
 
     fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
-        if self.trunk.is_some() {
-            return self.counters.count(Event::Stranger);
+        if self.root_totals.is_some() {
+            return self.counters.count(Event::UnknownNode);
         }
         let Some(broadcast) = &mut self.broadcast else {
             return self.counters.count(Event::StaleTorque);
@@ -156,12 +156,12 @@ impl Table {
     }
 
     fn take_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
-        let (Some(trunk), Some(cell)) = (&mut self.trunk, self.cells.get_mut(place)) else {
-            return self.counters.count(Event::Stranger);
+        let (Some(root_totals), Some(cell)) = (&mut self.root_totals, self.cells.get_mut(place)) else {
+            return self.counters.count(Event::UnknownNode);
         };
-        trunk.counts.received += 1;
+        root_totals.counts.received += 1;
         let Some(sums) = cell.sums.as_mut().filter(|sums| sums.feeds) else {
-            trunk.counts.overheard += 1;
+            root_totals.counts.overheard += 1;
             return;
         };
         let found = self.broadcast.as_mut().and_then(|broadcast| {
@@ -169,10 +169,10 @@ impl Table {
             Some((lag, sums.said.get_mut(lag)?, broadcast))
         });
         let Some((lag, said, broadcast)) = found else {
-            trunk.counts.stale += 1;
+            root_totals.counts.stale += 1;
             return;
         };
-        if trunk.take(lag, said, sum) == Taken::Resent {
+        if root_totals.take(lag, said, sum) == Taken::Resent {
             return;
         }
         if lag == 0 {
@@ -185,14 +185,14 @@ impl Table {
         // Q7.8 in steps of Q3.12, of which the running sum is made.
         let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
         self.apply(change);
-        self.let_go_of_what_moved(number);
+        self.release_what_moved(number);
     }
 
     /// Cells whose root fell silent find another one: then they are in its sum and not in what was held.
-    fn let_go_of_what_moved(&mut self, number: u64) {
-        let Some(due) = self.trunk.as_ref().and_then(Trunk::due) else { return };
+    fn release_what_moved(&mut self, number: u64) {
+        let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
         if self.snapshot.sums.contributing > due {
-            self.each_cell(|cell| if cell.is_behind(number) { cell.let_go() } else { Change::default() });
+            self.each_cell(|cell| if cell.is_behind(number) { cell.released() } else { Change::default() });
         }
     }
 }

@@ -36,16 +36,16 @@ impl Held {
     }
 
     /// Lets go of it.
-    pub(super) fn let_go(&mut self) -> Change {
+    pub(super) fn released(&mut self) -> Change {
         self.torque = None;
         self.contribute([0; WORDS], 0)
     }
 
     /// What is held has missed so many epochs, and grows old.
-    pub(super) fn grow_old(&mut self, missed: u32, safety: &Safety, is_sum: bool) -> Change {
+    pub(super) fn grow_old(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
         let Some((held, cells)) = self.torque else { return Change::default() };
-        let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(missed);
-        if left == 0 && missed > 0 {
+        let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
+        if left == 0 && unanswered > 0 {
             // Nothing of it counts any more; yet the cell has not said that its contact is over.
             return self.contribute([0; WORDS], 0);
         }

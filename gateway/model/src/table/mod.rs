@@ -16,9 +16,9 @@ mod epoch;
 mod hear;
 mod held;
 mod replies;
+mod root_totals;
 mod sensed;
 mod switched;
-mod trunk;
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -26,7 +26,7 @@ use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Heartbeat, Message, SkinSensors};
-use protocol::packet::{self, Epoch, Half, Packet, PacketError, Paired, WORDS};
+use protocol::packet::{self, Epoch, Packet, PacketError, Reassembly, Segment, WORDS};
 use protocol::parameters::{Events, Sensing};
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::Micros;
@@ -37,17 +37,17 @@ use crate::quantiles::histogram;
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
+use root_totals::RootTotals;
 use switched::Switched;
-use trunk::Trunk;
 
 pub use accuracy::{Accuracy, Errors};
 pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
 pub use epoch::Positions;
 pub use replies::Replies;
+pub use root_totals::{Contributions, SumCounts};
 pub use sensed::Sensed;
 pub use switched::{SWITCHES, Switch};
-pub use trunk::{Contributions, SumCounts};
 
 pub use crate::tracker::Uplink;
 
@@ -71,7 +71,7 @@ pub struct Sums {
     /// Resumes heard that this gateway did not send.
     pub resumes: u32,
     /// Frames of another gateway.
-    pub rivals: u32,
+    pub other_gateways: u32,
 }
 
 /// What a receiver leaves for the loop: the sums, and what a central computation beside them needs.
@@ -80,15 +80,15 @@ pub struct Snapshot {
     /// What a tick needs.
     pub sums: Sums,
     /// What each cell feels, in the order of the bus' cells; only kept up to date while comparing.
-    pub felt: Vec<SkinSensors>,
+    pub reference_torque: Vec<SkinSensors>,
 }
 
 impl Snapshot {
-    /// Takes over another one without allocating; what cells feel only if `felt`.
-    pub fn take(&mut self, other: &Self, felt: bool) {
+    /// Takes over another one without allocating; what cells feel only if `reference_torque`.
+    pub fn take(&mut self, other: &Self, reference_torque: bool) {
         self.sums = other.sums;
-        if felt {
-            self.felt.clone_from(&other.felt);
+        if reference_torque {
+            self.reference_torque.clone_from(&other.reference_torque);
         }
     }
 }
@@ -107,7 +107,7 @@ pub enum Notice {
     /// A cell is heard for the first time since its bus was lost: nobody knows what it has not heard.
     Returned(CellId),
     /// Another gateway speaks on this bus.
-    Rival,
+    OtherGateway,
 }
 
 /// All that is known of one bus.
@@ -122,12 +122,12 @@ pub struct Table {
     cells: Vec<Cell>,
     /// Where a node stands in `cells`.
     places: [Option<usize>; CellId::COUNT],
-    halves: Vec<Half>,
+    segments: Vec<Segment>,
     broadcast: Option<Broadcast>,
     /// Sums along the tree, where cells answer with them.
-    trunk: Option<Trunk>,
+    root_totals: Option<RootTotals>,
     /// Nodes that the skin does not have, each with its last heartbeat.
-    strangers: BTreeMap<CellId, Heartbeat>,
+    unknown_nodes: BTreeMap<CellId, Heartbeat>,
     /// The bus was lost since the last broadcast.
     interrupted: bool,
     /// Twice, four times ... a torque is a whole number of these, so that the sum never drifts.
@@ -155,7 +155,8 @@ impl Table {
             let switched = Switched::new(skin.events, sensing);
             cells.push(Cell::new(described, &part.parameters(described), summed, switched));
         }
-        let snapshot = Snapshot { sums: Sums::default(), felt: vec![SkinSensors::default(); cells.len()] };
+        let snapshot =
+            Snapshot { sums: Sums::default(), reference_torque: vec![SkinSensors::default(); cells.len()] };
         Self {
             format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
             safety: skin.safety,
@@ -165,10 +166,10 @@ impl Table {
             comparing: false,
             cells,
             places,
-            halves: vec![Half::NONE; 1 << 11],
+            segments: vec![Segment::NONE; 1 << 11],
             broadcast: None,
-            trunk: summed.then(Trunk::default),
-            strangers: BTreeMap::new(),
+            root_totals: summed.then(RootTotals::default),
+            unknown_nodes: BTreeMap::new(),
             interrupted: false,
             sum: [0; WORDS],
             snapshot,
@@ -191,7 +192,7 @@ impl Table {
         let Some(sums) = &mut cell.sums else { return };
         sums.feeds = feeds;
         if !feeds {
-            let change = cell.let_go();
+            let change = cell.released();
             self.apply(change);
         }
     }
@@ -228,8 +229,8 @@ impl Table {
     /// Distributed against central torques.
     #[must_use]
     pub fn accuracy(&self) -> Accuracy {
-        let Some(trunk) = &self.trunk else { return self.accuracy };
-        let error = &trunk.error;
+        let Some(root_totals) = &self.root_totals else { return self.accuracy };
+        let error = &root_totals.error;
         Accuracy {
             sums: error.each,
             sums_averaged: error.averaged,
@@ -241,7 +242,7 @@ impl Table {
     /// What became of sums, and of the cells that were to be in them; `None` where cells answer themselves.
     #[must_use]
     pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
-        self.trunk.as_ref().map(|trunk| (trunk.counts, trunk.contributions))
+        self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
     /// How often parents of cells changed, by the cells' own count.
@@ -251,8 +252,8 @@ impl Table {
     }
 
     /// Nodes that speak and that the skin does not have, each with its last heartbeat.
-    pub fn strangers(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
-        self.strangers.iter().map(|(node, heartbeat)| (*node, heartbeat))
+    pub fn unknown_nodes(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
+        self.unknown_nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
 
     /// From a broadcast to its last reply in time, in µs, for each epoch with a reply.
@@ -305,14 +306,14 @@ impl Table {
             return Err(Event::Length);
         }
         let is_used = self.is_used(id);
-        let half = self.halves.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
-        let waited = half.is_waiting();
-        match half.push(at, id, frame.data()).map_err(event)? {
-            Paired::Whole(packet) => Ok(Some(packet)),
+        let segment = self.segments.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
+        let waited = segment.is_waiting();
+        match segment.push(at, id, frame.data()).map_err(event)? {
+            Reassembly::Complete(packet) => Ok(Some(packet)),
             // Foreign frames are counted each, and not as packets that have lost a half.
-            Paired::Waiting | Paired::Incomplete if waited && !is_used => Err(Event::Foreign),
-            Paired::Waiting => Ok(None),
-            Paired::Incomplete => Err(Event::Incomplete),
+            Reassembly::Waiting | Reassembly::Incomplete if waited && !is_used => Err(Event::Foreign),
+            Reassembly::Waiting => Ok(None),
+            Reassembly::Incomplete => Err(Event::Incomplete),
         }
     }
 
@@ -352,8 +353,8 @@ impl Table {
         if let Some(broadcast) = &mut self.broadcast {
             broadcast.begin_accounts();
         }
-        if let Some(trunk) = &mut self.trunk {
-            *trunk = Trunk::default();
+        if let Some(root_totals) = &mut self.root_totals {
+            *root_totals = RootTotals::default();
         }
         (self.counters, self.accuracy) = (Counters::default(), Accuracy::default());
         self.last_reply.reset();
@@ -373,7 +374,7 @@ impl Table {
             if cell.tracked.falls_silent(now) {
                 self.snapshot.sums.dead += 1;
                 self.notices.push_back(Notice::Dead(cell.node));
-                let change = cell.let_go();
+                let change = cell.released();
                 self.apply(change);
             }
         }
@@ -383,8 +384,8 @@ impl Table {
     pub fn finish(&mut self) {
         self.close_epoch();
         self.broadcast = None;
-        if let Some(trunk) = &mut self.trunk {
-            trunk.finish();
+        if let Some(root_totals) = &mut self.root_totals {
+            root_totals.finish();
         }
         for cell in &mut self.cells {
             cell.settle();
@@ -422,7 +423,7 @@ impl Table {
             tree: cell.pages().tree,
             ports: cell.pages().ports,
         });
-        let strangers = self.strangers().map(|(node, heartbeat)| Seen {
+        let unknown_nodes = self.unknown_nodes().map(|(node, heartbeat)| Seen {
             node,
             serial: None,
             configuration: heartbeat.configuration,
@@ -431,7 +432,7 @@ impl Table {
             tree: None,
             ports: None,
         });
-        described.chain(strangers)
+        described.chain(unknown_nodes)
     }
 
     /// The joints that cells are answering: their number, their epoch, and when they stood on the bus.
@@ -441,8 +442,8 @@ impl Table {
     }
 
     /// What each cell has felt since those joints, as far as anybody knows, and its status now.
-    pub fn felt(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
-        self.statuses(now).map(|(cell, status)| (cell.feeling(), status))
+    pub fn reference_torque(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
+        self.statuses(now).map(|(cell, status)| (cell.contact_state(), status))
     }
 
     /// The cells' statuses now.

@@ -59,9 +59,9 @@ impl Owed {
     /// A new broadcast, to be answered if `due`; whether the oldest one was not answered and no longer can be.
     pub(super) fn open(&mut self, due: bool) -> bool {
         let oldest = 1 << LATEST;
-        let missed = self.due & oldest != 0;
+        let unanswered = self.due & oldest != 0;
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
-        missed
+        unanswered
     }
 
     /// A new broadcast, of which the only thing that counts is whether it is to be answered.

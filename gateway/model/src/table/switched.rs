@@ -16,16 +16,16 @@ pub const SWITCHES: usize = 2;
 /// The switches of one cell, in the order in which they are written: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Switched {
-    wanted: [Switch; SWITCHES],
+    target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
 }
 
 impl Switched {
     /// A cell that has just started, and shall be as a skin says.
     pub(super) fn new(events: Events, sensing: Sensing) -> Self {
-        let wanted =
+        let target =
             [(Parameter::Events.number(), events.words()), (Parameter::Sensing.number(), sensing.words())];
-        let mut switched = Self { wanted, confirmed: [false; SWITCHES] };
+        let mut switched = Self { target, confirmed: [false; SWITCHES] };
         switched.restart();
         switched
     }
@@ -33,8 +33,8 @@ impl Switched {
     /// The cell started anew: it is as every cell is at its start.
     pub(super) fn restart(&mut self) {
         let start = [Events::default().words(), Sensing::default().words()];
-        for ((confirmed, (_, wanted)), start) in self.confirmed.iter_mut().zip(self.wanted).zip(start) {
-            *confirmed = wanted == start;
+        for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
+            *confirmed = target == start;
         }
     }
 
@@ -45,16 +45,16 @@ impl Switched {
             Answer::Refused { number, reason: Answer::UNKNOWN } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
-        for ((number, wanted), confirmed) in self.wanted.iter_mut().zip(&mut self.confirmed) {
+        for ((number, target), confirmed) in self.target.iter_mut().zip(&mut self.confirmed) {
             if *number == of {
-                (*wanted, *confirmed) = (words.unwrap_or(*wanted), true);
+                (*target, *confirmed) = (words.unwrap_or(*target), true);
             }
         }
     }
 
     /// What it is to be told.
     pub(super) fn lacks(&self) -> [Option<Switch>; SWITCHES] {
-        let mut lacks = self.wanted.map(Some);
+        let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {
             *lacks = lacks.filter(|_| !confirmed);
         }

@@ -156,7 +156,7 @@ fn a_claim_of_a_number_that_is_taken_changes_nothing_of_its_cell() {
         let uplink = cell.uplink();
         (
             cell.heartbeat(),
-            cell.feeling(),
+            cell.contact_state(),
             cell.replies,
             cell.is_ready(),
             uplink.sent,

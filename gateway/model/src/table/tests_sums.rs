@@ -135,7 +135,7 @@ fn who_was_due_and_came_in_time_late_or_not_adds_up() {
 }
 
 #[test]
-fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_lets_go_of_it() {
+fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it() {
     let mut bench = Bench::new(&[3, 4]);
     let Safety { hold_epochs, decay_epochs, .. } = skin().safety;
     bench.joints(0);
@@ -162,7 +162,7 @@ fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_lets_go_of_i
 }
 
 #[test]
-fn a_root_that_starts_anew_does_not_take_its_childrens_torque_with_it() {
+fn a_root_that_restarts_does_not_take_its_childrens_torque_with_it() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 64);
@@ -214,7 +214,7 @@ fn a_root_below_another_cell_is_in_that_ones_sum() {
 }
 
 #[test]
-fn a_halt_lets_go_of_sums_and_nobody_is_due() {
+fn a_halt_releases_sums_and_nobody_is_due() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 64);

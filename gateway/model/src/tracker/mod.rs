@@ -59,7 +59,7 @@ impl Pages {
 
 /// What a packet of a cell tells beside what it says.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct News {
+pub struct Update {
     /// What its heartbeat is, if it is one.
     pub word: Option<Word>,
     /// The cell was thought dead.
@@ -81,17 +81,17 @@ pub struct Tracked {
 
 impl Tracked {
     /// Takes a packet that came at `at`; `joints` is the number of the newest joints.
-    pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> News {
+    pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
         let is_first = self.last_word.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
         self.account.arrive();
-        let Message::Network { page, .. } = message else { return News { revived, ..News::default() } };
+        let Message::Network { page, .. } = message else { return Update { revived, ..Update::default() } };
         let NetworkPage::Heartbeat(heartbeat) = page else {
             self.pages.take(page);
             if let NetworkPage::Tree(tree) = page {
                 self.account.sums_sent(tree.sent, joints);
             }
-            return News { revived, ..News::default() };
+            return Update { revived, ..Update::default() };
         };
         let away = self.account.is_interrupted();
         let mut word = self.claim.hear(heartbeat);
@@ -110,7 +110,7 @@ impl Tracked {
         }
         self.account.heartbeat_at(joints);
         let returned = away && matches!(word, Word::First | Word::Known | Word::Started { again: false });
-        News { word: Some(word), revived, returned }
+        Update { word: Some(word), revived, returned }
     }
 
     /// Who has the node id, and what its last heartbeat said.

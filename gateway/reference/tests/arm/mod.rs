@@ -24,8 +24,8 @@ impl Dice {
         f64::from(u32::try_from(self.0 >> 32).unwrap()) / f64::from(1_u32 << 31) - 1.0
     }
 
-    fn within(&mut self, greatest: f64) -> Q1_14 {
-        Q1_14::nearest(self.real() * greatest)
+    fn within(&mut self, max: f64) -> Q1_14 {
+        Q1_14::nearest(self.real() * max)
     }
 }
 
@@ -63,15 +63,15 @@ impl Case {
     }
 
     /// The words of sensors page 0.
-    pub(crate) fn felt(&self) -> [i16; WORDS] {
+    pub(crate) fn contact_state(&self) -> [i16; WORDS] {
         packet::words(self.contact.map(Q::to_bits))
     }
 
     /// J and the torques, as the cell computes them.
     pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [Q3_12; MAX_JOINTS]) {
-        let felt = SkinSensors { contact: self.contact, ..SkinSensors::default() };
+        let contact_state = SkinSensors { contact: self.contact, ..SkinSensors::default() };
         let cell = Reference::new(&self.parameters);
-        (cell.jacobian(&self.q), cell.torque(&self.q, &felt))
+        (cell.jacobian(&self.q), cell.torque(&self.q, &contact_state))
     }
 
     /// The torques in Nm: what a force against the normal does about each axis below the cell.

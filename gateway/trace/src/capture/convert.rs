@@ -79,7 +79,7 @@ pub struct Converted {
     /// Frames whose line says less than the capture.
     pub shortened: u64,
     /// Notes that are not in the output.
-    pub left_out: u64,
+    pub omitted: u64,
     /// How often a frame is older than the one before it, and the first of them, counted from 1.
     pub backwards: Option<(u64, u64)>,
 }
@@ -135,7 +135,7 @@ pub fn convert<W: Write>(
             Wrote::Less => done.shortened += 1,
             Wrote::Nothing => {
                 done.notes -= 1;
-                done.left_out += 1;
+                done.omitted += 1;
             }
         }
         if from.is_drained() {

@@ -11,7 +11,7 @@ pub struct Extras {
     /// Topics that are no frames and no notes, in the order in which they came.
     pub topics: Vec<Topic>,
     /// Frames of before, that are in force when the recording begins.
-    pub in_force: Vec<InForce>,
+    pub latched: Vec<Latched>,
     /// Attachments by name; the largest without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
     /// Metadata by name.
@@ -27,7 +27,7 @@ impl Extras {
     /// Nothing.
     pub(super) const NONE: &Self = &Self {
         topics: Vec::new(),
-        in_force: Vec::new(),
+        latched: Vec::new(),
         attachments: Vec::new(),
         metadata: Vec::new(),
         unfinished: None,
@@ -53,7 +53,7 @@ impl Extras {
 
 /// A frame that was on a bus before a recording began, and still says what holds.
 #[derive(Clone, Debug, PartialEq)]
-pub struct InForce {
+pub struct Latched {
     /// Its bus.
     pub bus: String,
     /// Whether whoever recorded it had sent it.

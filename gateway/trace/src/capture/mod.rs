@@ -17,7 +17,7 @@ mod mcap;
 mod parts;
 mod reader;
 
-pub use extras::{Extras, InForce, SKIN, Topic};
+pub use extras::{Extras, Latched, SKIN, Topic};
 pub use mcap::ORIGIN;
 pub use parts::{Part, PartsError};
 pub use reader::{CaptureError, Format, Reader};

@@ -40,14 +40,14 @@ pub enum CaptureError {
     #[error(transparent)]
     Parts(#[from] PartsError),
     /// Its first bytes say that it is something else.
-    #[error("{name} is {what}, and no candump log or MCAP recording: {remedy}")]
+    #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
     Other {
         /// Its name.
         name: String,
         /// What it is.
         what: &'static str,
         /// What to do.
-        remedy: &'static str,
+        hint: &'static str,
     },
     /// From here on it is not what it was.
     #[error("{name} is damaged: {what}; {entries} frames and notes before that were read")]
@@ -105,7 +105,7 @@ impl Source {
         match magic::look(&mut input) {
             Ok((Kind::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
             Ok((Kind::Mcap, head)) => Ok(Self::Mcap(Box::new(McapReader::new(&head, input, state)))),
-            Ok((Kind::Other(what, remedy), _)) => Err(CaptureError::Other { name, what, remedy }),
+            Ok((Kind::Other(what, hint), _)) => Err(CaptureError::Other { name, what, hint }),
             Err(source) => Err(CaptureError::Io { name, source }),
         }
     }

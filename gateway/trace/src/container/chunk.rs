@@ -115,8 +115,8 @@ impl Chunk {
         }
         let mut rest = self.bytes.as_slice();
         while let Some(record) = split(rest) {
-            let (_, _, left) = record?;
-            rest = rest.get(rest.len() - left..).unwrap_or_default();
+            let (_, _, leftover) = record?;
+            rest = rest.get(rest.len() - leftover..).unwrap_or_default();
             self.total_records += 1;
         }
         let limit = FREE_RECORDS.saturating_add(read.saturating_mul(RECORDS_A_BYTE));
@@ -153,8 +153,8 @@ impl Chunk {
         while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
             let before = (packed.len(), self.bytes.len());
             let mut decoder = lz4::Decoder::new(packed).map_err(wrong)?;
-            let left = claimed - self.bytes.len() as u64;
-            (&mut decoder).take(left).read_to_end(&mut self.bytes).map_err(wrong)?;
+            let leftover = claimed - self.bytes.len() as u64;
+            (&mut decoder).take(leftover).read_to_end(&mut self.bytes).map_err(wrong)?;
             packed = decoder.finish().0;
             if before == (packed.len(), self.bytes.len()) {
                 break;
@@ -172,13 +172,13 @@ fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
     if records.is_empty() {
         return None;
     }
-    let left = records.len() as u64;
+    let leftover = records.len() as u64;
     let Some((&[opcode, ref length @ ..], rest)) = records.split_first_chunk::<HEAD>() else {
-        return Some(Err(Damage::Overrun { bytes: HEAD as u64, left }));
+        return Some(Err(Damage::Overrun { bytes: HEAD as u64, leftover }));
     };
     let bytes = u64::from_le_bytes(*length);
     let whole = usize::try_from(bytes).ok().and_then(|bytes| rest.split_at_checked(bytes));
-    let whole = whole.ok_or(Damage::Overrun { bytes, left: rest.len() as u64 });
+    let whole = whole.ok_or(Damage::Overrun { bytes, leftover: rest.len() as u64 });
     Some(whole.map(|(body, rest)| (opcode, body, rest.len())))
 }
 
@@ -228,8 +228,8 @@ mod tests {
     fn what_a_chunk_claims_is_compared_with_what_is_there() {
         let one = record(3, b"abc");
         let long = record(u64::MAX, b"abc");
-        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(Damage::Overrun { bytes: u64::MAX, left: 3 }));
-        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(Damage::Overrun { bytes: 9, left: 5 }));
+        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(Damage::Overrun { bytes: u64::MAX, leftover: 3 }));
+        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(Damage::Overrun { bytes: 9, leftover: 5 }));
         assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(Damage::Unpacked { claimed: 11, found: 12 }));
         let none = Damage::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: LONGEST };
         assert_eq!(unpacked(&chunk(u64::MAX, 0, "zstd", &one)), Err(none));

@@ -86,12 +86,12 @@ pub enum Damage {
         found: u64,
     },
     /// A record reaches beyond its chunk.
-    #[error("a record of {bytes} bytes in a chunk has {left} bytes left there")]
+    #[error("a record of {bytes} bytes in a chunk has {leftover} bytes left there")]
     Overrun {
         /// Its length.
         bytes: u64,
         /// What is left of the chunk.
-        left: u64,
+        leftover: u64,
     },
     /// Names of topics and types.
     #[error("the names of its topics and types are too long: at most {limit} bytes are read")]

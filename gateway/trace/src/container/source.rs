@@ -145,10 +145,10 @@ impl<R: Read> Source<R> {
 
     /// Reads so many bytes without keeping them; whether they were there.
     fn pass_over(&mut self, bytes: u64) -> io::Result<bool> {
-        let mut left = bytes;
+        let mut leftover = bytes;
         let mut piece = [0; 8 << 10];
-        while left > 0 {
-            let most = usize::try_from(left).map_or(piece.len(), |left| left.min(piece.len()));
+        while leftover > 0 {
+            let most = usize::try_from(leftover).map_or(piece.len(), |leftover| leftover.min(piece.len()));
             let room = piece.get_mut(..most).unwrap_or_default();
             let came = read_some(&mut self.input, room)?;
             let Some(came @ [_, ..]) = room.get(..came) else { return Ok(false) };
@@ -156,7 +156,7 @@ impl<R: Read> Source<R> {
                 checksum.update(came);
             }
             self.read += came.len() as u64;
-            left -= came.len() as u64;
+            leftover -= came.len() as u64;
         }
         Ok(true)
     }
@@ -176,7 +176,7 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
 ///
 /// # Errors
 /// When the input fails.
-pub fn find<R: Read + Seek>(input: &mut BufReader<R>, wanted: &[u8]) -> io::Result<Option<(u8, u64)>> {
+pub fn find<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Result<Option<(u8, u64)>> {
     loop {
         let mut head = [0; 9];
         match input.read_exact(&mut head) {
@@ -185,7 +185,7 @@ pub fn find<R: Read + Seek>(input: &mut BufReader<R>, wanted: &[u8]) -> io::Resu
         }
         let [opcode, length @ ..] = head;
         let length = u64::from_le_bytes(length);
-        if wanted.contains(&opcode) {
+        if target.contains(&opcode) {
             return Ok(Some((opcode, length)));
         }
         // A length that leads beyond everything.

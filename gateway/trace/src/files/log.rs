@@ -10,7 +10,7 @@ use rustix::fs::{Access, access};
 
 use super::target::{
     Target, folder_of, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
-    sync_folder, with_remedy,
+    sync_folder, with_hint,
 };
 
 /// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
@@ -45,11 +45,11 @@ impl LogFile {
             Ok(Target::New) => State::Ours(begin(path)?),
             Ok(Target::Old) => {
                 // A link that took its place meanwhile is not followed.
-                let old = open_unfollowed(path).map_err(with_remedy)?;
+                let old = open_unfollowed(path).map_err(with_hint)?;
                 hold_log(&old)?;
                 // That nothing can take its place is known before the first line.
                 let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
-                writes.map_err(|errno| with_remedy(errno.into()))?;
+                writes.map_err(|errno| with_hint(errno.into()))?;
                 State::Old(old)
             }
             Err(error) => {
@@ -160,7 +160,7 @@ impl Drop for LogFile {
 /// Makes a file that nobody else has, and holds it.
 fn begin(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().append(true).create_new(true).open(path);
-    let file = file.map_err(|error| or_exists(with_remedy(error)))?;
+    let file = file.map_err(|error| or_exists(with_hint(error)))?;
     hold_log(&file)?;
     Ok(file)
 }

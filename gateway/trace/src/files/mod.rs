@@ -13,7 +13,7 @@ use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
 use target::{Target, open_stream, or_exists, part_of, sync_folder};
-pub use target::{check, check_regular, folder_of, rename, suffixed, sync, with_remedy};
+pub use target::{check, check_regular, folder_of, rename, suffixed, sync, with_hint};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
@@ -48,14 +48,14 @@ impl WholeFile {
     pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
         let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
         if Target::of(path, force)? == Target::Stream {
-            let file = open_stream(path, stopped).map_err(with_remedy)?;
+            let file = open_stream(path, stopped).map_err(with_hint)?;
             return Ok((begun(None, false), file));
         }
         if let Ok(file) = nameless(folder_of(path), 0o666) {
             return Ok((begun(Some(file.try_clone()?), false), file));
         }
         let part = OpenOptions::new().write(true).create_new(true).open(part_of(path));
-        let file = part.map_err(with_remedy)?;
+        let file = part.map_err(with_hint)?;
         Ok((begun(Some(file.try_clone()?), true), file))
     }
 

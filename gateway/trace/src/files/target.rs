@@ -36,9 +36,9 @@ impl Target {
         let kind = match fs::symlink_metadata(path) {
             Ok(about) => about.file_type(),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return fs::metadata(folder_of(path)).map(|_| Self::New).map_err(with_remedy);
+                return fs::metadata(folder_of(path)).map(|_| Self::New).map_err(with_hint);
             }
-            Err(error) => return Err(with_remedy(error)),
+            Err(error) => return Err(with_hint(error)),
         };
         if kind.is_symlink() {
             let streams = fs::metadata(path).is_ok_and(|about| is_stream(about.file_type()));
@@ -51,7 +51,7 @@ impl Target {
         }
         match kind {
             _ if is_stream(kind) => Ok(Self::Stream),
-            _ if kind.is_dir() => Err(with_remedy(io::ErrorKind::IsADirectory.into())),
+            _ if kind.is_dir() => Err(with_hint(io::ErrorKind::IsADirectory.into())),
             _ if !kind.is_file() => Err(no_regular_file()),
             _ if force => Ok(Self::Old),
             _ => Err(exists()),
@@ -245,7 +245,7 @@ pub(super) fn sync_folder(path: &Path) {
 
 /// Why a file cannot be begun, and what to do when it is because of where it is to be.
 #[must_use]
-pub fn with_remedy(error: io::Error) -> io::Error {
+pub fn with_hint(error: io::Error) -> io::Error {
     let place = matches!(
         error.kind(),
         io::ErrorKind::NotFound

@@ -77,7 +77,7 @@ fn who_names_a_place_for_no_file_is_told_what_to_do() {
         let why = format!("{why}; name a file in a folder that can be written");
         assert_eq!(refusals(&path, false), [why.clone(), why]);
     }
-    let full = with_remedy(io::ErrorKind::StorageFull.into());
+    let full = with_hint(io::ErrorKind::StorageFull.into());
     assert_eq!(full.to_string(), "no storage space", "another folder may be as full");
 }
 

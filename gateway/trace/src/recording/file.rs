@@ -65,7 +65,7 @@ pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
 /// # Errors
 /// When it cannot be read.
 pub fn is_marked(file: &mut File) -> io::Result<bool> {
-    let wanted = identity(&file.metadata()?);
+    let target = identity(&file.metadata()?);
     file.rewind()?;
     let mut from = Source::new(file, 0);
     if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
@@ -77,7 +77,7 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
         return Ok(false);
     }
     let Ok(Record::Metadata { name, facts }) = parse(op::METADATA, from.body()) else { return Ok(false) };
-    Ok(name == MARK && wanted.iter().all(|(key, value)| facts.get(key) == Some(value)))
+    Ok(name == MARK && target.iter().all(|(key, value)| facts.get(key) == Some(value)))
 }
 
 /// What was written cannot go on.

@@ -18,7 +18,7 @@ use thiserror::Error;
 
 use super::file;
 use crate::files::{
-    folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_remedy,
+    folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_hint,
 };
 
 /// What a file is called in addition until it is whole.
@@ -85,7 +85,7 @@ impl Part {
             if error.kind() == io::ErrorKind::AlreadyExists {
                 return io::Error::new(io::ErrorKind::AlreadyExists, why_taken(&path));
             }
-            with_remedy(error)
+            with_hint(error)
         };
         let file = unnamed(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
         let is = identity(&file.metadata()?);
@@ -174,7 +174,7 @@ pub fn is_held(file: &File) -> bool {
 /// Why a `.part` in a recording's folder is not ours to touch.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum Left {
+pub enum Leftover {
     /// A link to something.
     #[error("it is a symlink")]
     Symlink,
@@ -206,7 +206,7 @@ pub enum Left {
     Unmarked,
 }
 
-impl Left {
+impl Leftover {
     /// Whether it may be a recording.
     #[must_use]
     pub const fn may_be_recording(&self) -> bool {
@@ -215,7 +215,7 @@ impl Left {
 }
 
 /// A file that a run left which was killed, held against others from now on; or why it is not.
-pub type Orphan = Result<File, Left>;
+pub type Orphan = Result<File, Leftover>;
 
 /// What of unfinished recordings is in a recording's folder.
 ///
@@ -241,29 +241,27 @@ fn look(path: &Path) -> Orphan {
     // Of what is no file not even an opening is harmless.
     let kind = fs::symlink_metadata(path)?.file_type();
     if kind.is_symlink() {
-        return Err(Left::Symlink);
+        return Err(Leftover::Symlink);
     }
     if !kind.is_file() {
-        return Err(Left::Irregular);
+        return Err(Leftover::Irregular);
     }
-    let mut file = open_unfollowed(path).map_err(Left::Unreadable)?;
+    let mut file = open_unfollowed(path).map_err(Leftover::Unreadable)?;
     let about = file.metadata()?;
     let (owner, me) = (about.uid(), rustix::process::geteuid().as_raw());
     if !about.is_file() {
-        return Err(Left::Irregular);
+        return Err(Leftover::Irregular);
     }
     if owner != me {
-        return Err(Left::Owner { owner, me });
+        return Err(Leftover::Owner { owner, me });
     }
     if about.nlink() != 1 {
-        return Err(Left::Linked(about.nlink()));
+        return Err(Leftover::Linked(about.nlink()));
     }
-    hold(&file).map_err(
-        |error| {
-            if error.kind() == io::ErrorKind::WouldBlock { Left::Held } else { error.into() }
-        },
-    )?;
-    if file::is_marked(&mut file).map_err(Left::Unreadable)? { Ok(file) } else { Err(Left::Unmarked) }
+    hold(&file).map_err(|error| {
+        if error.kind() == io::ErrorKind::WouldBlock { Leftover::Held } else { error.into() }
+    })?;
+    if file::is_marked(&mut file).map_err(Leftover::Unreadable)? { Ok(file) } else { Err(Leftover::Unmarked) }
 }
 
 /// Takes an orphan away, if its name is still its own.

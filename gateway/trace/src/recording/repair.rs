@@ -72,7 +72,7 @@ fn copy(
     from: &File,
     to: &Path,
     force: bool,
-    wanted: impl FnOnce(&Recovered) -> bool,
+    target: impl FnOnce(&Recovered) -> bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     as_private(from, &file).map_err(RecoverError::Write)?;
@@ -81,7 +81,7 @@ fn copy(
     // A pipe is where it is.
     let _ = from.rewind();
     let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
-    if !wanted(&recovered) {
+    if !target(&recovered) {
         return Ok((recovered, None));
     }
     let finish = || -> io::Result<u64> {
@@ -114,24 +114,24 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
         let held = match found {
             Ok(held) => held,
             Err(why) => {
-                let remedy = why.may_be_recording().then(|| {
+                let hint = why.may_be_recording().then(|| {
                     format!(
                         "; if it is a recording that broke off, `gateway recover {name} -o NAME` copies it"
                     )
                 });
-                say(&format!("{name} is left alone: {why}{}", remedy.unwrap_or_default()));
+                say(&format!("{name} is left alone: {why}{}", hint.unwrap_or_default()));
                 continue;
             }
         };
-        let left = "was left by a run that was killed";
+        let leftover = "was left by a run that was killed";
         match repair(&part, &held, || names::recovered(&names::goal_of(&part)), false) {
             Ok(Repaired { recovered, new: Some((path, _)) }) => {
-                say(&format!("{name} {left}; repaired, it is {}: {recovered}", path.display()));
+                say(&format!("{name} {leftover}; repaired, it is {}: {recovered}", path.display()));
             }
             Ok(Repaired { new: None, .. }) => {
-                say(&format!("{name} {left}; nothing was recorded in it, it is gone"));
+                say(&format!("{name} {leftover}; nothing was recorded in it, it is gone"));
             }
-            Err(error) => say(&format!("{name} {left} and cannot be repaired: {error}")),
+            Err(error) => say(&format!("{name} {leftover} and cannot be repaired: {error}")),
         }
     }
 }

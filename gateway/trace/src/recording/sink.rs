@@ -49,11 +49,11 @@ impl Gauge {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
         // Half of it is for the chunk on the way.
-        let wanted = RESERVE / 2 + chunks * RESERVE_FOR_CHUNK;
-        if wanted <= reserve.bytes {
+        let target = RESERVE / 2 + chunks * RESERVE_FOR_CHUNK;
+        if target <= reserve.bytes {
             return;
         }
-        let more = wanted.next_multiple_of(RESERVE);
+        let more = target.next_multiple_of(RESERVE);
         match fallocate(&reserve.file, FallocateFlags::empty(), 0, more) {
             Ok(()) => reserve.bytes = more,
             Err(_) => {

@@ -73,11 +73,11 @@ pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
         got: length.into(),
         allowed: "that of the data; 8 in a classic frame, 64 in an FD one",
     };
-    let asked = [0; 64];
+    let requested = [0; 64];
     let data = match id & REMOTE {
         0 if data.len() == usize::from(length) => data,
         0 => return Err(wrong),
-        _ => asked.get(..usize::from(length)).ok_or(wrong)?,
+        _ => requested.get(..usize::from(length)).ok_or(wrong)?,
     };
     let frame = Frame::with_data(id, format, flags, data).map_err(|_| wrong)?.with_raw_dlc(raw_dlc);
     Ok(Record { time, interface, frame, direction })

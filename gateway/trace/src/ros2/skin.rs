@@ -97,7 +97,7 @@ impl Encode for Torques<'_> {
 
 /// What a cell of a patch feels, and how it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Felt {
+pub struct ContactState {
     /// Its number on the bus.
     pub node: u16,
     /// The force in N that Algorithm 1 makes of its sensors; not a number while nobody knows.
@@ -118,7 +118,7 @@ pub struct PatchState<'a> {
     /// The joints' epoch.
     pub epoch: u8,
     /// Each cell.
-    pub cells: &'a [Felt],
+    pub cells: &'a [ContactState],
 }
 
 impl Message for PatchState<'_> {

@@ -16,7 +16,7 @@ use crate::bus::kinds::Carrier;
 use crate::bus::{Bus, BusError, Filter, Options};
 
 /// How long a client waits for a server: it answers at once unless it is stopped.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 /// Room for what the server has not read yet: some 700 FD frames, a whole skin's answers in one go.
 const SEND_BUFFER: usize = 1 << 18;
 
@@ -30,7 +30,7 @@ impl Carrier for Embedded {
             Errno::PIPE | Errno::CONNRESET => BusError::Closed(name.to_owned()),
             errno => failed(errno),
         };
-        let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: PATIENCE };
+        let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT };
         let socket = CanFdSocket::from(connect(name, options)?);
         socket.set_recv_timestamp(true).map_err(|source| BusError::refused(name, "set up", source))?;
         let hello = Hello {
@@ -41,7 +41,7 @@ impl Carrier for Embedded {
             buffer: options.receive_buffer as u64,
         };
         rustix::net::send(&socket, &hello.encode(), SendFlags::NOSIGNAL).map_err(gone)?;
-        let wait = Timespec::try_from(PATIENCE).unwrap_or_default();
+        let wait = Timespec::try_from(TIMEOUT).unwrap_or_default();
         let mut polled = [PollFd::new(&socket, PollFlags::IN)];
         if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).map_err(failed)? == 0 {
             return Err(no_answer());
@@ -91,12 +91,12 @@ fn connect(name: &str, options: &Options) -> Result<OwnedFd, BusError> {
     let address = address(&directory, name)?;
     let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
     // A connection waits while the server's list of new clients is full; the timeout bounds that.
-    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(PATIENCE)).map_err(failed)?;
+    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(TIMEOUT)).map_err(failed)?;
     sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
     match rustix::net::connect(&socket, &address) {
         Ok(()) => Ok(socket),
         Err(Errno::NOENT | Errno::CONNREFUSED) => Err(not_served()),
-        Err(Errno::AGAIN) => Err(BusError::NoAnswer { name: name.to_owned(), waited: PATIENCE }),
+        Err(Errno::AGAIN) => Err(BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT }),
         Err(errno) => Err(failed(errno)),
     }
 }

@@ -127,12 +127,12 @@ fn any_world() -> impl Strategy<Value = World> {
     )
 }
 
-fn any_wanted() -> impl Strategy<Value = Vec<Wanted>> {
+fn any_target() -> impl Strategy<Value = Vec<Target>> {
     let one = (0..NAMES.len(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
-    let wanted = one.prop_map(|(name, skin, fd, rate, data)| {
+    let target = one.prop_map(|(name, skin, fd, rate, data)| {
         let name = NAMES[name];
         if !skin {
-            return Wanted::named(name);
+            return Target::named(name);
         }
         let format = if fd { Format::Fd } else { Format::Classic };
         let bitrate = (rate > 0).then_some(rate * 250_000);
@@ -140,66 +140,66 @@ fn any_wanted() -> impl Strategy<Value = Vec<Wanted>> {
         in_skin(name, format, bitrate, data)
     });
     // A name once: two skins may want different things of one bus.
-    proptest::collection::vec(wanted, 0..5).prop_map(|mut all| {
+    proptest::collection::vec(target, 0..5).prop_map(|mut all| {
         let mut seen = std::collections::HashSet::new();
-        all.retain(|wanted| seen.insert(wanted.name.clone()));
+        all.retain(|target| seen.insert(target.name.clone()));
         all
     })
 }
 
 proptest! {
     #[test]
-    fn a_plan_leads_to_what_is_wanted_and_touches_nothing_else(
-        world in any_world(), wanted in any_wanted(), set: bool,
+    fn a_plan_leads_to_what_is_requested_and_touches_nothing_else(
+        world in any_world(), target in any_target(), set: bool,
     ) {
-        let Ok(plan) = up(&wanted, &world.here, set) else {
-            let harmless = |wanted: &Wanted| find(&world.here, &wanted.name)
-                .map_or_else(|| wanted.hardware().is_none(), |it| it.is_virtual() && it.ours);
-            prop_assert!(!wanted.iter().all(harmless), "refused, and all could have been had");
+        let Ok(plan) = up(&target, &world.here, set) else {
+            let harmless = |target: &Target| find(&world.here, &target.name)
+                .map_or_else(|| target.hardware().is_none(), |it| it.is_virtual() && it.ours);
+            prop_assert!(!target.iter().all(harmless), "refused, and all could have been had");
             return Ok(());
         };
         let after = world.carry_out_all(&plan);
-        for wanted in &wanted {
-            let it = after.named(&wanted.name);
-            prop_assert!(it.is_can() && it.up && wanted.carried_by(it.mtu), "{it:?}");
+        for target in &target {
+            let it = after.named(&target.name);
+            prop_assert!(it.is_can() && it.up && target.carried_by(it.mtu), "{it:?}");
         }
         for before in &world.here {
             let hardware = matches!(before.kind, Kind::Hardware(_));
-            let may_change = wanted.iter().any(|it| it.name == before.name)
+            let may_change = target.iter().any(|it| it.name == before.name)
                 && (before.is_virtual() && before.ours || hardware && set);
             prop_assert!(may_change || after.named(&before.name) == before, "{before:?}");
         }
-        prop_assert_eq!(up(&wanted, &after.here, set).unwrap().steps, []);
-        prop_assert_eq!(up(&wanted, &after.here, false).unwrap().steps, []);
+        prop_assert_eq!(up(&target, &after.here, set).unwrap().steps, []);
+        prop_assert_eq!(up(&target, &after.here, false).unwrap().steps, []);
     }
 
     #[test]
-    fn down_takes_back_what_up_made(world in any_world(), wanted in any_wanted()) {
-        let Ok(plan) = up(&wanted, &world.here, false) else { return Ok(()) };
+    fn down_takes_back_what_up_made(world in any_world(), target in any_target()) {
+        let Ok(plan) = up(&target, &world.here, false) else { return Ok(()) };
         let after = world.carry_out_all(&plan);
-        let made: Vec<_> = plan.steps.iter().map(|step| Wanted::named(&step.name)).collect();
+        let made: Vec<_> = plan.steps.iter().map(|step| Target::named(&step.name)).collect();
         let end = after.carry_out_all(&down(&made, &after.here).unwrap());
         let kept = |it: &&Interface| plan.steps.iter().all(|step| step.name != it.name);
         for before in world.here.iter().filter(kept) {
             let taken_along = before.peer().is_some_and(|peer| peer.namespace_id.is_none());
             prop_assert!(taken_along || end.named(&before.name) == before);
         }
-        prop_assert!(made.iter().all(|wanted| find(&end.here, &wanted.name).is_none()));
+        prop_assert!(made.iter().all(|target| find(&end.here, &target.name).is_none()));
     }
 
     #[test]
-    fn down_removes_what_is_ours_and_only_that(world in any_world(), wanted in any_wanted()) {
-        let Ok(plan) = down(&wanted, &world.here) else {
-            let foreign = |wanted: &Wanted| find(&world.here, &wanted.name)
+    fn down_removes_what_is_ours_and_only_that(world in any_world(), target in any_target()) {
+        let Ok(plan) = down(&target, &world.here) else {
+            let foreign = |target: &Target| find(&world.here, &target.name)
                 .is_some_and(|it| !it.ours || !it.is_virtual());
-            prop_assert!(wanted.iter().any(|wanted| wanted.skin.is_none() && foreign(wanted)));
+            prop_assert!(target.iter().any(|target| target.skin.is_none() && foreign(target)));
             return Ok(());
         };
         let after = world.carry_out_all(&plan);
-        for wanted in &wanted {
-            let left = find(&after.here, &wanted.name);
-            prop_assert!(left.is_none_or(|it| !it.ours || !it.is_virtual()), "{left:?}");
+        for target in &target {
+            let unchanged = find(&after.here, &target.name);
+            prop_assert!(unchanged.is_none_or(|it| !it.ours || !it.is_virtual()), "{unchanged:?}");
         }
-        prop_assert_eq!(down(&wanted, &after.here).unwrap().steps, []);
+        prop_assert_eq!(down(&target, &after.here).unwrap().steps, []);
     }
 }

@@ -30,7 +30,7 @@ impl Said {
         self.put("state_version", state.version());
     }
 
-    fn felt(&mut self, page: SensorPage) {
+    fn contact_state(&mut self, page: SensorPage) {
         match page {
             SensorPage::Skin(skin) => {
                 self.put("page", 0);
@@ -97,7 +97,7 @@ impl Said {
                 self.put("events_acceleration", Q::<12>::from_bits(words[3]).to_f64());
                 self.put("events_hysteresis", q14(4).to_f64());
             }
-            Some(Parameter::Cuts) => {
+            Some(Parameter::LinksDown) => {
                 for port in 0..5 {
                     self.put(format!("cut_port_{port}"), words[0] >> port & 1);
                 }
@@ -149,7 +149,7 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
         }
         Message::Sensors { from, epoch, page } => {
             said.put("epoch", epoch.0);
-            said.felt(page);
+            said.contact_state(page);
             format!("sensors_{from}")
         }
         Message::Network { from, epoch, page } => {
@@ -240,7 +240,7 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
         Message::Stimulus { to, from, page } => {
             said.put("epoch", if let From::Epoch(epoch) = from { epoch.0 } else { 0 });
             said.put("from_next", u8::from(from == From::Next));
-            said.felt(page);
+            said.contact_state(page);
             format!("stimulus_{to}")
         }
     };

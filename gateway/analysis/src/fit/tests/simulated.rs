@@ -107,7 +107,9 @@ impl Bench<'_> {
         let bytes = self.bytes();
         let frames = match self.case.format {
             Format::Fd => vec![Frame::fd(sent.id(), BIT_RATE_SWITCH, &bytes).unwrap()],
-            Format::Classic => bytes.chunks(8).map(|half| Frame::classic(sent.id(), half).unwrap()).collect(),
+            Format::Classic => {
+                bytes.chunks(8).map(|segment| Frame::classic(sent.id(), segment).unwrap()).collect()
+            }
         };
         for (index, frame) in frames.iter().enumerate() {
             let tag = u64::try_from(self.on_the_way.len()).unwrap();

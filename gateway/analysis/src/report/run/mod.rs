@@ -11,7 +11,7 @@
 //! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. What a real bus would have made of
 //! them is what `gateway shadow` says of the same recording.
 
-mod lane;
+mod bus_figures;
 mod motion;
 mod page;
 
@@ -22,9 +22,9 @@ use protocol::wire_time::BitRatesError;
 use thiserror::Error;
 
 use super::figure::Page;
-use crate::fit::rates::{Asked, Chosen};
+use crate::fit::rates::{Chosen, Requested};
 use crate::shadow::{self, Shadow};
-use lane::Lane;
+use bus_figures::LinkId;
 use motion::Motion;
 use trace::capture::{CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN};
 use trace::recording::layout::Layout;
@@ -92,7 +92,7 @@ pub struct Options {
 impl Options {
     /// The bit rates that a bus' load is reckoned with.
     fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
-        let rates = Asked { nominal: self.nominal, data: self.data }.of_bus(bus);
+        let rates = Requested { nominal: self.nominal, data: self.data }.of_bus(bus);
         rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
@@ -145,9 +145,10 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), R
 }
 
 /// What a real bus would make of these buses.
-fn shadow(skin: &Skin, lanes: &[Lane]) -> Shadow {
-    let rates = Asked::default().rates().expect("common rates are possible");
-    let of_bus = lanes.iter().map(|lane| (lane.name.clone(), lane.rates.rates)).collect();
+fn shadow(skin: &Skin, bus_figures: &[LinkId]) -> Shadow {
+    let rates = Requested::default().rates().expect("common rates are possible");
+    let of_bus =
+        bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
     let options =
         shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
     Shadow::new(options).expect("no bit is damaged")
@@ -167,7 +168,7 @@ struct Run {
     /// When the first message was, in ns since 1970.
     began: Option<u64>,
     motion: Motion,
-    lanes: Vec<Lane>,
+    bus_figures: Vec<LinkId>,
     shadow: Shadow,
     /// Packets of any network that the kernel dropped on their way to sockets.
     backlog: u64,
@@ -187,16 +188,16 @@ impl Run {
         let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
         let layout = Layout::new(&skin);
         let buses = skin.buses.iter().enumerate();
-        let lanes = buses.map(|(at, bus)| Ok(Lane::new(&skin, at, options.rates(bus)?)));
-        let mut lanes = lanes.collect::<Result<Vec<_>, ReportError>>()?;
-        let mut shadow = shadow(&skin, &lanes);
-        for before in &extras.in_force {
-            shadow.in_force(&before.bus, before.nanos, &before.frame);
-            if let Some(lane) = skin.bus_named(&before.bus).and_then(|bus| lanes.get_mut(bus)) {
-                lane.in_force(before);
+        let bus_figures = buses.map(|(at, bus)| Ok(LinkId::new(&skin, at, options.rates(bus)?)));
+        let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
+        let mut shadow = shadow(&skin, &bus_figures);
+        for before in &extras.latched {
+            shadow.latched(&before.bus, before.nanos, &before.frame);
+            if let Some(bus_figures) = skin.bus_named(&before.bus).and_then(|bus| bus_figures.get_mut(bus)) {
+                bus_figures.latched(before);
             }
         }
-        lanes.iter_mut().for_each(Lane::begin);
+        bus_figures.iter_mut().for_each(LinkId::begin);
         Ok(Self {
             topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
             motion: Motion::new(layout.joints.len()),
@@ -205,7 +206,7 @@ impl Run {
             metadata: extras.metadata.clone(),
             skin,
             began: None,
-            lanes,
+            bus_figures,
             shadow,
             backlog: 0,
             others: 0,
@@ -217,9 +218,9 @@ impl Run {
         match item {
             Item::Entry(Entry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
-                match self.skin.bus_named(record.interface).and_then(|bus| self.lanes.get_mut(bus)) {
-                    Some(lane) => {
-                        lane.frame(at, record);
+                match self.skin.bus_named(record.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
+                    Some(bus_figures) => {
+                        bus_figures.frame(at, record);
                         self.shadow.frame(record.interface, record.time.nanos, &record.frame);
                         self.carried();
                     }
@@ -234,8 +235,8 @@ impl Run {
     fn note(&mut self, note: &Note<'_>) {
         match note.kind {
             NoteKind::Dropped(frames) => {
-                match self.skin.bus_named(note.interface).and_then(|bus| self.lanes.get_mut(bus)) {
-                    Some(lane) => lane.dropped = lane.dropped.saturating_add(frames),
+                match self.skin.bus_named(note.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
+                    Some(bus_figures) => bus_figures.dropped = bus_figures.dropped.saturating_add(frames),
                     None => self.backlog = self.backlog.saturating_add(frames),
                 }
             }
@@ -270,19 +271,19 @@ impl Run {
         while let Some(frame) = self.shadow.poll() {
             let at = self.seconds(frame.nanos);
             let bus = frame.bus.and_then(|bus| self.skin.bus_named(self.shadow.bus(bus)));
-            let lane = bus.and_then(|bus| self.lanes.get_mut(bus));
-            lane.into_iter().for_each(|lane| lane.carried(at, frame.bits));
+            let bus_figures = bus.and_then(|bus| self.bus_figures.get_mut(bus));
+            bus_figures.into_iter().for_each(|bus_figures| bus_figures.carried(at, frame.bits));
         }
     }
 
     fn finish(&mut self) {
-        self.lanes.iter_mut().for_each(Lane::finish);
+        self.bus_figures.iter_mut().for_each(LinkId::finish);
         self.shadow.finish();
         self.carried();
     }
 
     fn is_empty(&self) -> bool {
-        self.motion.counts.ticks == 0 && self.lanes.iter().all(|lane| lane.frames == 0)
+        self.motion.counts.ticks == 0 && self.bus_figures.iter().all(|bus_figures| bus_figures.frames == 0)
     }
 
     /// A value of the recording's metadata.

@@ -4,7 +4,7 @@ mod arm;
 mod bus;
 
 use super::Run;
-use super::lane::Lane;
+use super::bus_figures::LinkId;
 use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number};
 use crate::report::thin::Thinned;
@@ -53,8 +53,8 @@ impl Draft<'_> {
         thinned.points().into_iter().map(|(x, y)| (x - self.zero, y)).collect()
     }
 
-    fn line(&self, label: impl Into<String>, thinned: &Thinned) -> Series {
-        Series::new(label, Shape::Line, self.points(thinned))
+    fn line(&self, caption: impl Into<String>, thinned: &Thinned) -> Series {
+        Series::new(caption, Shape::Line, self.points(thinned))
     }
 
     /// A figure of the page's width over the time of the run.
@@ -71,15 +71,20 @@ impl Draft<'_> {
         self.run.motion.turns.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
     }
 
-    fn named(&self, lane: &Lane) -> String {
-        if self.run.lanes.len() > 1 { lane.name.clone() } else { String::new() }
+    fn named(&self, bus_figures: &LinkId) -> String {
+        if self.run.bus_figures.len() > 1 { bus_figures.name.clone() } else { String::new() }
     }
 
     /// All numbers that the paper has too, and what must hold.
     fn summary(&self) -> Section {
         let (skin, motion) = (&self.run.skin, &self.run.motion);
         let mut findings = Vec::new();
-        let accuracy = self.run.lanes.iter().map(|lane| lane.table.accuracy()).reduce(Accuracy::with);
+        let accuracy = self
+            .run
+            .bus_figures
+            .iter()
+            .map(|bus_figures| bus_figures.table.accuracy())
+            .reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
         for (what, theirs, errors) in [
             ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single),
@@ -106,28 +111,28 @@ impl Draft<'_> {
             );
             findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
-        findings.push(Finding::told("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
+        findings.push(Finding::stated("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             let loop_hz =
                 hertz(motion.counts.ticks.saturating_add(motion.counts.unrecorded), motion.seconds());
-            findings.push(Finding::told("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
-            let joints = self.run.lanes.iter().filter_map(|lane| lane.joints);
+            findings.push(Finding::stated("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
+            let joints = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
-                let finding = Finding::told("joints", hertz(count, last - first));
+                let finding = Finding::stated("joints", hertz(count, last - first));
                 findings.push(finding.beside(PAPER_BROADCAST_HZ));
             }
             findings.push(none("ticks skipped".to_owned(), motion.counts.skipped));
         }
-        let accounts = self.run.lanes.iter().map(Lane::account);
+        let accounts = self.run.bus_figures.iter().map(LinkId::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
             let what = format!("replies not there before the next joints, of {due} that were due");
             findings.push(none(what, due - in_time));
         }
         findings.extend(self.fits());
-        let uplink: Uplink = self.run.lanes.iter().map(|lane| lane.table.uplink()).sum();
+        let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
         findings.push(none("packets of cells lost, by their own count".to_owned(), uplink.lost));
         Section::new("summary", "In numbers").findings(findings).text(
             "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
@@ -138,7 +143,7 @@ impl Draft<'_> {
 
 /// What must not be there at all.
 fn none(what: String, count: u64) -> Finding {
-    Finding::told(what, count as f64).must("none", count == 0)
+    Finding::stated(what, count as f64).must("none", count == 0)
 }
 
 fn several(count: usize, one: &str, more: &str) -> String {

@@ -60,7 +60,7 @@ fn values_stand_where_the_axes_say() {
 }
 
 #[test]
-fn what_lies_outside_is_cut_off_at_the_edge_and_a_gap_is_a_gap() {
+fn what_lies_outside_is_truncated_at_the_edge_and_a_gap_is_a_gap() {
     let inside = [(0.0, -1.0), (10.0, 1.0)];
     let beyond = [(0.0, -3.0), (5.0, 3.0), (10.0, -3.0)];
     let gap = [(0.0, 0.5), (2.0, 0.5), (3.0, f64::NAN), (4.0, 0.5), (6.0, 0.5)];

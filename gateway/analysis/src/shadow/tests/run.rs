@@ -3,7 +3,7 @@
 use super::super::*;
 use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::Verdict;
-use model::generate::{Wanted, generate};
+use model::generate::{Target, generate};
 use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{CellId, Node};
@@ -128,7 +128,7 @@ fn options() -> Options {
 }
 
 #[test]
-fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_asked_for() {
+fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_requested_for() {
     for format in [Format::Fd, Format::Classic] {
         let (mut plain, mut bench) = (Run::new(format), Run::new(format));
         for run in [&mut plain, &mut bench] {
@@ -155,7 +155,7 @@ fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_asked_for() {
         assert_eq!(with.delay_us, plain.delay_us);
         assert_eq!(with.answering, plain.answering);
         let all = bench.shadow(Options { bench_traffic: true, ..options() });
-        assert!(!all.counts.bench_left_out && with.counts.bench_left_out);
+        assert!(!all.counts.bench_omitted && with.counts.bench_omitted);
         assert_eq!(all.counts.bench, with.counts.bench, "they are counted all the same");
         assert_eq!(all.counts.sent, with.counts.sent + all.counts.bench.total());
         assert!(all.load.mean.unwrap() > 1.4 * with.load.mean.unwrap(), "{:?} {:?}", all.load, with.load);
@@ -200,7 +200,7 @@ fn a_second_part_of_a_recording_has_no_start_up_even_if_joints_come_late() {
     let mut first = Run::new(Format::Fd);
     first.epoch(0);
     let mut shadow = Shadow::new(options()).unwrap();
-    shadow.in_force("vcan0", BEGIN - 9 * MS, &first.frames[0].1);
+    shadow.latched("vcan0", BEGIN - 9 * MS, &first.frames[0].1);
     run.frames.iter().for_each(|(at, frame)| shadow.frame("vcan0", *at, frame));
     shadow.finish();
     assert!(shadow.report().buses[0].start_up.is_none());
@@ -248,7 +248,7 @@ fn while_cells_are_halted_nobody_is_expected_to_answer() {
 
 #[test]
 fn beside_the_run_stands_the_worst_case_of_the_skin_at_the_same_rates() {
-    let text = generate(&Wanted { cells: 253, ..Wanted::default() }).unwrap();
+    let text = generate(&Target { cells: 253, ..Target::default() }).unwrap();
     let skin = Skin::parse("skin.toml", &text).unwrap();
     let mut run = Run::new(Format::Fd);
     run.start(253);

@@ -35,19 +35,19 @@ impl Stage for Fake {
     fn is_over(&self) -> bool {
         self.stops_at.is_some_and(|at| self.clock >= at)
     }
-    fn announce(&mut self, lane: usize, round: Option<u64>, _: Epoch) {
-        self.announced.push((lane, round));
+    fn announce(&mut self, bus_link: usize, round: Option<u64>, _: Epoch) {
+        self.announced.push((bus_link, round));
     }
-    fn send(&mut self, lane: usize, frames: &[Frame]) -> Result<(), SendError> {
-        self.sent.push((self.clock, lane, frames.to_vec()));
+    fn send(&mut self, bus_link: usize, frames: &[Frame]) -> Result<(), SendError> {
+        self.sent.push((self.clock, bus_link, frames.to_vec()));
         self.clock += self.takes;
         if self.outcomes.is_empty() { Ok(()) } else { self.outcomes.remove(0) }
     }
-    fn was_not_sent(&mut self, lane: usize, round: u64) {
-        self.unsent.push((lane, round));
+    fn was_not_sent(&mut self, bus_link: usize, round: u64) {
+        self.unsent.push((bus_link, round));
     }
-    fn wait_for_answers(&mut self, lane: usize, _: &Open) {
-        self.waited.push((self.sent.len(), lane));
+    fn wait_for_answers(&mut self, bus_link: usize, _: &Open) {
+        self.waited.push((self.sent.len(), bus_link));
     }
     fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
         self.restored += 1;
@@ -60,25 +60,25 @@ impl Stage for Fake {
 /// A bus has taken so many and stayed full.
 fn full(sent: usize) -> Result<(), SendError> {
     let cause = BusError::Full { name: "vcan0".to_owned(), waited: Duration::from_millis(100) };
-    Err(SendError { sent, wanted: sent, cause })
+    Err(SendError { sent, target: sent, cause })
 }
 
 /// A bus has taken so many and is down.
 fn down(sent: usize) -> Result<(), SendError> {
-    Err(SendError { sent, wanted: sent, cause: BusError::Down("vcan0".to_owned()) })
+    Err(SendError { sent, target: sent, cause: BusError::Down("vcan0".to_owned()) })
 }
 
 fn frame(id: u32) -> Frame {
     Frame::classic(id, &[]).unwrap()
 }
 
-fn plain(at_us: u64, lane: usize, id: u32) -> Step {
-    Step::Frame(Due { at: at_us * 1_000, lane, frame: frame(id), role: Role::Plain, is_late: false })
+fn plain(at_us: u64, bus_link: usize, id: u32) -> Step {
+    Step::Frame(Due { at: at_us * 1_000, bus_link, frame: frame(id), role: Role::Plain, is_late: false })
 }
 
-fn joints(at_us: u64, lane: usize, round: u64) -> Step {
+fn joints(at_us: u64, bus_link: usize, round: u64) -> Step {
     let role = Role::Joints(Open { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
-    Step::Frame(Due { at: at_us * 1_000, lane, frame: frame(1), role, is_late: false })
+    Step::Frame(Due { at: at_us * 1_000, bus_link, frame: frame(1), role, is_late: false })
 }
 
 fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = Step>) -> Played {
@@ -100,7 +100,7 @@ fn frames_come_at_their_times_and_those_of_the_same_time_together() {
         let played = play(Player::new(1, Pace::Timed(speed), None), &mut stage, steps);
         assert_eq!(identifiers(&stage), [vec![1, 2], vec![3]]);
         assert_eq!(stage.sent[1].0 - stage.sent[0].0, last * 1_000);
-        assert_eq!((played.late.len(), played.late.max(), played.lanes[0].sent), (3, 0, 3));
+        assert_eq!((played.late.len(), played.late.max(), played.bus_links[0].sent), (3, 0, 3));
     }
 }
 
@@ -120,7 +120,7 @@ fn buses_are_served_in_turn_and_no_batch_is_larger_than_the_kernel_takes() {
     let many = (0..100).map(|id| plain(0, 0, id));
     let steps = many.chain([plain(0, 1, 0x100), plain(0, 0, 0x200)]);
     play(Player::new(2, Pace::Max, None), &mut stage, steps);
-    let sizes: Vec<_> = stage.sent.iter().map(|(_, lane, frames)| (*lane, frames.len())).collect();
+    let sizes: Vec<_> = stage.sent.iter().map(|(_, bus_link, frames)| (*bus_link, frames.len())).collect();
     assert_eq!(sizes, [(0, 64), (0, 36), (1, 1), (0, 1)]);
 }
 
@@ -146,14 +146,15 @@ fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
 }
 
 #[test]
-fn the_first_half_of_joints_waits_too() {
-    let half = Step::Frame(Due { at: 0, lane: 0, frame: frame(1), role: Role::HalfOfJoints, is_late: false });
+fn the_first_segment_of_joints_waits_too() {
+    let segment =
+        Step::Frame(Due { at: 0, bus_link: 0, frame: frame(1), role: Role::SegmentOfJoints, is_late: false });
     let sync = vec![vec![frame(2), frame(2)]];
     let mut stage = Fake::default();
     play(
         Player::new(1, Pace::Max, Some(sync)),
         &mut stage,
-        [half.clone(), joints(0, 0, 0), half, joints(0, 0, 1)],
+        [segment.clone(), joints(0, 0, 0), segment, joints(0, 0, 1)],
     );
     assert_eq!(identifiers(&stage), [vec![1, 1, 2, 2], vec![1, 1, 2, 2]]);
     assert_eq!(stage.waited, [(1, 0), (2, 0)]);
@@ -161,7 +162,7 @@ fn the_first_half_of_joints_waits_too() {
 
 #[test]
 fn what_a_bus_does_not_take_is_counted_by_its_reason() {
-    let gone = Err(SendError { sent: 0, wanted: 1, cause: BusError::Gone("vcan0".to_owned()) });
+    let gone = Err(SendError { sent: 0, target: 1, cause: BusError::Gone("vcan0".to_owned()) });
     let outcomes = vec![full(1), down(0), down(0), Ok(()), gone];
     let mut stage = Fake { outcomes, ..Fake::default() };
     let steps = [
@@ -174,7 +175,7 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
         plain(5_000, 0, 7),
     ];
     let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
-    assert_eq!(played.lanes, [LaneTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
+    assert_eq!(played.bus_links, [BusLinkTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
     assert_eq!(
         played.failure.map(|why| why.to_string()).as_deref(),
@@ -200,7 +201,7 @@ fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
 
 #[test]
 fn what_is_older_than_what_was_sent_does_not_wait_and_is_not_late() {
-    let late = Due { at: 9_000_000, lane: 0, frame: frame(9), role: Role::Plain, is_late: true };
+    let late = Due { at: 9_000_000, bus_link: 0, frame: frame(9), role: Role::Plain, is_late: true };
     let mut stage = Fake::default();
     let played =
         play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), Step::Frame(late)]);
@@ -212,7 +213,7 @@ fn somebody_may_say_stop() {
     let mut stage = Fake { stops_at: Some(5_000_000), ..Fake::default() };
     let played =
         play(Player::new(1, Pace::Timed(1.0), None), &mut stage, (0..100).map(|n| plain(n * 1_000, 0, 1)));
-    assert!(played.was_stopped && played.lanes[0].sent < 10, "{played:?}");
+    assert!(played.was_stopped && played.bus_links[0].sent < 10, "{played:?}");
 }
 
 proptest! {
@@ -225,10 +226,10 @@ proptest! {
     ) {
         let mut at = 0;
         let mut rounds = [0; 3];
-        let steps: Vec<_> = (0_u32..).zip(steps).map(|(id, (step, lane, is_joints))| {
+        let steps: Vec<_> = (0_u32..).zip(steps).map(|(id, (step, bus_link, is_joints))| {
             at += step;
-            let mut due = if is_joints { joints(at, lane, rounds[lane]) } else { plain(at, lane, 0) };
-            rounds[lane] += u64::from(is_joints);
+            let mut due = if is_joints { joints(at, bus_link, rounds[bus_link]) } else { plain(at, bus_link, 0) };
+            rounds[bus_link] += u64::from(is_joints);
             if let Step::Frame(due) = &mut due {
                 due.frame = frame(id);
             }
@@ -243,16 +244,16 @@ proptest! {
         let mut stage = Fake { takes, outcomes: outcomes.collect(), ..Fake::default() };
         let played = play(Player::new(3, Pace::Timed(1.0), syncs), &mut stage, steps.clone());
         let tried: Vec<_> = stage.sent.iter()
-            .flat_map(|(at, lane, frames)| frames.iter().map(move |frame| (*at, *lane, *frame)))
+            .flat_map(|(at, bus_link, frames)| frames.iter().map(move |frame| (*at, *bus_link, *frame)))
             .filter(|(_, _, frame)| frame.id() != 0x7FF).collect();
         prop_assert_eq!(tried.len(), steps.len());
         let first = match &steps.first() { Some(Step::Frame(due)) => due.at, _ => 0 };
-        for ((at, lane, frame), step) in tried.iter().zip(&steps) {
+        for ((at, bus_link, frame), step) in tried.iter().zip(&steps) {
             let Step::Frame(due) = step else { unreachable!() };
-            prop_assert_eq!((*lane, *frame), (due.lane, due.frame));
+            prop_assert_eq!((*bus_link, *frame), (due.bus_link, due.frame));
             prop_assert!(*at >= due.at - first + LEAD_NS, "early");
         }
-        let total: u64 = played.lanes.iter().map(|lane| lane.sent + lane.refused + lane.lost).sum();
+        let total: u64 = played.bus_links.iter().map(|bus_link| bus_link.sent + bus_link.refused + bus_link.lost).sum();
         prop_assert_eq!(total, steps.len() as u64);
     }
 }

@@ -265,7 +265,7 @@ impl Truth {
         };
         let lost: Vec<_> = seen.iter().filter(lost).map(|cell| cell.node).collect();
         if !lost.is_empty() {
-            self.expected.insert(Difference::NoWay(lost));
+            self.expected.insert(Difference::Unreachable(lost));
         }
         seen
     }
@@ -320,7 +320,7 @@ proptest! {
 }
 
 #[test]
-fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_has_no_way() {
+fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_is_unreachable() {
     let skin = skin(&[[2, 0, 0, 0], [1, 3, 4, 0], [2, 4, 0, 0], [2, 3, 5, 0], [4, 0, 0, 0]]);
     let mut truth = Truth::new(&skin);
     let mut seen = truth.seen();
@@ -335,7 +335,7 @@ fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_has_no_way() {
     let found = differences(&truth.wires, &seen);
     assert_eq!(
         found,
-        [Difference::Circle(vec![cell(2), cell(3), cell(4)]), Difference::NoWay(vec![cell(5)])]
+        [Difference::Circle(vec![cell(2), cell(3), cell(4)]), Difference::Unreachable(vec![cell(5)])]
     );
     assert!(found.iter().all(Difference::breaks_the_tree));
 }

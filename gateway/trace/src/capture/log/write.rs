@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_written_as_it_was_or_as_was_asked_for() {
+    fn a_frame_is_written_as_it_was_or_as_was_requested() {
         let line = "(1.000000007) can0 123#1122334455667788_A T";
         let style = |digits, plain| Style { digits, plain, directions: !plain };
         let as_is = |line: &str| (format!("{line}\n"), vec![Wrote::All]);

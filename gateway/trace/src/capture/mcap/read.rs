@@ -5,7 +5,7 @@ use std::io::{BufReader, Chain, Cursor, Read};
 use ::mcap::records::op;
 
 use super::Fault;
-use super::state::{KEPT, State, Wanted};
+use super::state::{KEPT, State, Target};
 use crate::capture::{Extras, Item};
 use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, parse};
 
@@ -21,7 +21,7 @@ pub(crate) struct McapReader {
     place: Place,
     state: State,
     /// What was read when it was opened: the first message that is wanted, or why there is none.
-    first: Option<Result<Wanted, Fault>>,
+    first: Option<Result<Target, Fault>>,
 }
 
 /// Where a reader is in its file.
@@ -58,22 +58,22 @@ impl McapReader {
 
     /// The next entry, or message of another topic where these are wanted. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
-        let wanted = match self.first.take() {
+        let target = match self.first.take() {
             Some(first) => Some(first?),
             None => self.advance()?,
         };
-        let Some(Wanted { channel, log_time, in_chunk }) = wanted else { return Ok(None) };
+        let Some(Target { channel, log_time, in_chunk }) = target else { return Ok(None) };
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
         Ok(Some(self.state.item(channel, log_time, data)))
     }
 
     /// Reads up to the next message that is wanted.
-    fn advance(&mut self) -> Result<Option<Wanted>, Fault> {
+    fn advance(&mut self) -> Result<Option<Target>, Fault> {
         while self.place != Place::Over {
             match self.step() {
                 Ok(None) => {}
-                Ok(wanted) => return Ok(wanted),
+                Ok(target) => return Ok(target),
                 Err(fault) => {
                     self.place = Place::Over;
                     return Err(fault);
@@ -84,7 +84,7 @@ impl McapReader {
     }
 
     /// Reads on by a record.
-    fn step(&mut self) -> Result<Option<Wanted>, Fault> {
+    fn step(&mut self) -> Result<Option<Target>, Fault> {
         let Self { source, chunk, place, state, .. } = self;
         match place {
             Place::Over => {}
@@ -122,7 +122,7 @@ impl McapReader {
                 Framed::Long(_, bytes) => {
                     return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());
                 }
-                Framed::End(_) => self.cut_off(),
+                Framed::End(_) => self.truncated(),
             },
         }
         Ok(None)
@@ -134,13 +134,13 @@ impl McapReader {
             if !MAGIC.starts_with(self.source.body()) {
                 return Err(Damage::Magic.into());
             }
-            self.cut_off();
+            self.truncated();
         }
         Ok(())
     }
 
-    fn cut_off(&mut self) {
+    fn truncated(&mut self) {
         self.place = Place::Over;
-        self.state.cut_off(self.source.read());
+        self.state.truncated(self.source.read());
     }
 }

@@ -10,7 +10,7 @@ use protocol::candump::{Direction, Record, Timestamp};
 use super::Fault;
 use super::foreign::Foreign;
 use crate::capture::log::LONGEST as LONGEST_LINE;
-use crate::capture::{Entry, Extras, InForce, Item, Note, NoteKind, Other, Topic};
+use crate::capture::{Entry, Extras, Item, Latched, Note, NoteKind, Other, Topic};
 use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
 use crate::recording::TOPIC_OF_STATE;
 use crate::ros2::cdr::CdrError;
@@ -30,7 +30,7 @@ const LONGEST_BUS: usize = 255;
 /// What is known of a recording.
 pub(crate) struct State {
     schemas: HashMap<u16, String>,
-    channels: HashMap<u16, Lane>,
+    channels: HashMap<u16, LinkId>,
     /// The places of topics that are only counted, by name and type.
     counted: HashMap<(String, String), usize>,
     names: Names,
@@ -48,14 +48,14 @@ pub(crate) struct State {
 
 /// A message that is wanted. What it says is the record that was read last.
 #[derive(Clone, Copy)]
-pub(super) struct Wanted {
+pub(super) struct Target {
     pub(super) channel: u16,
     pub(super) log_time: u64,
     pub(super) in_chunk: bool,
 }
 
 /// A channel: its topic, and what is done with its messages.
-struct Lane {
+struct LinkId {
     topic: String,
     what: What,
 }
@@ -66,7 +66,7 @@ enum What {
         nine_digits: bool,
     },
     /// Frames of before, that are in force when the recording begins.
-    InForce,
+    Latched,
     Notes,
     Foreign(Foreign),
     /// They are counted, here in the list of topics.
@@ -99,7 +99,7 @@ impl State {
     }
 
     /// Nothing more comes, and it has no end.
-    pub(super) fn cut_off(&mut self, read: u64) {
+    pub(super) fn truncated(&mut self, read: u64) {
         let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
         self.extras.unfinished.get_or_insert_with(why);
     }
@@ -140,7 +140,7 @@ impl State {
     }
 
     /// Takes a record.
-    pub(super) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Wanted>, Fault> {
+    pub(super) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Target>, Fault> {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
                 if self.schemas.get(&id).is_none_or(|known| known != name) {
@@ -154,8 +154,8 @@ impl State {
                 self.channel(id, schema, topic, encoding, &facts)?;
             }
             Raw::Message { channel, log_time, data, .. } => {
-                let wanted = self.is_wanted(channel, data)?;
-                return Ok(wanted.then_some(Wanted { channel, log_time, in_chunk }));
+                let target = self.is_requested(channel, data)?;
+                return Ok(target.then_some(Target { channel, log_time, in_chunk }));
             }
             Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
             Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
@@ -169,23 +169,23 @@ impl State {
     }
 
     /// Takes a message, if nobody else wants it.
-    fn is_wanted(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
-        let lane = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
-        match lane.what {
+    fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
+        let channel_state = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
+        match channel_state.what {
             What::Counted(topic) => {
                 if let Some(topic) = self.extras.topics.get_mut(topic) {
                     topic.messages += 1;
                 }
                 Ok(self.others)
             }
-            What::InForce if !self.is_first => Ok(false),
-            What::InForce => {
-                let record =
-                    in_force(data).map_err(|source| Damage::Message { topic: lane.topic.clone(), source })?;
+            What::Latched if !self.is_first => Ok(false),
+            What::Latched => {
+                let record = latched(data)
+                    .map_err(|source| Damage::Message { topic: channel_state.topic.clone(), source })?;
                 let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
                 let (frame, nanos) = (record.frame, record.time.nanos);
                 self.keep(bus.len() + ENTRY, |extras| {
-                    extras.in_force.push(InForce { bus: bus.to_owned(), own, frame, nanos });
+                    extras.latched.push(Latched { bus: bus.to_owned(), own, frame, nanos });
                 });
                 Ok(false)
             }
@@ -232,7 +232,7 @@ impl State {
         let what = if encoding != "cdr" {
             None
         } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
-            Some(What::InForce)
+            Some(What::Latched)
         } else if schema == Record::TYPE {
             Some(What::Frames { nine_digits })
         } else if schema == Note::TYPE {
@@ -249,12 +249,12 @@ impl State {
                 });
             What::Counted(*place)
         });
-        self.channels.insert(id, Lane { topic: topic.to_owned(), what });
+        self.channels.insert(id, LinkId { topic: topic.to_owned(), what });
         Ok(())
     }
 
     pub(super) fn item<'a>(&'a mut self, channel: u16, log_time: u64, message: &'a [u8]) -> Item<'a> {
-        let Some(Lane { topic, what }) = self.channels.get(&channel) else {
+        let Some(LinkId { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
         };
         let decoded = match *what {
@@ -264,7 +264,7 @@ impl State {
                 return Item::Other(Other { topic, schema, nanos: log_time, message });
             }
             // They are never wanted.
-            What::InForce => in_force(message).map(Entry::Frame),
+            What::Latched => latched(message).map(Entry::Frame),
             What::Frames { nine_digits } => {
                 let time = Timestamp { nanos: log_time, nine_digits };
                 decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
@@ -301,7 +301,7 @@ fn decode<'a, T>(
 }
 
 /// A frame of before, with its own time.
-fn in_force(message: &[u8]) -> Result<Record<'_>, MessageError> {
+fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
         messages::frame(message, Timestamp { nanos: messages::stamp(message)?, nine_digits: true })
     })

@@ -9,7 +9,7 @@ use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{NOTES, TOPIC_OF_BUS};
 
 /// Channels of frames: each costs a reader memory, and what a log calls its buses may be anything.
-const LANES: usize = 64;
+const CHANNEL_STATES: usize = 64;
 /// Where the frames of further buses stand; each bears its bus' name.
 const FURTHER: &str = "/further";
 /// The metadata that says what a recording was made from, when that was a capture.
@@ -23,7 +23,7 @@ const WAITING: usize = 1 << 20;
 #[derive(Debug)]
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
-    lanes: Vec<Lane>,
+    channel_states: Vec<LinkId>,
     /// The lane of the last frame.
     last: usize,
     notes: Option<Channel>,
@@ -35,7 +35,7 @@ pub(crate) struct McapWriter<W: Write> {
 
 /// The channel of a bus' frames with times of so many digits.
 #[derive(Debug)]
-struct Lane {
+struct LinkId {
     interface: String,
     nine_digits: bool,
     channel: Channel,
@@ -56,7 +56,14 @@ impl<W: Write> McapWriter<W> {
         let mut file = FileWriter::new(out)?;
         let (key, value) = SOURCE;
         file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
-        Ok(Self { file, lanes: Vec::new(), last: 0, notes: None, waiting: Some(Vec::new()), bytes: 0 })
+        Ok(Self {
+            file,
+            channel_states: Vec::new(),
+            last: 0,
+            notes: None,
+            waiting: Some(Vec::new()),
+            bytes: 0,
+        })
     }
 
     /// Writes an entry.
@@ -66,9 +73,9 @@ impl<W: Write> McapWriter<W> {
                 if self.waiting.is_some() {
                     self.write_waiting(record.time.nanos)?;
                 }
-                let lane = self.lane(record)?;
-                let Some(lane) = self.lanes.get_mut(lane) else { return Ok(()) };
-                self.file.write(&mut lane.channel, record.time.nanos, record)
+                let channel_state = self.channel_state(record)?;
+                let Some(channel_state) = self.channel_states.get_mut(channel_state) else { return Ok(()) };
+                self.file.write(&mut channel_state.channel, record.time.nanos, record)
             }
             Entry::Note(note) => match &mut self.waiting {
                 Some(waiting) if note.line > 0 && self.bytes < WAITING => {
@@ -102,18 +109,23 @@ impl<W: Write> McapWriter<W> {
     }
 
     /// The place of a frame's lane, which is made when it is the first one there.
-    fn lane(&mut self, record: &Record<'_>) -> io::Result<usize> {
+    fn channel_state(&mut self, record: &Record<'_>) -> io::Result<usize> {
         let nine_digits = record.time.nine_digits;
-        let is = |name: &str, lane: &Lane| lane.nine_digits == nine_digits && lane.interface == name;
-        if self.lanes.get(self.last).is_some_and(|lane| is(record.interface, lane)) {
+        let is = |name: &str, channel_state: &LinkId| {
+            channel_state.nine_digits == nine_digits && channel_state.interface == name
+        };
+        if self.channel_states.get(self.last).is_some_and(|channel_state| is(record.interface, channel_state))
+        {
             return Ok(self.last);
         }
-        let find = |lanes: &[Lane], name: &str| lanes.iter().position(|lane| is(name, lane));
-        let mut found = find(&self.lanes, record.interface);
+        let find = |channel_states: &[LinkId], name: &str| {
+            channel_states.iter().position(|channel_state| is(name, channel_state))
+        };
+        let mut found = find(&self.channel_states, record.interface);
         let mut name = record.interface;
-        if found.is_none() && self.lanes.len() >= LANES {
+        if found.is_none() && self.channel_states.len() >= CHANNEL_STATES {
             name = FURTHER;
-            found = find(&self.lanes, name);
+            found = find(&self.channel_states, name);
         }
         self.last = if let Some(place) = found {
             place
@@ -121,8 +133,8 @@ impl<W: Write> McapWriter<W> {
             let topic = format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
             let digits = if nine_digits { "9" } else { "6" };
             let channel = self.file.channel::<Record<'_>>(&topic, &[("time_digits", digits)])?;
-            self.lanes.push(Lane { interface: name.to_owned(), nine_digits, channel });
-            self.lanes.len() - 1
+            self.channel_states.push(LinkId { interface: name.to_owned(), nine_digits, channel });
+            self.channel_states.len() - 1
         };
         Ok(self.last)
     }

@@ -23,12 +23,17 @@ impl Draft<'_> {
                 .series([self.line("distributed", distributed)])
                 .draw("central", Shape::Dashed, self.points(central))
         });
-        let errors: Vec<_> = self.run.lanes.iter().filter(|lane| lane.lines.error.count() > 0).collect();
+        let errors: Vec<_> =
+            self.run.bus_figures.iter().filter(|bus_figures| bus_figures.lines.error.count() > 0).collect();
         let error = (!errors.is_empty()).then(|| {
             let papers = |format: &str, mean| Mark::y(mean, format!("paper, {format}: {} Nm", number(mean)));
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
-                .series(errors.iter().map(|lane| self.line(self.named(lane), &lane.lines.error)))
+                .series(
+                    errors
+                        .iter()
+                        .map(|bus_figures| self.line(self.named(bus_figures), &bus_figures.lines.error)),
+                )
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
         Section::new("torque", "Distributed and central torque")
@@ -42,7 +47,12 @@ impl Draft<'_> {
 
     /// Errors joint by joint.
     fn errors(&self) -> Option<Table> {
-        let accuracy = self.run.lanes.iter().map(|lane| lane.table.accuracy()).reduce(Accuracy::with)?;
+        let accuracy = self
+            .run
+            .bus_figures
+            .iter()
+            .map(|bus_figures| bus_figures.table.accuracy())
+            .reduce(Accuracy::with)?;
         let joints = self.run.skin.robot.joints.len().min(WORDS);
         let single = accuracy.single_by_joint.iter().zip(&accuracy.whole_by_joint).take(joints);
         let text = |errors: &Errors| {
@@ -95,7 +105,7 @@ impl Draft<'_> {
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
         let figure = |name: &str, title: &str, series: &[(&str, &Thinned)]| {
-            let series = series.iter().map(|(label, thinned)| self.line(*label, thinned));
+            let series = series.iter().map(|(caption, thinned)| self.line(*caption, thinned));
             self.figure(name, title, Axis::new("time", "µs").log()).series(series).marks(self.marks())
         };
         let took = [("tick", &motion.took.line), ("central computation in it", &motion.central_took.line)];

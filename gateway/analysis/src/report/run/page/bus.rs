@@ -1,6 +1,6 @@
 //! What became of the cells' replies and packets, and what a real bus would carry.
 
-use super::super::lane::{Lane, Latency};
+use super::super::bus_figures::{Latency, LinkId};
 use super::Draft;
 use crate::fit::verdict::{Answer, percent};
 use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number};
@@ -15,44 +15,44 @@ const WORST: usize = 12;
 
 impl Draft<'_> {
     pub(super) fn replies(&self) -> Section {
-        let due = self.run.lanes.iter().filter(|lane| lane.account().due > 0);
+        let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.account().due > 0);
         Section::new("replies", "Replies")
             .text(
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
                  joints, late within three more.",
             )
-            .figures(due.flat_map(|lane| self.replies_of(lane)))
+            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)))
             .tables([self.accounts(), self.worst()])
     }
 
-    fn replies_of(&self, lane: &Lane) -> [Figure; 3] {
-        let name = &lane.name;
-        let unit = if lane.sums { "cells in sums" } else { "replies" };
+    fn replies_of(&self, bus_figures: &LinkId) -> [Figure; 3] {
+        let name = &bus_figures.name;
+        let unit = if bus_figures.sums { "cells in sums" } else { "replies" };
         let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &Thinned); 2]| {
-            let of = of.map(|(label, thinned)| Series::new(label, Shape::Steps, self.points(thinned)));
+            let of = of.map(|(caption, thinned)| Series::new(caption, Shape::Steps, self.points(thinned)));
             self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y).half().series(of)
         };
         let y = Axis::new(unit, "");
-        let lost = lane.account().late + lane.account().missing;
+        let lost = bus_figures.account().late + bus_figures.account().missing;
         let y_lost = if lost == 0 { y.clone().between(0.0, 1.0) } else { y.clone() };
         let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
         let [due, late] = [
-            [("due", &lane.lines.due), ("in time", &lane.lines.in_time)],
-            [("late", &lane.lines.late), ("missing", &lane.lines.missing)],
+            [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
+            [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
         [
             steps("replies", "due and in time, epoch by epoch", y, due),
             steps("late", "late and missing, when that was settled", y_lost, late),
             self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"))
-                .series([self.line("", &lane.lines.slowest)]),
+                .series([self.line("", &bus_figures.lines.slowest)]),
         ]
     }
 
     fn accounts(&self) -> Table {
-        let row = |lane: &Lane| {
-            let account = lane.account();
-            let counters = lane.table.counters();
-            let reply = Quantiles::of(lane.table.last_reply(), 1.0);
+        let row = |bus_figures: &LinkId| {
+            let account = bus_figures.account();
+            let counters = bus_figures.table.counters();
+            let reply = Quantiles::of(bus_figures.table.last_reply(), 1.0);
             let numbers = [
                 account.due,
                 account.in_time,
@@ -63,9 +63,9 @@ impl Draft<'_> {
             ];
             let numbers = numbers.map(|count| count.to_string());
             let times = [reply.p50, reply.p99, reply.max].map(|micros| number(micros * 1e-3));
-            [lane.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
+            [bus_figures.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
         };
-        let rows = self.run.lanes.iter().map(row);
+        let rows = self.run.bus_figures.iter().map(row);
         let head = [
             "bus",
             "due",
@@ -83,35 +83,31 @@ impl Draft<'_> {
 
     /// Cells by what went wrong with them, and then by how slow they were.
     fn worst(&self) -> Table {
-        let cells = self.run.lanes.iter().enumerate().flat_map(|(bus, lane)| {
+        let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_of(bus);
-            lane.table
+            bus_figures
+                .table
                 .cells()
                 .iter()
                 .zip(described)
-                .zip(&lane.latency)
-                .map(move |((cell, described), latency)| (lane, cell, described.joint, latency))
+                .zip(&bus_figures.latency)
+                .map(move |((cell, described), latency)| (bus_figures, cell, described.joint, latency))
         });
         let mut cells: Vec<_> = cells.collect();
         cells.sort_by_key(|(_, cell, _, latency)| {
             let (replies, uplink) = (&cell.replies, cell.uplink());
-            std::cmp::Reverse((
-                replies.missing + replies.late,
-                uplink.lost,
-                uplink.restarts,
-                latency.greatest,
-            ))
+            std::cmp::Reverse((replies.missing + replies.late, uplink.lost, uplink.restarts, latency.max))
         });
-        let row = |(lane, cell, joint, latency): &(&Lane, &Cell, u8, &Latency)| {
+        let row = |(bus_figures, cell, joint, latency): &(&LinkId, &Cell, u8, &Latency)| {
             let (mean, slowest) = if latency.count == 0 {
                 (f64::NAN, f64::NAN)
             } else {
-                (latency.sum as f64 / latency.count as f64 * 1e-3, latency.greatest as f64 * 1e-3)
+                (latency.sum as f64 / latency.count as f64 * 1e-3, latency.max as f64 * 1e-3)
             };
             let replies = &cell.replies;
             let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink().lost];
             let counts = counts.map(|count| count.to_string());
-            [format!("{} {}", lane.name, cell.node), joint.to_string()]
+            [format!("{} {}", bus_figures.name, cell.node), joint.to_string()]
                 .into_iter()
                 .chain(counts)
                 .chain([cell.uplink().restarts.to_string(), number(mean), number(slowest)])
@@ -156,12 +152,12 @@ impl Draft<'_> {
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         for bus in self.shadows() {
-            let lane = self.run.lanes.iter().find(|lane| lane.name == bus.bus);
-            let is_chosen = lane.is_some_and(|lane| lane.rates.is_chosen);
+            let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
+            let is_chosen = bus_figures.is_some_and(|bus_figures| bus_figures.rates.is_chosen);
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
                 let Answer { load, rates, cells, verdict } = answer;
                 let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
-                let mut finding = Finding::told(what, (tenths(100.0 * load), "%"));
+                let mut finding = Finding::stated(what, (tenths(100.0 * load), "%"));
                 if is_chosen {
                     finding = finding.must("within all limits", verdict.fits());
                 }
@@ -173,8 +169,8 @@ impl Draft<'_> {
 
     /// What a real bus would carry.
     pub(super) fn load(&self) -> Section {
-        let figure = |lane: &Lane| {
-            let Lane { name, load, load_of_all, rates, .. } = lane;
+        let figure = |bus_figures: &LinkId| {
+            let LinkId { name, load, load_of_all, rates, .. } = bus_figures;
             let (rates, width) = (rates.rates, number(load.width()));
             let title = format!("{name}: load of a real bus at {rates}, over {width} s each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
@@ -186,13 +182,15 @@ impl Draft<'_> {
                     own bits make. This run is judged by the second in which most is asked of the bus; in the worst case all cells \
                     answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
                     wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
-        let assumed = self.run.lanes.iter().any(|lane| !lane.rates.is_chosen);
+        let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
         let mut section = Section::new("load", "Load of the buses").text(text);
         if assumed {
             section = section
                 .text("The skin has no bit rates for every bus, so common ones are shown, for information.");
         }
-        section.figures(self.run.lanes.iter().map(figure)).tables(self.shadows().map(|bus| carried(&bus)))
+        section
+            .figures(self.run.bus_figures.iter().map(figure))
+            .tables(self.shadows().map(|bus| carried(&bus)))
     }
 
     pub(super) fn losses(&self) -> Section {
@@ -208,13 +206,13 @@ impl Draft<'_> {
         row("bad cycles".to_owned(), ticks.bad, false);
         row("ticks while the robot was halted".to_owned(), ticks.halted, false);
         row("ticks whose velocity was not finite".to_owned(), ticks.refused, false);
-        for lane in &run.lanes {
-            let name = &lane.name;
-            let uplink = lane.table.uplink();
-            row(format!("{name}: frames recorded"), lane.frames, true);
+        for bus_figures in &run.bus_figures {
+            let name = &bus_figures.name;
+            let uplink = bus_figures.table.uplink();
+            row(format!("{name}: frames recorded"), bus_figures.frames, true);
             row(
                 format!("{name}: frames that are not in the recording, by its own notes"),
-                lane.dropped,
+                bus_figures.dropped,
                 true,
             );
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
@@ -222,7 +220,7 @@ impl Draft<'_> {
             row(format!("{name}: of these refused"), uplink.rejected, false);
             row(format!("{name}: starts of cells while it ran"), u64::from(uplink.restarts), false);
             for event in Event::ALL {
-                row(format!("{name}: {}", event.name()), lane.table.counters().events(event), false);
+                row(format!("{name}: {}", event.name()), bus_figures.table.counters().events(event), false);
             }
         }
         row("packets of any network in the kernel's backlog".to_owned(), run.backlog, false);

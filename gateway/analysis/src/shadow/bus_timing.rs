@@ -9,7 +9,7 @@ use protocol::wire_time::{BitRates, Bits};
 use super::epochs::Epochs;
 use super::phase::{Each, Figures, Phase, Phases};
 use super::report::{BusShadow, Counts, Delays};
-use super::told::Told;
+use super::reported::Reported;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 use crate::fit;
@@ -17,7 +17,7 @@ use crate::fit::traffic::{Says, Sorted, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 
 /// Frames that may wait on a bus: some minutes of a full one. Beyond them frames are refused, as by a full transmit queue.
-pub const GREATEST_QUEUE: usize = 1 << 22;
+pub const MAX_QUEUE: usize = 1 << 22;
 /// Identifiers of 11 bits.
 const IDS: usize = 0x800;
 
@@ -59,7 +59,7 @@ pub(super) struct Known {
 
 /// One bus.
 #[derive(Debug)]
-pub(super) struct Lane {
+pub(super) struct LinkId {
     pub(super) name: String,
     pub(super) counts: Counts,
     known: Known,
@@ -80,12 +80,12 @@ pub(super) struct Lane {
     queued: Vec<u32>,
 }
 
-impl Lane {
+impl LinkId {
     pub(super) fn new(name: &str, known: Known, errors: Option<BitErrors>) -> Self {
         let model = BusModel::new(known.rates);
         Self {
             name: name.to_owned(),
-            counts: Counts { bench_left_out: !known.bench_traffic, ..Counts::default() },
+            counts: Counts { bench_omitted: !known.bench_traffic, ..Counts::default() },
             known,
             model: errors.into_iter().fold(model, BusModel::with_errors),
             pending: VecDeque::new(),
@@ -103,7 +103,7 @@ impl Lane {
     }
 
     /// A frame that was on the bus before the capture began, and still says what holds.
-    pub(super) fn in_force(&mut self, nanos: u64, frame: &Frame) {
+    pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
             Says::Joints(_) => self.phases.beginning.in_the_middle = true,
             says @ (Says::Halt | Says::Resume) => _ = self.epochs.hear(nanos, says, None),
@@ -125,7 +125,7 @@ impl Lane {
         frame: &Frame,
         bits: Bits,
         place: u64,
-        told: Option<&mut Told>,
+        reported: Option<&mut Reported>,
     ) {
         let id = (!frame.is_extended()).then(|| u16::try_from(frame.id()).unwrap_or(0));
         let sorted = self.traffic.sort(nanos, frame);
@@ -150,32 +150,32 @@ impl Lane {
         }
         let newest = self.pending.back().map_or(nanos, |last| last.at);
         let waits = |first: &Pending, count: usize| newest - first.at <= WINDOW_NS && count <= WINDOW_FRAMES;
-        let mut told = told;
+        let mut reported = reported;
         while let Some(first) =
             self.pending.front().filter(|first| !waits(first, self.pending.len())).copied()
         {
             self.pending.pop_front();
-            self.enter(first, told.as_deref_mut());
+            self.enter(first, reported.as_deref_mut());
         }
     }
 
     /// There is no more.
-    pub(super) fn finish(&mut self, mut told: Option<&mut Told>) {
+    pub(super) fn finish(&mut self, mut reported: Option<&mut Reported>) {
         while let Some(first) = self.pending.pop_front() {
-            self.enter(first, told.as_deref_mut());
+            self.enter(first, reported.as_deref_mut());
         }
         self.model.finish();
-        self.drain(told);
+        self.drain(reported);
     }
 
     /// The next frame in order of time wants to go out.
-    fn enter(&mut self, pending: Pending, mut told: Option<&mut Told>) {
+    fn enter(&mut self, pending: Pending, mut reported: Option<&mut Reported>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
         let Sorted { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
             self.counts.bench.count(bench, 1);
             if !self.known.bench_traffic {
-                told.into_iter().for_each(|told| told.left_out(place));
+                reported.into_iter().for_each(|reported| reported.omitted(place));
                 return;
             }
         }
@@ -183,15 +183,15 @@ impl Lane {
         let at = at.max(self.released);
         self.released = at;
         self.model.run_until(at);
-        self.drain(told.as_deref_mut());
+        self.drain(reported.as_deref_mut());
         let phase = self.phases.at(at, says, self.traffic.is_ours());
         let answer = self.epochs.hear(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
         let figures = self.figures.of(phase);
-        figures.ask(at, took);
-        if self.model.waiting() >= GREATEST_QUEUE {
+        figures.request(at, took);
+        if self.model.waiting() >= MAX_QUEUE {
             self.counts.no_room += 1;
-            told.into_iter().for_each(|told| told.sent(place, None));
+            reported.into_iter().for_each(|reported| reported.sent(place, None));
             return;
         }
         let queued = id.and_then(|id| Some((self.queued.get_mut(usize::from(id))?, id)));
@@ -205,7 +205,7 @@ impl Lane {
     }
 
     /// Takes in what has ended on the wire.
-    fn drain(&mut self, mut told: Option<&mut Told>) {
+    fn drain(&mut self, mut reported: Option<&mut Reported>) {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
@@ -221,8 +221,8 @@ impl Lane {
             if let Some((epoch, was_late)) = answer {
                 self.epochs.answered(epoch, was_late, (at, end));
             }
-            if let Some(told) = &mut told {
-                told.sent(place, Some((start, end)));
+            if let Some(reported) = &mut reported {
+                reported.sent(place, Some((start, end)));
             }
         }
     }

@@ -16,7 +16,7 @@ pub struct Tally {
     /// Replies that were not recorded, and nothing says why.
     pub extra: u64,
     /// Recorded replies to joints that a bus did not take from this replay.
-    pub not_asked: u64,
+    pub not_requested: u64,
     /// Among the equal ones, sums less their children.
     pub sums: u64,
     /// What the recording itself lacks.
@@ -44,13 +44,13 @@ pub struct Lacking {
     /// Recorded replies whose joints stood on the bus before the part began.
     pub joints_earlier: u64,
     /// Recorded answers to `configure` that was said before the part began.
-    pub asked_earlier: u64,
+    pub requested_earlier: u64,
     /// Recorded replies of cells that measured: what they felt was not recorded.
     pub measured: u64,
     /// What cells felt, said without being asked at another time than now.
     pub sensed_otherwise: u64,
     /// Sums of cells that had spoken, had not said the end, and did not come to their slot in time.
-    pub slot_missed: u64,
+    pub slot_skipped: u64,
     /// Sums of cells that, or whose children, were changing their parent in that epoch, then or now.
     pub parent_changing: u64,
     /// Sums of epochs in which a cell had not said where its sums go, then or now.
@@ -63,7 +63,7 @@ impl Tally {
     /// Counts a reply that is not as it was recorded; one to joints that a bus did not take cannot come.
     pub(super) const fn count(&mut self, how: How, is_unsent: bool) {
         let count = match how {
-            How::Missing if is_unsent => &mut self.not_asked,
+            How::Missing if is_unsent => &mut self.not_requested,
             How::Missing => &mut self.missing,
             How::Different => &mut self.different,
             How::Extra => &mut self.extra,
@@ -83,7 +83,7 @@ impl Tally {
         self.different == 0
             && self.missing == 0
             && self.extra == 0
-            && self.not_asked == 0
+            && self.not_requested == 0
             && !self.lacks_the_tree()
     }
 }

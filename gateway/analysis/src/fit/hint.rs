@@ -7,44 +7,44 @@ use serde::Serialize;
 
 use super::case::{self, Answers, Case};
 use super::limits::{Limit, Most, Need, exceeded};
-use super::{COMMON, Judged};
+use super::{COMMON, Rated};
 
 /// The longest period of joints that the wire protocol has a word for, in ns.
 const LONGEST_NS: u64 = 65_535_000;
 
 /// A change and the bus after it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Remedy {
+pub struct Hint {
     /// What to change.
     pub change: String,
     /// What comes of it; of several buses, of the fullest.
     #[serde(flatten)]
-    pub after: Judged,
+    pub after: Rated,
 }
 
 /// What can be done about a bus; nothing when it holds all limits.
 #[must_use]
-pub fn remedies(skin: &Skin, case: &Case) -> Vec<Remedy> {
+pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
     let exceeded = exceeded(case);
     if exceeded.is_empty() {
         return Vec::new();
     }
-    let mut remedies = more_buses(case);
+    let mut hints = more_buses(case);
     // Transceivers do not care how fast it goes.
     if exceeded != [Limit::Nodes] {
-        remedies.extend(faster(case));
-        remedies.extend(slower_joints(skin, case));
-        remedies.extend(events(case));
+        hints.extend(faster(case));
+        hints.extend(slower_joints(skin, case));
+        hints.extend(events(case));
     }
-    remedies
+    hints
 }
 
-fn remedy(change: String, case: &Case) -> Remedy {
-    Remedy { change, after: Judged::of(case) }
+fn hint(change: String, case: &Case) -> Hint {
+    Hint { change, after: Rated::of(case) }
 }
 
 /// As many as its time takes, and as many as transceivers take.
-fn more_buses(case: &Case) -> Vec<Remedy> {
+fn more_buses(case: &Case) -> Vec<Hint> {
     let cells = case.answers.cells();
     let need = Need::of(&Most::of(case), cells);
     let mut numbers: Vec<_> =
@@ -52,13 +52,13 @@ fn more_buses(case: &Case) -> Vec<Remedy> {
     numbers.dedup();
     let spread = |buses: u32| {
         let each = cells.div_ceil(buses);
-        remedy(format!("{buses} buses of {each} cells"), &case.with_cells(each))
+        hint(format!("{buses} buses of {each} cells"), &case.with_cells(each))
     };
     numbers.into_iter().map(spread).collect()
 }
 
 /// The slowest common rates at which it is in time: of the same format, and CAN FD in the place of classic CAN.
-fn faster(case: &Case) -> Vec<Remedy> {
+fn faster(case: &Case) -> Vec<Hint> {
     let at = |format: Format| {
         let rates = COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
         let others = rates.map(|rates| Case { format, rates, ..case.clone() }).filter(is_in_time);
@@ -70,7 +70,7 @@ fn faster(case: &Case) -> Vec<Remedy> {
         Format::Classic => [Some(Format::Classic), Some(Format::Fd)],
     };
     let cases = formats.into_iter().flatten().filter_map(at);
-    cases.map(|it| remedy(super::name(it.format, it.rates), &it)).collect()
+    cases.map(|it| hint(super::name(it.format, it.rates), &it)).collect()
 }
 
 fn is_in_time(case: &Case) -> bool {
@@ -78,11 +78,11 @@ fn is_in_time(case: &Case) -> bool {
 }
 
 /// The shortest period of whole ticks in which everything has its time.
-fn slower_joints(skin: &Skin, case: &Case) -> Option<Remedy> {
+fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
     let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= LONGEST_NS);
     let slower = periods.map(|period_ns| Case { period_ns, ..case.clone() }).find(is_in_time)?;
-    Some(remedy(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
+    Some(hint(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "below 1e8")]
@@ -91,12 +91,12 @@ fn hertz(period_ns: u64) -> f64 {
 }
 
 /// Sensors that speak when something changes.
-fn events(case: &Case) -> Option<Remedy> {
+fn events(case: &Case) -> Option<Hint> {
     match case.sensing {
         Sensing::Off | Sensing::Event => None,
         Sensing::Continuous { .. } => {
             let quiet = Case { sensing: Sensing::Event, ..case.clone() };
-            Some(remedy("sensing = \"event\", quiet".to_owned(), &quiet))
+            Some(hint("sensing = \"event\", quiet".to_owned(), &quiet))
         }
     }
 }
@@ -104,7 +104,7 @@ fn events(case: &Case) -> Option<Remedy> {
 /// What the cells of a bus can answer with instead of what they do: torques, sums with all cells on the bus, and sums
 /// with only the roots on it, where its wires lead everywhere.
 #[must_use]
-pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Remedy> {
+pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {
         Some(Reply::Sum { slot_us, .. }) => Some(slot_us),
         Some(Reply::Torque) | None => None,
@@ -115,7 +115,7 @@ pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Remedy> {
         [(Some(torques), "torques"), (sums(true), "sums of all cells"), (sums(false), "sums, only of roots")];
     let other = |(answers, change): (Option<Answers>, &str)| {
         let other = Case { answers: answers?, ..case.clone() };
-        (other.answers != case.answers).then(|| remedy(change.to_owned(), &other))
+        (other.answers != case.answers).then(|| hint(change.to_owned(), &other))
     };
     others.into_iter().filter_map(other).collect()
 }

@@ -7,9 +7,9 @@ use crate::tracker::{Claim, PerCell, Word};
 
 /// All numbers of a bus.
 #[derive(Debug, Default)]
-pub(super) struct Roster(PerCell<Claim>);
+pub(super) struct AddressTable(PerCell<Claim>);
 
-impl Roster {
+impl AddressTable {
     /// Takes a heartbeat; two serial numbers that both come back under one number are returned.
     ///
     /// One change is a cell that took another's place; it is the way back that shows that both are there. A cell
@@ -39,9 +39,9 @@ mod tests {
     use protocol::message::State;
 
     fn heard(said: &[(u32, State)]) -> Vec<Option<[u32; 2]>> {
-        let (mut roster, number) = (Roster::default(), CellId::new(5).unwrap());
+        let (mut address_table, number) = (AddressTable::default(), CellId::new(5).unwrap());
         let beat = |(at, &(serial, state)): (u16, &(u32, State))| {
-            roster.hear(number, &Heartbeat { serial, state, sent: 40 + at, ..Heartbeat::default() })
+            address_table.hear(number, &Heartbeat { serial, state, sent: 40 + at, ..Heartbeat::default() })
         };
         (0..).zip(said).map(beat).collect()
     }

@@ -10,8 +10,8 @@
 //! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus each
 //! for itself. Rounds of joints are judged when 100 more have been sent, or at the end.
 
+mod bus_comparator;
 mod close;
-mod lane;
 mod sums;
 mod tally;
 
@@ -22,8 +22,8 @@ use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
-pub use lane::Present;
-use lane::{Asked, Both, Lane, take_first_joints};
+pub use bus_comparator::Present;
+use bus_comparator::{Announced, Both, LinkId, take_first_joints};
 pub use sums::Own;
 use sums::{Side, Sum};
 pub use tally::{Lacking, Tally};
@@ -65,17 +65,17 @@ impl First {
 
 /// All buses.
 #[derive(Debug)]
-pub struct Judge {
-    lanes: Vec<Lane>,
+pub struct Comparator {
+    bus_comparators: Vec<LinkId>,
     expects: bool,
     /// While a state is restored, replies are not those of the capture.
     is_muted: bool,
     tally: Tally,
     first: First,
-    rival: Option<usize>,
+    other_gateway: Option<usize>,
 }
 
-impl Judge {
+impl Comparator {
     /// For some buses, by what they are called now and their cells in the capture. Replies are compared if `expects`
     /// says so, once it is no longer muted.
     #[must_use]
@@ -84,63 +84,72 @@ impl Judge {
         first_nanos: u64,
         expects: bool,
     ) -> Self {
-        let lanes = buses.into_iter().map(|(name, cells)| Lane::new(name, cells)).collect();
+        let bus_comparators = buses.into_iter().map(|(name, cells)| LinkId::new(name, cells)).collect();
         Self {
-            lanes,
+            bus_comparators,
             expects,
             is_muted: true,
             tally: Tally::default(),
             first: First { nanos: first_nanos, difference: None },
-            rival: None,
+            other_gateway: None,
         }
     }
 
     /// Takes in that the capture has joints next; returns the number of their round on their bus, if they will be
     /// sent.
-    pub fn record_joints(&mut self, lane: usize, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
-        self.lanes.get_mut(lane)?.record_joints(nanos, epoch, is_sent)
+    pub fn record_joints(
+        &mut self,
+        bus_comparator: usize,
+        nanos: u64,
+        epoch: Epoch,
+        is_sent: bool,
+    ) -> Option<u64> {
+        self.bus_comparators.get_mut(bus_comparator)?.record_joints(nanos, epoch, is_sent)
     }
 
     /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
-    pub fn record(&mut self, lane: usize, message: &Message, is_in_part: bool) {
+    pub fn record(&mut self, bus_comparator: usize, message: &Message, is_in_part: bool) {
         let expects = self.expects;
-        let (Some(lane), tally) = (self.lanes.get_mut(lane).filter(|_| expects), &mut self.tally) else {
+        let (Some(bus_comparator), tally) =
+            (self.bus_comparators.get_mut(bus_comparator).filter(|_| expects), &mut self.tally)
+        else {
             return;
         };
-        lane.record_state(message, is_in_part);
+        bus_comparator.record_state(message, is_in_part);
         if let Message::Configured { from, tag, answer } = *message {
-            let is_lacking = is_in_part && is_compared(answer) && !lane.record_answer(from, tag, answer);
-            tally.lacking.asked_earlier += u64::from(is_lacking);
+            let is_lacking =
+                is_in_part && is_compared(answer) && !bus_comparator.record_answer(from, tag, answer);
+            tally.lacking.requested_earlier += u64::from(is_lacking);
         } else if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
             if let NetworkPage::Tree(tree) = page {
-                lane.record_parent(cell, epoch, tree.parent);
-            } else if matches!(page, NetworkPage::Heartbeat(_)) && lane.is_claiming(cell) {
-                lane.record_parent(cell, epoch, None);
+                bus_comparator.record_parent(cell, epoch, tree.parent);
+            } else if matches!(page, NetworkPage::Heartbeat(_)) && bus_comparator.is_claiming(cell) {
+                bus_comparator.record_parent(cell, epoch, None);
             }
         } else if let Message::Sum { from, epoch, torque, count } = *message {
-            match lane.recorded_round(epoch) {
+            match bus_comparator.recorded_round(epoch) {
                 Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
-                None if is_in_part => lane.count_without_joints(epoch, &mut tally.lacking),
+                None if is_in_part => bus_comparator.count_without_joints(epoch, &mut tally.lacking),
                 None => {}
             }
         } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message {
             let is_sensing = number == Parameter::Sensing.number();
             let sensing = Sensing::from_words(words).filter(|_| is_sensing);
-            lane.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
+            bus_comparator.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
         }
-        take_first_joints(&mut lane.untouched.recorded, message);
+        take_first_joints(&mut bus_comparator.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && lane.untouched.recorded.get(&cell) == Some(&epoch) {
+        if what != What::Torque && bus_comparator.untouched.recorded.get(&cell) == Some(&epoch) {
             // Of no joints, even if joints of that epoch stood on the bus by then.
             return;
         }
-        let measured = lane.excuses.get(&cell).is_some_and(|excuse| excuse.cell.measured);
-        match lane.recorded_round(epoch) {
+        let measured = bus_comparator.known.get(&cell).is_some_and(|known_cell| known_cell.cell.measured);
+        match bus_comparator.recorded_round(epoch) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
             // Before the first joints there are replies of sensors without any.
             None if is_in_part && what == What::Torque => {
-                lane.count_without_joints(epoch, &mut tally.lacking)
+                bus_comparator.count_without_joints(epoch, &mut tally.lacking)
             }
             None => {}
         }
@@ -148,23 +157,24 @@ impl Judge {
 
     /// Takes in that the capture begins anew: replies before its first joints answer none of the last pass.
     pub fn record_begin(&mut self) {
-        self.lanes.iter_mut().for_each(Lane::begin);
+        self.bus_comparators.iter_mut().for_each(LinkId::begin);
     }
 
     /// Takes in that the capture has no more joints.
     pub fn record_end(&mut self) {
-        for lane in &mut self.lanes {
-            lane.last_round = (lane.base + lane.rounds.len() as u64).checked_sub(1);
+        for bus_comparator in &mut self.bus_comparators {
+            bus_comparator.last_round =
+                (bus_comparator.base + bus_comparator.rounds.len() as u64).checked_sub(1);
         }
     }
 
     /// Takes in that joints are about to be sent: those of a round, or others.
-    pub fn announce(&mut self, lane: usize, round: Option<u64>, epoch: Epoch) {
-        let Some(it) = self.lanes.get_mut(lane) else { return };
+    pub fn announce(&mut self, bus_comparator: usize, round: Option<u64>, epoch: Epoch) {
+        let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
         it.announce();
-        let asked = Asked { announcement: it.announcements, round };
-        if let Some(place) = it.asked.get_mut(usize::from(epoch.0)) {
-            *place = Some(asked);
+        let announced = Announced { announcement: it.announcements, round };
+        if let Some(place) = it.announced.get_mut(usize::from(epoch.0)) {
+            *place = Some(announced);
         }
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
@@ -172,40 +182,50 @@ impl Judge {
             round.is_unsent = false;
             // Asked again, all cells say their sums again.
             round.sums.now.clear();
-            round.asked_as = epoch;
-            round.asked += 1;
+            round.announced_as = epoch;
+            round.announced += 1;
         }
-        while self.lanes.get(lane).is_some_and(|lane| lane.base + WINDOW < number) {
-            self.close_round(lane);
+        while self
+            .bus_comparators
+            .get(bus_comparator)
+            .is_some_and(|bus_comparator| bus_comparator.base + WINDOW < number)
+        {
+            self.close_round(bus_comparator);
         }
     }
 
     /// Takes in that all that was sent so far shall be done: a sync without joints.
-    pub fn announce_again(&mut self, lane: usize) {
-        let Some(it) = self.lanes.get_mut(lane) else { return };
+    pub fn announce_again(&mut self, bus_comparator: usize) {
+        let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
         it.announce();
         let (announcement, last) = (it.announcements, it.announcements - 1);
-        if let Some(asked) = it.asked.iter_mut().flatten().find(|asked| asked.announcement == last) {
-            asked.announcement = announcement;
+        if let Some(announced) =
+            it.announced.iter_mut().flatten().find(|announced| announced.announcement == last)
+        {
+            announced.announcement = announcement;
         }
     }
 
     /// Takes in that a bus did not take the joints of a round.
-    pub fn was_not_sent(&mut self, lane: usize, round: u64) {
-        if let Some(round) = self.lanes.get_mut(lane).and_then(|lane| lane.round(round)) {
+    pub fn was_not_sent(&mut self, bus_comparator: usize, round: u64) {
+        if let Some(round) = self
+            .bus_comparators
+            .get_mut(bus_comparator)
+            .and_then(|bus_comparator| bus_comparator.round(round))
+        {
             round.is_unsent = true;
         }
     }
 
     /// Takes in a message of somebody else on a bus.
     pub fn hear(&mut self, index: usize, message: &Message) {
-        let Some(lane) = self.lanes.get_mut(index) else { return };
-        lane.is_down = false;
-        take_first_joints(&mut lane.untouched.now, message);
+        let Some(bus_comparator) = self.bus_comparators.get_mut(index) else { return };
+        bus_comparator.is_down = false;
+        take_first_joints(&mut bus_comparator.untouched.now, message);
         if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
-            lane.network(cell, epoch, &page);
+            bus_comparator.network(cell, epoch, &page);
         } else if let Message::Joints { .. } | Message::Network { .. } = message {
-            self.rival.get_or_insert(index);
+            self.other_gateway.get_or_insert(index);
         }
         if !self.expects || self.is_muted {
             return;
@@ -213,17 +233,18 @@ impl Judge {
         if let Message::Configured { from, tag, answer } = *message
             && is_compared(answer)
         {
-            lane.answers.entry(from).or_default().now.push_back((tag, answer));
+            bus_comparator.answers.entry(from).or_default().now.push_back((tag, answer));
         } else if let Message::Sum { from, epoch, torque, count } = *message
-            && let Some((_, round)) = lane.asked_round(epoch).filter(|(_, round)| round.asked_as == epoch)
+            && let Some((_, round)) =
+                bus_comparator.announced_round(epoch).filter(|(_, round)| round.announced_as == epoch)
         {
             round.sums.now.take(from, Sum { torque, count });
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && lane.untouched.now.get(&cell) == Some(&epoch) {
+        if what != What::Torque && bus_comparator.untouched.now.get(&cell) == Some(&epoch) {
             return;
         }
-        let Some((number, round)) = lane.asked_round(epoch) else { return };
+        let Some((number, round)) = bus_comparator.announced_round(epoch) else { return };
         let pair = round.replies.entry((cell, what)).or_default();
         let (epoch, nanos) = (round.epoch, round.nanos);
         match pair.now {
@@ -235,31 +256,33 @@ impl Judge {
             Some(_) => {
                 self.tally.extra += 1;
                 let said = [None, Some(Said::Words(what, words))];
-                self.first.note(How::Extra, &lane.name, cell, Some((number, epoch, nanos)), said);
+                self.first.note(How::Extra, &bus_comparator.name, cell, Some((number, epoch, nanos)), said);
             }
         }
     }
 
     /// Whether a bus' cells that are waited for are done with the joints announced last.
     #[must_use]
-    pub fn is_done(&self, lane: usize) -> bool {
-        self.lanes.get(lane).is_none_or(|lane| lane.is_down || lane.undone().next().is_none())
+    pub fn is_done(&self, bus_comparator: usize) -> bool {
+        self.bus_comparators
+            .get(bus_comparator)
+            .is_none_or(|bus_comparator| bus_comparator.is_down || bus_comparator.undone().next().is_none())
     }
 
     /// Cells that are done with the joints announced last, so that progress can be seen.
     #[must_use]
-    pub fn done(&self, lane: usize) -> usize {
-        self.lanes
-            .get(lane)
-            .map_or(0, |lane| lane.roll.values().filter(|present| lane.has_done(present)).count())
+    pub fn done(&self, bus_comparator: usize) -> usize {
+        self.bus_comparators.get(bus_comparator).map_or(0, |bus_comparator| {
+            bus_comparator.present.values().filter(|present| bus_comparator.has_done(present)).count()
+        })
     }
 
     /// Gives up those that are not done; returns who they are.
-    pub fn give_up(&mut self, lane: usize) -> Vec<CellId> {
-        let Some(lane) = self.lanes.get_mut(lane) else { return Vec::new() };
-        let late: Vec<_> = lane.undone().collect();
+    pub fn give_up(&mut self, bus_comparator: usize) -> Vec<CellId> {
+        let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) else { return Vec::new() };
+        let late: Vec<_> = bus_comparator.undone().collect();
         for cell in &late {
-            if let Some(present) = lane.roll.get_mut(cell) {
+            if let Some(present) = bus_comparator.present.get_mut(cell) {
                 present.is_given_up = true;
             }
         }
@@ -268,79 +291,92 @@ impl Judge {
 
     /// How many recorded torques and sums of the joints of a round have not come, of cells that are there.
     #[must_use]
-    pub fn unanswered(&self, lane: usize, number: u64) -> usize {
-        let Some(lane) = self.lanes.get(lane) else { return 0 };
-        let Some(round) =
-            number.checked_sub(lane.base).and_then(|at| lane.rounds.get(usize::try_from(at).ok()?))
+    pub fn unanswered(&self, bus_comparator: usize, number: u64) -> usize {
+        let Some(bus_comparator) = self.bus_comparators.get(bus_comparator) else { return 0 };
+        let Some(round) = number
+            .checked_sub(bus_comparator.base)
+            .and_then(|at| bus_comparator.rounds.get(usize::try_from(at).ok()?))
         else {
             return 0;
         };
-        let is_there =
-            |cell: &CellId| lane.roll.get(cell).is_some_and(|present: &Present| !present.is_given_up);
+        let is_there = |cell: &CellId| {
+            bus_comparator.present.get(cell).is_some_and(|present: &Present| !present.is_given_up)
+        };
         let replies = round.replies.iter().filter(|((_, what), _)| *what == What::Torque);
-        let missed = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
-        let torques = missed.filter(|((cell, _), _)| is_there(cell)).count();
+        let unanswered = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
+        let torques = unanswered.filter(|((cell, _), _)| is_there(cell)).count();
         let Both { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;
         }
-        let then = Side::new(then, &lane.trees.recorded, number);
+        let then = Side::new(then, &bus_comparator.trees.recorded, number);
         let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.feels(*cell);
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
     /// Takes in that a bus is down, so that nobody on it is waited for; it ends with the next message.
-    pub fn is_down(&mut self, lane: usize) {
-        if let Some(lane) = self.lanes.get_mut(lane) {
-            lane.is_down = true;
+    pub fn is_down(&mut self, bus_comparator: usize) {
+        if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
+            bus_comparator.is_down = true;
         }
     }
 
     /// From now on replies are not those of the capture, or are again: then to joints that are yet to be sent.
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
-        for asked in self.lanes.iter_mut().flat_map(|lane| lane.asked.iter_mut().flatten()) {
-            asked.round = None;
+        for announced in self
+            .bus_comparators
+            .iter_mut()
+            .flat_map(|bus_comparator| bus_comparator.announced.iter_mut().flatten())
+        {
+            announced.round = None;
         }
     }
 
     /// The bus on which another gateway has spoken.
     #[must_use]
-    pub const fn rival(&self) -> Option<usize> {
-        self.rival
+    pub const fn other_gateway(&self) -> Option<usize> {
+        self.other_gateway
     }
 
     /// The cells that are on a bus now.
-    pub fn present(&self, lane: usize) -> impl Iterator<Item = (CellId, &Present)> {
-        self.lanes.get(lane).into_iter().flat_map(|lane| lane.roll.iter().map(|(cell, it)| (*cell, it)))
+    pub fn present(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
+        self.bus_comparators
+            .get(bus_comparator)
+            .into_iter()
+            .flat_map(|bus_comparator| bus_comparator.present.iter().map(|(cell, it)| (*cell, it)))
     }
 
     /// Those of them that do not only claim their node id.
-    pub fn settled(&self, lane: usize) -> impl Iterator<Item = (CellId, &Present)> {
-        self.present(lane).filter(|(_, present)| present.claim.is_settled())
+    pub fn settled(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
+        self.present(bus_comparator).filter(|(_, present)| present.claim.is_settled())
     }
 
     /// Cells that have not said where their sums go, or have no way up.
     #[must_use]
-    pub fn without_a_way(&self, lane: usize) -> Vec<CellId> {
-        let settled = self.settled(lane);
-        let Some(lane) = self.lanes.get(lane) else { return Vec::new() };
-        settled.map(|(cell, _)| cell).filter(|cell| !lane.trees.now.has_a_way(*cell)).collect()
+    pub fn unreachable(&self, bus_comparator: usize) -> Vec<CellId> {
+        let settled = self.settled(bus_comparator);
+        let Some(bus_comparator) = self.bus_comparators.get(bus_comparator) else { return Vec::new() };
+        settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
     }
 
     /// Judges all that has been sent, and hears no more; `is_whole` says whether that was all that the capture has.
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
-        for lane in self.lanes.iter_mut().filter(|_| !is_whole) {
-            lane.forget_the_unsent();
+        for bus_comparator in self.bus_comparators.iter_mut().filter(|_| !is_whole) {
+            bus_comparator.forget_the_unsent();
         }
-        for lane in 0..self.lanes.len() {
-            while self.lanes.get(lane).is_some_and(|lane| !lane.rounds.is_empty()) {
-                self.close_round(lane);
+        for bus_comparator in 0..self.bus_comparators.len() {
+            while self
+                .bus_comparators
+                .get(bus_comparator)
+                .is_some_and(|bus_comparator| !bus_comparator.rounds.is_empty())
+            {
+                self.close_round(bus_comparator);
             }
         }
-        for lane in &mut self.lanes {
-            lane.close_answers(&mut self.tally, &mut self.first);
+        for bus_comparator in &mut self.bus_comparators {
+            bus_comparator.close_answers(&mut self.tally, &mut self.first);
         }
     }
 

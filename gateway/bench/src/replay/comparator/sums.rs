@@ -38,7 +38,7 @@ impl Trees {
     }
 
     /// Whether a cell's sums go anywhere, by its last word.
-    pub(super) fn has_a_way(&self, cell: CellId) -> bool {
+    pub(super) fn is_reachable(&self, cell: CellId) -> bool {
         self.0.get(&cell).and_then(VecDeque::back).is_some_and(|step| step.parent.is_some())
     }
 
@@ -175,7 +175,7 @@ pub(super) enum Outcome {
     Different,
     Missing,
     Extra,
-    LeftOut(Why),
+    Omitted(Why),
 }
 
 impl<'a> Side<'a> {
@@ -284,13 +284,13 @@ fn exact(word: Q7_8) -> Option<i32> {
 /// Compares what a cell put into its sums.
 pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outcome {
     if recorded.affected.contains(&cell) || now.affected.contains(&cell) {
-        return Outcome::LeftOut(Why::Changing);
+        return Outcome::Omitted(Why::Changing);
     }
     if !recorded.is_known || !now.is_known {
-        return Outcome::LeftOut(Why::Unknown);
+        return Outcome::Omitted(Why::Unknown);
     }
     if !recorded.is_whole(cell, now) || !now.is_whole(cell, recorded) {
-        return Outcome::LeftOut(Why::NotTaken);
+        return Outcome::Omitted(Why::NotTaken);
     }
     let (then, today) = (recorded.own(cell), now.own(cell));
     match (then, today) {
@@ -308,7 +308,7 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outc
             if same {
                 Outcome::Equal
             } else if now.holds_a_mover(cell, recorded) || recorded.holds_a_mover(cell, now) {
-                Outcome::LeftOut(Why::NotTaken)
+                Outcome::Omitted(Why::NotTaken)
             } else {
                 Outcome::Different
             }

@@ -51,16 +51,16 @@ fn decoded(frame: &Frame) -> Decoded {
 }
 
 /// All steps of so many passes.
-fn cut(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<Due>, Cut) {
-    cut_of(&capture(), part, selection, passes)
+fn plan_summary(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<Due>, PlanSummary) {
+    share_of(&capture(), part, selection, passes)
 }
 
-fn cut_of(
+fn share_of(
     capture: &[(u64, &'static str, Frame)],
     part: Part,
     selection: impl FnOnce(&mut Selection),
     passes: u32,
-) -> (Vec<Due>, Cut) {
+) -> (Vec<Due>, PlanSummary) {
     let mut survey = Survey::new(part);
     let record = |(nanos, interface, frame): &(u64, &'static str, Frame)| Record {
         time: Timestamp { nanos: *nanos, nine_digits: true },
@@ -70,55 +70,57 @@ fn cut_of(
     };
     capture.iter().for_each(|it| survey.take(&record(it)));
     survey.finish();
-    let lanes = vec![Some(0), Some(1)];
-    let mut chosen = Selection { only: Only::All, pick: Pick::default(), lanes, reads: true };
+    let bus_links = vec![Some(0), Some(1)];
+    let mut chosen = Selection { only: Only::All, pick: Pick::default(), bus_links, reads: true };
     selection(&mut chosen);
     let names = ["a", "b"].map(|name| (name.to_owned(), BTreeMap::new()));
-    let mut judge = Judge::new(names, 0, true);
-    let mut reel = Reel::new(&survey, &chosen);
+    let mut comparator = Comparator::new(names, 0, true);
+    let mut replay_plan = ReplayPlan::new(&survey, &chosen);
     let mut steps = Vec::new();
     for _ in 0..passes {
         for it in capture {
-            if reel.take(&record(it), &mut judge).is_break() {
+            if replay_plan.take(&record(it), &mut comparator).is_break() {
                 break;
             }
         }
-        reel.end_pass(&mut judge);
-        steps.extend(std::iter::from_fn(|| reel.next_step()));
+        replay_plan.end_pass(&mut comparator);
+        steps.extend(std::iter::from_fn(|| replay_plan.next_step()));
     }
     let due = |step| match step {
         Step::Frame(due) => due,
         Step::Restore(_) => panic!("nobody asked for it"),
     };
-    (steps.into_iter().map(due).collect(), reel.into_cut())
+    (steps.into_iter().map(due).collect(), replay_plan.into_summary())
 }
 
 fn shown(due: &[Due]) -> Vec<(u64, usize, u32)> {
-    due.iter().map(|due| (due.at / MS, due.lane, due.frame.id())).collect()
+    due.iter().map(|due| (due.at / MS, due.bus_link, due.frame.id())).collect()
 }
 
 #[test]
 fn all_is_sent_but_what_never_was_on_a_bus() {
-    let (due, cut) = cut(Part::default(), |_| {}, 1);
+    let (due, plan_summary) = plan_summary(Part::default(), |_| {}, 1);
     let ids = [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (3, 0, 0x201), (4, 0, 5), (6, 0, 1), (7, 1, 0x202)];
     assert_eq!(shown(&due), ids);
-    assert_eq!(cut.skipped, BTreeMap::from([(reason::ERROR, 1)]));
+    assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR, 1)]));
     // Joints are numbered, each bus by itself.
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints(Open { round, .. }) => Some((due.lane, round)),
-        Role::Plain | Role::HalfOfJoints => None,
+        Role::Joints(Open { round, .. }) => Some((due.bus_link, round)),
+        Role::Plain | Role::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [(0, Some(0)), (1, Some(0)), (0, Some(1))]);
 }
 
 #[test]
 fn inputs_and_replies_are_the_two_sides() {
-    let (inputs, cut_of_inputs) = cut(Part::default(), |selection| selection.only = Only::Inputs, 1);
+    let (inputs, truncate_inputs) =
+        plan_summary(Part::default(), |selection| selection.only = Only::Inputs, 1);
     assert_eq!(shown(&inputs), [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (6, 0, 1)]);
-    assert_eq!(cut_of_inputs.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_INPUT, 3)]));
-    let (replies, cut_of_replies) = cut(Part::default(), |selection| selection.only = Only::Replies, 1);
+    assert_eq!(truncate_inputs.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_INPUT, 3)]));
+    let (replies, share_of_replies) =
+        plan_summary(Part::default(), |selection| selection.only = Only::Replies, 1);
     assert_eq!(shown(&replies), [(0, 0, 0x201), (4, 1, 0x202)], "the first one begins");
-    assert_eq!(cut_of_replies.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_REPLY, 5)]));
+    assert_eq!(share_of_replies.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_REPLY, 5)]));
 }
 
 #[test]
@@ -134,11 +136,11 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
         .chain(classic(&press))
         .collect();
     let capture: Vec<_> = (5_000_u64..).zip(frames).map(|(at, frame)| (at * MS, "a", frame)).collect();
-    let of = |only| cut_of(&capture, Part::default(), |selection| selection.only = only, 1);
+    let of = |only| share_of(&capture, Part::default(), |selection| selection.only = only, 1);
     let ids = |due: &[Due]| due.iter().map(|due| due.frame.id()).collect::<Vec<_>>();
-    let (inputs, cut) = of(Only::Inputs);
+    let (inputs, plan_summary) = of(Only::Inputs);
     assert_eq!(ids(&inputs), [0, 0, 0x702, 0x702]);
-    assert_eq!(cut.skipped, BTreeMap::from([(reason::NO_INPUT, 4)]));
+    assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::NO_INPUT, 4)]));
     assert_eq!(of(Only::Replies).0.len(), 0);
     let (all, _) = of(Only::All);
     assert_eq!(ids(&all), [0x001, 0x201, 0, 0x701, 0, 0x001, 0x702, 0x702], "in their order");
@@ -149,34 +151,34 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
 fn what_cells_said_over_their_wires_is_never_sent() {
     let survey = Survey::new(Part::default());
     for only in [Only::All, Only::Inputs, Only::Replies] {
-        let selection = Selection { only, pick: Pick::default(), lanes: vec![Some(0)], reads: true };
-        let reel = Reel::new(&survey, &selection);
-        let frame = wire::Lane { wire: 9, back: false }.frame(wire::PortMessage::Join);
-        assert_eq!(reel.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
+        let selection = Selection { only, pick: Pick::default(), bus_links: vec![Some(0)], reads: true };
+        let replay_plan = ReplayPlan::new(&survey, &selection);
+        let frame = wire::LinkId { wire: 9, back: false }.frame(wire::PortMessage::Join);
+        assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
         // Damaged it proves nothing, and is somebody else's.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
-        assert_ne!(reel.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
+        assert_ne!(replay_plan.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
     }
 }
 
 #[test]
 fn a_part_begins_and_ends_at_its_times_and_buses_go_where_they_shall() {
     let part = Part { from: MS, to: Some(6 * MS) };
-    let (due, cut) = cut(part, |selection| selection.lanes = vec![None, Some(0)], 1);
+    let (due, plan_summary) = plan_summary(part, |selection| selection.bus_links = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);
     let skipped = [(reason::BEFORE, 1), (reason::AFTER, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];
-    assert_eq!(cut.skipped, BTreeMap::from(skipped));
+    assert_eq!(plan_summary.skipped, BTreeMap::from(skipped));
 }
 
 #[test]
 fn passes_follow_each_other_as_joints_do() {
-    let (due, _) = cut(Part::default(), |selection| selection.only = Only::Inputs, 3);
+    let (due, _) = plan_summary(Part::default(), |selection| selection.only = Only::Inputs, 3);
     let starts: Vec<_> = due.iter().step_by(4).map(|due| due.at / MS).collect();
     // A pass lasts 6 ms, and from the first joints to the second it is all of that.
     assert_eq!(starts, [0, 12, 24]);
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints(Open { round, .. }) if due.lane == 0 => round,
-        Role::Joints(_) | Role::Plain | Role::HalfOfJoints => None,
+        Role::Joints(Open { round, .. }) if due.bus_link == 0 => round,
+        Role::Joints(_) | Role::Plain | Role::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);
 }

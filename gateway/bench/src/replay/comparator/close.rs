@@ -5,41 +5,41 @@ use std::collections::BTreeSet;
 use protocol::id::CellId;
 use protocol::packet::WORDS;
 
-use super::lane::{Both, Excuse, Lane, Round, excuse_extra};
+use super::bus_comparator::{Both, KnownCell, LinkId, Round, explain_extra};
 use super::sums::{Outcome, Side, Why, compare};
-use super::{First, Judge, Tally};
+use super::{Comparator, First, Tally};
 use crate::replay::difference::{How, Said, What};
 
-impl Judge {
+impl Comparator {
     pub(super) fn close_round(&mut self, index: usize) {
-        let Self { lanes, tally, first, .. } = self;
-        let Some(lane) = lanes.get_mut(index) else { return };
-        let Some(round) = lane.rounds.pop_front() else { return };
-        let number = lane.base;
-        lane.base += 1;
-        if !self.expects || round.asked == 0 {
+        let Self { bus_comparators, tally, first, .. } = self;
+        let Some(bus_comparator) = bus_comparators.get_mut(index) else { return };
+        let Some(round) = bus_comparator.rounds.pop_front() else { return };
+        let number = bus_comparator.base;
+        bus_comparator.base += 1;
+        if !self.expects || round.announced == 0 {
             return;
         }
         if round.is_first {
-            lane.excuses.values_mut().for_each(|excuse| excuse.speaks = None);
+            bus_comparator.known.values_mut().for_each(|known_cell| known_cell.speaks = None);
         }
         let at = Some((number, round.epoch, round.nanos));
         for (&(cell, what), &pair) in &round.replies {
-            if let Some(how) = lane.compare_reply(number, &round, (cell, what), pair, tally) {
+            if let Some(how) = bus_comparator.compare_reply(number, &round, (cell, what), pair, tally) {
                 tally.count(how, round.is_unsent);
                 let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
-                first.note(how, &lane.name, cell, at, said);
+                first.note(how, &bus_comparator.name, cell, at, said);
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
-            lane.close_sums(number, &round, tally, first);
+            bus_comparator.close_sums(number, &round, tally, first);
         }
-        lane.trees.recorded.forget_before(number);
-        lane.trees.now.forget_before(number);
+        bus_comparator.trees.recorded.forget_before(number);
+        bus_comparator.trees.now.forget_before(number);
     }
 }
 
-impl Lane {
+impl LinkId {
     /// Compares a reply to joints with the recorded one; how it is another, unless the recording says why.
     fn compare_reply(
         &mut self,
@@ -51,16 +51,16 @@ impl Lane {
     ) -> Option<How> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
         let is_torque = what == What::Torque;
-        let mut excuse = self.excuses.get_mut(&cell);
-        let spoke = excuse.as_ref().and_then(|excuse| excuse.speaks);
-        if let (Some(excuse), Some(recorded), true) = (&mut excuse, recorded, is_torque) {
-            excuse.speaks = Some(recorded != [0; WORDS]);
+        let mut known_cell = self.known.get_mut(&cell);
+        let spoke = known_cell.as_ref().and_then(|known_cell| known_cell.speaks);
+        if let (Some(known_cell), Some(recorded), true) = (&mut known_cell, recorded, is_torque) {
+            known_cell.speaks = Some(recorded != [0; WORDS]);
         }
         match (recorded, now) {
             (None, None) => None,
             (Some(recorded), Some(now)) => {
-                if let Some(excuse) = excuse.filter(|_| is_torque) {
-                    excuse.ended_earlier = false;
+                if let Some(known_cell) = known_cell.filter(|_| is_torque) {
+                    known_cell.ended_earlier = false;
                 }
                 tally.equal += u64::from(recorded == now);
                 (recorded != now).then_some(How::Different)
@@ -75,19 +75,19 @@ impl Lane {
                 // What was over before, by what was sent, or began before the part: the cell had not taken the
                 // joints at which it ended.
                 let was_over = spoke.map_or(begins_later, |spoke| spoke && !round.may_answer(cell));
-                let is_later = |excuse: &&mut Excuse| {
-                    let was_over = was_over && !excuse.cell.is_counted_at(round.nanos);
-                    is_end && (excuse.ended_earlier || was_over)
+                let is_later = |known_cell: &&mut KnownCell| {
+                    let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
+                    is_end && (known_cell.ended_earlier || was_over)
                 };
-                let Some(excuse) = excuse.filter(is_later) else { return Some(How::Missing) };
-                excuse.ended_earlier = false;
+                let Some(known_cell) = known_cell.filter(is_later) else { return Some(How::Missing) };
+                known_cell.ended_earlier = false;
                 tally.lacking.said_later += 1;
                 None
             }
             // Reports may be asked for by this replay.
             (None, Some(now)) => {
                 let counts =
-                    is_torque && !excuse_extra(&mut tally.lacking, excuse, (cell, round), is_last, now);
+                    is_torque && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now);
                 counts.then_some(How::Extra)
             }
         }
@@ -100,9 +100,9 @@ impl Lane {
         let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
         let is_last = self.last_round == Some(number);
         for cell in cells {
-            let excuse = self.excuses.get_mut(&cell);
+            let known_cell = self.known.get_mut(&cell);
             let lacking = &mut tally.lacking;
-            if excuse.as_ref().is_some_and(|excuse| excuse.cell.measured) {
+            if known_cell.as_ref().is_some_and(|known_cell| known_cell.cell.measured) {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
@@ -110,10 +110,10 @@ impl Lane {
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
                 then.is_doubtful(cell, is_touched, false)
-                    || round.asked > 1 && now.is_doubtful(cell, is_touched, true)
+                    || round.announced > 1 && now.is_doubtful(cell, is_touched, true)
             };
             if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
-                outcome = Outcome::LeftOut(Why::NotTaken);
+                outcome = Outcome::Omitted(Why::NotTaken);
             }
             let how = match outcome {
                 Outcome::Nothing => continue,
@@ -122,9 +122,9 @@ impl Lane {
                     tally.sums += 1;
                     continue;
                 }
-                Outcome::LeftOut(why) => {
+                Outcome::Omitted(why) => {
                     *match why {
-                        _ if round.is_unsent => &mut tally.not_asked,
+                        _ if round.is_unsent => &mut tally.not_requested,
                         Why::Changing => &mut lacking.parent_changing,
                         Why::Unknown => &mut lacking.tree_unknown,
                         Why::NotTaken => &mut lacking.sums_not_taken,
@@ -135,11 +135,11 @@ impl Lane {
                 Outcome::Missing => How::Missing,
                 // It had to go on then, or to say the end: it did not come to its slot in time.
                 Outcome::Extra if self.speaking.contains(&cell) => {
-                    lacking.slot_missed += 1;
+                    lacking.slot_skipped += 1;
                     continue;
                 }
                 // The words only say whether a contact has ended, which a sum does not tell.
-                Outcome::Extra if excuse_extra(lacking, excuse, (cell, round), is_last, [1; WORDS]) => {
+                Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, [1; WORDS]) => {
                     continue;
                 }
                 Outcome::Extra => How::Extra,
@@ -161,10 +161,10 @@ impl Lane {
     pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut First) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
-                let excuse = self.excuses.get_mut(&cell);
+                let known_cell = self.known.get_mut(&cell);
                 let next = answers.recorded.front().map(|(_, tag, _)| *tag);
                 if let Some((tag, _)) = answers.now.front().copied().filter(|(tag, _)| Some(*tag) != next)
-                    && answers.excuse_extra(&mut tally.lacking, excuse, tag, self.base)
+                    && answers.explain_extra(&mut tally.lacking, known_cell, tag, self.base)
                 {
                     answers.now.pop_front();
                     continue;

@@ -30,20 +30,20 @@ struct Entry {
 
 /// Frames that wait for those before them.
 #[derive(Debug, Default)]
-pub(super) struct Told {
+pub(super) struct Reported {
     entries: VecDeque<Entry>,
     /// The place of the first one.
     first: u64,
 }
 
-impl Told {
+impl Reported {
     /// A frame came; of one with bits it is not known yet when it goes out.
     pub(super) fn enter(&mut self, shaded: Shaded) {
         self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 
     /// No real bus carries it.
-    pub(super) fn left_out(&mut self, place: u64) {
+    pub(super) fn omitted(&mut self, place: u64) {
         self.settle(place, |shaded| shaded.bits = None);
     }
 

@@ -1,10 +1,10 @@
 //! The way up: whom a cell joins, follows, leaves, and lets in.
 
 use protocol::time::{Micros, Span};
-use protocol::wire::{Label, PortMessage, UPLINK};
+use protocol::wire::{PortMessage, Rank, UPLINK};
 
 use super::port::Port;
-use super::{ALL, JOIN_PATIENCE, LeftBehind, Lost, Network, Parent, SEEK};
+use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};
 
 impl Network {
     /// Whether nothing is lost by moving: no sums go up, or the parent has no way itself.
@@ -14,8 +14,8 @@ impl Network {
 
     /// A port that is nearer than the parent is asked, when nothing is lost by moving.
     pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
-        let label = self.ports.get(port).and_then(|port| port.label(now));
-        let nearer = label.is_some_and(|label| label.is_better_than(parent.label));
+        let rank = self.ports.get(port).and_then(|port| port.rank(now));
+        let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
         if nearer && self.may_move() && self.joining.is_none() {
             self.joining = Some((port, now));
             self.say(port, PortMessage::Join);
@@ -24,12 +24,12 @@ impl Network {
 
     /// The parent's label is this. All ports hear another depth; another round only those that need it: children,
     /// and who looks for a way. So a round costs one message a cell, and not one a port.
-    pub(super) fn follow(&mut self, now: Micros, port: usize, label: Label) {
-        let before = self.parent.replace(Parent { port, label });
+    pub(super) fn follow(&mut self, now: Micros, port: usize, rank: Rank) {
+        let before = self.parent.replace(Parent { port, rank });
         if before == self.parent {
             return;
         }
-        let own = label.below();
+        let own = rank.below();
         self.best = Some(own);
         self.deserted = false;
         let offered = self.offered.replace(own);
@@ -47,7 +47,7 @@ impl Network {
 
     /// A cell asks to send its sums here.
     pub(super) fn let_in(&mut self, now: Micros, port: usize) {
-        let Some(label) = self.label().filter(|_| self.up() != Some(port)) else {
+        let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
             return self.say(port, PortMessage::Refuse);
         };
         let number = self.number_at(port);
@@ -60,30 +60,30 @@ impl Network {
             }
         }
         self.tree_changed = true;
-        self.say(port, PortMessage::Grant(label));
+        self.say(port, PortMessage::Grant(rank));
     }
 
-    fn is_good(&self, label: Label) -> bool {
-        self.best.is_none_or(|best| label.is_better_than(best))
+    fn is_good(&self, rank: Rank) -> bool {
+        self.best.is_none_or(|best| rank.is_better_than(best))
     }
 
     /// A cell lets this one in.
-    pub(super) fn join(&mut self, now: Micros, port: usize, label: Label) {
+    pub(super) fn join(&mut self, now: Micros, port: usize, rank: Rank) {
         if self.up() == Some(port) {
             return;
         }
-        let moves = self.parent.is_none_or(|parent| self.may_move() && label.is_better_than(parent.label));
-        if !moves || !self.is_good(label) {
+        let moves = self.parent.is_none_or(|parent| self.may_move() && rank.is_better_than(parent.rank));
+        if !moves || !self.is_good(rank) {
             return self.say(port, PortMessage::Leave);
         }
         if let Some(before) = self.parent {
-            self.left = Some(LeftBehind::new(before.port, false, now));
+            self.former_parent = Some(FormerParent::new(before.port, false, now));
             self.say(before.port, PortMessage::Leave);
         }
         self.joining = None;
-        self.seek = None;
+        self.repair = None;
         self.changes = self.changes.wrapping_add(1);
-        self.follow(now, port, label);
+        self.follow(now, port, rank);
         if port == UPLINK {
             // The gateway's side takes sums from then on.
             self.hello(now, port);
@@ -95,7 +95,7 @@ impl Network {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
         self.deserted = false;
-        self.left = Some(LeftBehind::new(parent.port, how == Lost::Done, now));
+        self.former_parent = Some(FormerParent::new(parent.port, how == Lost::Done, now));
         self.say(parent.port, PortMessage::Leave);
         self.distrust(now, parent.port);
         self.search(now);
@@ -110,15 +110,15 @@ impl Network {
         if self.parent.is_some() {
             return;
         }
-        if let Some((asked, at)) = self.joining {
-            if now.since(at) < JOIN_PATIENCE {
+        if let Some((requested, at)) = self.joining {
+            if now.since(at) < JOIN_TIMEOUT {
                 return;
             }
             self.joining = None;
-            self.distrust(now, asked);
+            self.distrust(now, requested);
         }
-        let labelled = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.label(now)?)));
-        let good = labelled().filter(|(_, label)| self.is_good(*label));
+        let labelled = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
+        let good = labelled().filter(|(_, rank)| self.is_good(*rank));
         let nearest =
             good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
         if let Some((port, _)) = nearest {
@@ -127,23 +127,23 @@ impl Network {
         }
         // Who never had a way has nothing to compare: the first hello with a label is good enough.
         let Some(best) = self.best else { return };
-        let (at, wait) = self.seek.unwrap_or((now, SEEK.0));
+        let (at, wait) = self.repair.unwrap_or((now, REPAIR.0));
         if now >= at {
-            self.seek = Some((now + wait, Span(wait.0 * 2).min(SEEK.1)));
+            self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR.1)));
             // Where no other port leads to the gateway, or none did so far, the way may be through those below, or
             // through who was a parent.
-            let is_first = wait == SEEK.0;
-            let leads = self.ports.iter().any(|port| port.label(now).is_some());
-            self.seek_at(now, best.round, None, !(leads && is_first));
+            let is_first = wait == REPAIR.0;
+            let leads = self.ports.iter().any(|port| port.rank(now).is_some());
+            self.repair_at(now, best.round, None, !(leads && is_first));
         }
     }
 
     /// Asks for a round later than this one, on all ports that lead to the gateway but one, or on all that work.
-    fn seek_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
+    fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
         for port in (0..ALL).filter(|port| Some(*port) != but) {
-            let leads = |port: &Port| port.label(now).is_some() || (all && port.works(now));
+            let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
             if self.ports.get(port).is_some_and(leads) {
-                self.say(port, PortMessage::Seek(round));
+                self.say(port, PortMessage::Repair(round));
             }
         }
     }
@@ -152,7 +152,7 @@ impl Network {
     /// way there.
     pub(super) fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
-        if parent.label.round.wrapping_sub(round).cast_signed() > 0 {
+        if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {
             return self.hello(now, port);
         }
         self.ports.get_mut(port).into_iter().for_each(|port| port.sought = true);
@@ -160,15 +160,15 @@ impl Network {
         self.deserted |= is_deserted;
         // Upwards is not everywhere: a parent may have two wires to this cell, and seek on both.
         let again =
-            |(of, everywhere, at)| of == round && now.since(at) < SEEK.0 && (everywhere || !is_deserted);
+            |(of, everywhere, at)| of == round && now.since(at) < REPAIR.0 && (everywhere || !is_deserted);
         if self.passed_on.is_some_and(again) {
             return;
         }
         self.passed_on = Some((round, is_deserted, now));
         if is_deserted {
-            self.seek_at(now, round, Some(port), true);
+            self.repair_at(now, round, Some(port), true);
         } else {
-            self.say(parent.port, PortMessage::Seek(round));
+            self.say(parent.port, PortMessage::Repair(round));
         }
     }
 }

@@ -6,14 +6,14 @@ fn cell(number: u8) -> CellId {
 }
 
 /// What each cell itself feels, in steps; cells from 1.
-type Felt = Vec<Option<[i16; WORDS]>>;
+type Contact = Vec<Option<[i16; WORDS]>>;
 
 /// A tree: the parent of each cell, 0 for the gateway's side. Only cells of a lesser place are parents.
-fn sums(felt: &Felt, parents: &[u8]) -> (Sums, Trees) {
+fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
     let (mut sums, mut trees) = (Sums::default(), Trees::default());
-    let mut totals = vec![([0_i32; WORDS], 0_u8); felt.len()];
-    for place in (0..felt.len()).rev() {
-        if let Some(own) = felt[place] {
+    let mut totals = vec![([0_i32; WORDS], 0_u8); contact.len()];
+    for place in (0..contact.len()).rev() {
+        if let Some(own) = contact[place] {
             totals[place].1 += 1;
             (0..WORDS).for_each(|word| totals[place].0[word] += i32::from(own[word]));
         }
@@ -44,8 +44,8 @@ fn words(first: i16) -> Option<[i16; WORDS]> {
 #[test]
 fn the_same_contributions_are_equal_in_whatever_tree() {
     // 1 - 2 - 3 and 1 - (2, 3); cell 2 only passes on in the first.
-    let felt = vec![words(10), None, words(30)];
-    let both = (sums(&felt, &[0, 1, 2]), sums(&felt, &[0, 1, 1]));
+    let contact = vec![words(10), None, words(30)];
+    let both = (sums(&contact, &[0, 1, 2]), sums(&contact, &[0, 1, 1]));
     assert_eq!(outcomes(&both.0, &both.1, 3), [Outcome::Equal, Outcome::Nothing, Outcome::Equal]);
     let side = Side::new(&both.0.0, &both.0.1, 5);
     let own = side.own(cell(1)).unwrap();
@@ -75,9 +75,9 @@ fn who_feels_nothing_now_is_missing_and_who_did_not_then_is_extra() {
 
 #[test]
 fn who_only_passes_on_must_not_add_anything() {
-    let felt = vec![None, words(20)];
-    let (then, other) = (sums(&felt, &[0, 1]), sums(&felt, &[0, 0]));
-    let mut today = sums(&felt, &[0, 1]);
+    let contact = vec![None, words(20)];
+    let (then, other) = (sums(&contact, &[0, 1]), sums(&contact, &[0, 0]));
+    let mut today = sums(&contact, &[0, 1]);
     today.0.0.get_mut(&cell(1)).unwrap().torque[2] = Q7_8::from_bits(9);
     assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
     assert_eq!(outcomes(&other, &today, 2), [Outcome::Different, Outcome::Equal]);
@@ -85,29 +85,29 @@ fn who_only_passes_on_must_not_add_anything() {
 }
 
 #[test]
-fn whose_children_are_not_certain_is_left_out() {
-    let felt = vec![words(10), words(20), words(30), words(40)];
-    let then = sums(&felt, &[0, 0, 1, 0]);
-    let mut today = sums(&felt, &[0, 0, 1, 0]);
+fn whose_children_are_not_certain_is_omitted() {
+    let contact = vec![words(10), words(20), words(30), words(40)];
+    let then = sums(&contact, &[0, 0, 1, 0]);
+    let mut today = sums(&contact, &[0, 0, 1, 0]);
     today.1.say(cell(3), None, 6);
     today.1.say(cell(3), Some(2), 6);
-    let changing = Outcome::LeftOut(Why::Changing);
+    let changing = Outcome::Omitted(Why::Changing);
     assert_eq!(outcomes(&then, &today, 4), [changing, changing, changing, Outcome::Equal]);
     // Nobody knows whose child the third is.
     today.1.0.remove(&cell(3));
-    assert_eq!(outcomes(&then, &today, 4), [Outcome::LeftOut(Why::Unknown); 4]);
+    assert_eq!(outcomes(&then, &today, 4), [Outcome::Omitted(Why::Unknown); 4]);
 }
 
 #[test]
 fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice() {
     // The third goes to the second by its page, and to the first in fact.
-    let felt = vec![None, words(20), words(30), None];
-    let then = sums(&felt, &[0, 1, 1, 0]);
-    let mut today = sums(&felt, &[0, 1, 1, 0]);
+    let contact = vec![None, words(20), words(30), None];
+    let then = sums(&contact, &[0, 1, 1, 0]);
+    let mut today = sums(&contact, &[0, 1, 1, 0]);
     today.1.0.remove(&cell(3));
-    let left_out = Outcome::LeftOut(Why::NotTaken);
+    let omitted = Outcome::Omitted(Why::NotTaken);
     for (parents, counted_twice, expected) in [
-        (&[2, 1][..], false, left_out),
+        (&[2, 1][..], false, omitted),
         (&[2], false, Outcome::Different),
         (&[2, 4], false, Outcome::Different),
         (&[2, 1], true, Outcome::Different),
@@ -124,7 +124,7 @@ fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice(
                 let sum = today.0.0.get_mut(&cell(number)).unwrap();
                 sum.count = count;
                 sum.torque = std::array::from_fn(|word| {
-                    let [second, third] = [1, 2].map(|at: usize| felt[at].unwrap()[word]);
+                    let [second, third] = [1, 2].map(|at: usize| contact[at].unwrap()[word]);
                     Q7_8::from_bits(second + third * (i16::from(count) - 1))
                 });
             }
@@ -134,24 +134,24 @@ fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice(
 }
 
 #[test]
-fn a_cell_between_two_parents_is_left_out_and_one_that_finds_none_is_not() {
-    let felt = vec![words(10), words(20)];
-    let then = sums(&felt, &[0, 1]);
+fn a_cell_between_two_parents_is_omitted_and_one_that_finds_none_is_not() {
+    let contact = vec![words(10), words(20)];
+    let then = sums(&contact, &[0, 1]);
     let mut today = sums(&vec![words(10), None], &[0, 1]);
     today.1.say(cell(2), None, 2);
     assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Missing]);
     today.1.say(cell(2), Some(0), 9);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::LeftOut(Why::Changing)]);
+    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Omitted(Why::Changing)]);
 }
 
 #[test]
-fn a_sum_that_lacks_a_childs_is_left_out() {
-    let felt = vec![words(10), words(20), None];
-    let then = sums(&felt, &[0, 1, 0]);
-    let mut today = sums(&felt, &[0, 1, 0]);
+fn a_sum_that_lacks_a_childs_is_omitted() {
+    let contact = vec![words(10), words(20), None];
+    let then = sums(&contact, &[0, 1, 0]);
+    let mut today = sums(&contact, &[0, 1, 0]);
     let alone = Sum { torque: words(10).unwrap().map(Q7_8::from_bits), count: 1 };
     today.0.0.insert(cell(1), alone);
-    let torn = Outcome::LeftOut(Why::NotTaken);
+    let torn = Outcome::Omitted(Why::NotTaken);
     assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Equal]);
     // The child's was lost on the way to the recording, and is in the parent's.
     let mut then = sums(&vec![None, words(20)], &[0, 1]);
@@ -177,19 +177,19 @@ fn saturated_words_are_compared_as_saturated() {
         side.0.0.get_mut(&cell(number)).unwrap().torque[0] = Q7_8::MAX;
         side
     };
-    let whole = |felt: &Felt, parents: &[u8]| saturate(sums(felt, parents), 1);
-    let felt = vec![words(10), words(20)];
-    assert_eq!(outcomes(&whole(&felt, &[0, 1]), &whole(&felt, &[0, 1]), 2), [Outcome::Equal; 2]);
+    let whole = |contact: &Contact, parents: &[u8]| saturate(sums(contact, parents), 1);
+    let contact = vec![words(10), words(20)];
+    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &whole(&contact, &[0, 1]), 2), [Outcome::Equal; 2]);
     assert_eq!(
-        outcomes(&then, &whole(&felt, &[0, 1]), 2),
+        outcomes(&then, &whole(&contact, &[0, 1]), 2),
         [Outcome::Different, Outcome::Equal],
         "the same cells are in it"
     );
-    let other = sums(&felt, &[0, 0]);
-    assert_eq!(outcomes(&other, &whole(&felt, &[0, 1]), 2)[0], Outcome::Equal, "others are in it");
+    let other = sums(&contact, &[0, 0]);
+    assert_eq!(outcomes(&other, &whole(&contact, &[0, 1]), 2)[0], Outcome::Equal, "others are in it");
     // The other words are compared as ever.
-    let felt = vec![Some([10, 9, 0, 0, 0, 0]), words(20)];
-    assert_eq!(outcomes(&whole(&felt, &[0, 1]), &then, 2)[0], Outcome::Different);
+    let contact = vec![Some([10, 9, 0, 0, 0, 0]), words(20)];
+    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &then, 2)[0], Outcome::Different);
 }
 
 #[test]
@@ -208,29 +208,29 @@ proptest! {
     /// cell alone differs.
     #[test]
     fn the_tree_leaves_no_trace(
-        felt in proptest::collection::vec(proptest::option::of([-60_i16..=60, -60..=60, -60..=60, -60..=60, -60..=60, -60..=60]), 1..40),
+        contact in proptest::collection::vec(proptest::option::of([-60_i16..=60, -60..=60, -60..=60, -60..=60, -60..=60, -60..=60]), 1..40),
         trees: [[u8; 40]; 2],
         odd: (u8, i16),
     ) {
         let parents = |seeds: &[u8; 40]| -> Vec<u8> {
-            (0..felt.len()).map(|place| seeds[place] % u8::try_from(place + 1).unwrap()).collect()
+            (0..contact.len()).map(|place| seeds[place] % u8::try_from(place + 1).unwrap()).collect()
         };
         let [then, today] = [parents(&trees[0]), parents(&trees[1])];
-        let recorded = sums(&felt, &then);
-        let all = outcomes(&recorded, &sums(&felt, &today), felt.len());
+        let recorded = sums(&contact, &then);
+        let all = outcomes(&recorded, &sums(&contact, &today), contact.len());
         for (place, outcome) in all.iter().enumerate() {
-            let wanted = if felt[place].is_some() {
+            let target = if contact[place].is_some() {
                 matches!(outcome, Outcome::Equal)
             } else {
                 matches!(outcome, Outcome::Nothing | Outcome::Equal)
             };
-            prop_assert!(wanted, "cell {}: {outcome:?}", place + 1);
+            prop_assert!(target, "cell {}: {outcome:?}", place + 1);
         }
-        let at = usize::from(odd.0) % felt.len();
-        let mut other = felt.clone();
+        let at = usize::from(odd.0) % contact.len();
+        let mut other = contact.clone();
         if let (Some(words), true) = (&mut other[at], odd.1.unsigned_abs() > 1) {
             words[3] = words[3].wrapping_add(odd.1 % 60 + 2 * odd.1.signum());
-            let again = outcomes(&recorded, &sums(&other, &today), felt.len());
+            let again = outcomes(&recorded, &sums(&other, &today), contact.len());
             for (place, outcome) in again.iter().enumerate() {
                 prop_assert_eq!(*outcome == Outcome::Different, place == at, "cell {}", place + 1);
             }

@@ -9,7 +9,7 @@ fn claim() -> Message {
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_excuses_nothing_and_leaves_the_cell_there() {
+fn a_claim_of_a_number_that_is_taken_known_nothing_and_leaves_the_cell_there() {
     let with_claim = |at| {
         let mut said = run();
         said.insert(at, claim());
@@ -19,11 +19,11 @@ fn a_claim_of_a_number_that_is_taken_excuses_nothing_and_leaves_the_cell_there()
         // An extra reply is no less one.
         let mut now = run();
         now.insert(9, torque(1, 4, 9));
-        let extra = |recorded: &[Message]| judged(&[recorded, &[joints(5)]].concat(), &now).tally;
+        let extra = |recorded: &[Message]| rated(&[recorded, &[joints(5)]].concat(), &now).tally;
         assert_eq!(extra(&with_claim(at)), extra(&run()), "recorded after {at}");
-        let judge = judged(&run(), &with_claim(at));
-        assert_eq!(counts(&judge), [3, 0, 0, 0], "heard after {at}");
-        assert!(judge.present(0).all(|(_, present)| present.claim.is_settled()), "heard after {at}");
+        let comparator = rated(&run(), &with_claim(at));
+        assert_eq!(counts(&comparator), [3, 0, 0, 0], "heard after {at}");
+        assert!(comparator.present(0).all(|(_, present)| present.claim.is_settled()), "heard after {at}");
     }
 }
 
@@ -41,10 +41,10 @@ fn a_claim_of_a_number_that_is_taken_leaves_the_tree_as_it_is() {
         joints(3),
     ];
     let with = [&said[..4], &[claim()], &said[4..]].concat();
-    let tally = judged(&said, &said).tally;
+    let tally = rated(&said, &said).tally;
     assert_eq!((tally.equal, tally.sums), (2, 2));
-    assert_eq!(judged(&with, &said).tally, tally, "recorded");
-    assert_eq!(judged(&said, &with).tally, tally, "now");
+    assert_eq!(rated(&with, &said).tally, tally, "recorded");
+    assert_eq!(rated(&said, &with).tally, tally, "now");
 }
 
 #[test]

@@ -17,7 +17,7 @@ pub(crate) type Waiting = (Micros, Frame);
 
 /// A cell, or the place for one.
 #[derive(Debug)]
-pub struct Seat {
+pub struct CellSlot {
     /// Who sits here.
     pub identity: Identity,
     /// What its flash holds.
@@ -35,7 +35,7 @@ pub struct Seat {
     pub(crate) wake: Option<Micros>,
 }
 
-impl Seat {
+impl CellSlot {
     /// A cell that is not switched on yet.
     #[must_use]
     pub const fn new(identity: Identity, flash: Flash, format: Format) -> Self {

@@ -10,14 +10,14 @@ use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use model::decode::{Decoded, Decoder};
 use model::table::{Contributions, Replies, Table};
-use trace::capture::InForce;
+use trace::capture::Latched;
 
 /// Time is let pass for the cells as often as a receiver does it.
 const LOOK_US: u64 = 20_000;
 /// How long a cell took to answer, in µs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Latency {
-    pub(super) greatest: u64,
+    pub(super) max: u64,
     pub(super) sum: u64,
     pub(super) count: u64,
 }
@@ -52,7 +52,7 @@ pub(super) struct Lines {
 
 /// One bus.
 #[derive(Debug)]
-pub(super) struct Lane {
+pub(super) struct LinkId {
     pub(super) name: String,
     pub(super) table: Table,
     /// Whether cells answer with sums.
@@ -76,7 +76,7 @@ pub(super) struct Lane {
     pub(super) dropped: u64,
 }
 
-impl Lane {
+impl LinkId {
     pub(super) fn new(skin: &Skin, bus: usize, rates: Chosen) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
@@ -104,7 +104,7 @@ impl Lane {
     }
 
     /// A frame that was on the bus before the recording began, and still says what holds.
-    pub(super) fn in_force(&mut self, before: &InForce) {
+    pub(super) fn latched(&mut self, before: &Latched) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }
 
@@ -154,7 +154,7 @@ impl Lane {
             return;
         };
         let took = now.since(opened).0;
-        latency.greatest = latency.greatest.max(took);
+        latency.max = latency.max.max(took);
         latency.sum = latency.sum.saturating_add(took);
         latency.count += 1;
         if let Some(open) = &mut self.open {

@@ -14,16 +14,16 @@ use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::WORDS;
 use protocol::time::Micros;
 
-use super::{PATIENCE, Place, until};
+use super::{Place, TIMEOUT, until};
 
 /// Another client of a bus of a format.
-pub(crate) struct Guest {
+pub(crate) struct TestClient {
     pub(crate) bus: Bus,
     format: Format,
     decoder: RefCell<Decoder>,
 }
 
-impl Guest {
+impl TestClient {
     pub(crate) fn on(place: &Place, bus: &str, format: Format) -> Self {
         Self::on_kind(place, bus, format, Choice::Only(place.kind()))
     }
@@ -46,10 +46,10 @@ impl Guest {
         self.bus.send(&frames).unwrap();
     }
 
-    /// Hears messages until somebody has enough, or until `PATIENCE` is over: whether somebody had.
+    /// Hears messages until somebody has enough, or until `TIMEOUT` is over: whether somebody had.
     pub(crate) fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
         let mut inbox = Inbox::new();
-        let give_up = Instant::now() + PATIENCE;
+        let give_up = Instant::now() + TIMEOUT;
         while Instant::now() < give_up {
             self.bus.wait(Some(Duration::from_millis(100))).unwrap();
             self.bus.receive(&mut inbox).unwrap();
@@ -67,7 +67,7 @@ impl Guest {
 
     /// Waits for a message after which somebody has enough.
     pub(crate) fn waits_for(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
-        assert!(self.hears(enough), "waited {PATIENCE:?} for {what} on {}", self.bus.name());
+        assert!(self.hears(enough), "waited {TIMEOUT:?} for {what} on {}", self.bus.name());
     }
 
     /// Waits until each of these cells has said a torque that is not zero.

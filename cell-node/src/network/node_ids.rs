@@ -9,7 +9,7 @@ use super::port::Port;
 
 /// The cell's number, and what it knows of the numbers of those below it.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Numbers {
+pub(super) struct NodeIds {
     /// Its own, if it has one.
     pub(super) own: Option<CellId>,
     /// A number that a walk gave it, until that is asked.
@@ -22,20 +22,20 @@ pub(super) struct Numbers {
 
 impl Network {
     pub(super) fn is_unnumbered(&self) -> bool {
-        self.numbers.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
+        self.node_ids.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
     }
 
     /// Numbers are given away: this cell takes the first if it has none, and then each child's turn comes.
     pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
-        if self.numbers.last_walk.replace(walk.walk) == Some(walk.walk) {
+        if self.node_ids.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;
         }
-        if self.numbers.own.is_none()
+        if self.node_ids.own.is_none()
             && walk.first <= walk.last
             && let Ok(number) = CellId::new(walk.first.into())
         {
-            self.numbers.own = Some(number);
-            self.numbers.given = Some(number);
+            self.node_ids.own = Some(number);
+            self.node_ids.given = Some(number);
             walk.first += 1;
             self.hello_to_all(now);
         }
@@ -43,7 +43,7 @@ impl Network {
     }
 
     pub(super) fn go_on_walking(&mut self, port: usize, walk: Walk) {
-        if self.numbers.walking.is_some_and(|(of, at)| at == port && of.walk == walk.walk) {
+        if self.node_ids.walking.is_some_and(|(of, at)| at == port && of.walk == walk.walk) {
             self.walk_from(port + 1, walk);
         }
     }
@@ -51,9 +51,9 @@ impl Network {
     fn walk_from(&mut self, first: usize, walk: Walk) {
         let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
-        self.numbers.walking = next.map(|at| (walk, at));
+        self.node_ids.walking = next.map(|at| (walk, at));
         match (next, self.up()) {
-            (Some(port), _) => self.say(port, PortMessage::Number(walk)),
+            (Some(port), _) => self.say(port, PortMessage::NodeId(walk)),
             (None, Some(up)) => self.say(up, PortMessage::Return(walk)),
             (None, None) => {}
         }
@@ -61,7 +61,7 @@ impl Network {
 
     pub(super) fn tell_unnumbered(&mut self, now: Micros) {
         let unnumbered = self.is_unnumbered();
-        if core::mem::replace(&mut self.numbers.was_unnumbered, unnumbered) != unnumbered
+        if core::mem::replace(&mut self.node_ids.was_unnumbered, unnumbered) != unnumbered
             && let Some(up) = self.up()
         {
             self.hello(now, up);

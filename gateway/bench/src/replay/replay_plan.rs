@@ -15,7 +15,7 @@ use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, PacketError, data_id};
 use protocol::time::Micros;
 
-use super::judge::Judge;
+use super::comparator::Comparator;
 use super::survey::{Survey, is_input, is_joints};
 use model::decode::Decoded;
 use model::decode::pick::Pick;
@@ -25,7 +25,7 @@ use trace::order::{Order, Ordered};
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
 /// The least time from one pass to the next, in ns.
-const LEAST_GAP_NS: u64 = 1_000_000;
+const MIN_GAP_NS: u64 = 1_000_000;
 
 /// Whose frames are sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -47,7 +47,7 @@ pub struct Selection {
     /// Which kinds, to and from whom. Times are the survey's.
     pub pick: Pick,
     /// By the capture's buses: where a bus' frames go, if they go anywhere.
-    pub lanes: Vec<Option<usize>>,
+    pub bus_links: Vec<Option<usize>>,
     /// Whether packets are read: joints are numbered, and replies handed on.
     pub reads: bool,
 }
@@ -67,7 +67,7 @@ pub struct Due {
     /// When, in ns after the first one, by the capture's clock and over all passes.
     pub at: u64,
     /// On which bus.
-    pub lane: usize,
+    pub bus_link: usize,
     /// What.
     pub frame: Frame,
     /// What it means for the order of things.
@@ -82,7 +82,7 @@ pub enum Role {
     /// Nothing.
     Plain,
     /// The first half of joints.
-    HalfOfJoints,
+    SegmentOfJoints,
     /// Joints.
     Joints(Open),
 }
@@ -100,7 +100,7 @@ pub struct Open {
 
 /// What a reel came to.
 #[derive(Clone, Debug, Default)]
-pub struct Cut {
+pub struct PlanSummary {
     /// Frames that were not sent, by reason.
     pub skipped: BTreeMap<&'static str, u64>,
     /// Frames that were older than one sent before them.
@@ -109,14 +109,14 @@ pub struct Cut {
 
 /// One pass over a capture, or several.
 #[derive(Debug)]
-pub struct Reel<'a> {
+pub struct ReplayPlan<'a> {
     survey: &'a Survey,
     selection: &'a Selection,
     /// Frames that wait for their place, with their buses.
     order: Order<(usize, Frame)>,
     settler: Settler<Ordered<(usize, Frame)>>,
     steps: VecDeque<Step>,
-    cut: Cut,
+    plan_summary: PlanSummary,
     /// When this pass begins, in ns after the first one.
     offset: u64,
     /// The times of the first and the last frame of this pass that are sent.
@@ -125,7 +125,7 @@ pub struct Reel<'a> {
     counts: (u64, u64),
 }
 
-impl<'a> Reel<'a> {
+impl<'a> ReplayPlan<'a> {
     /// Of a capture that has been looked through.
     #[must_use]
     pub fn new(survey: &'a Survey, selection: &'a Selection) -> Self {
@@ -135,7 +135,7 @@ impl<'a> Reel<'a> {
             order: Order::default(),
             settler: Settler::new(None),
             steps: VecDeque::new(),
-            cut: Cut::default(),
+            plan_summary: PlanSummary::default(),
             offset: 0,
             sent: None,
             counts: (0, 0),
@@ -143,7 +143,7 @@ impl<'a> Reel<'a> {
     }
 
     /// Takes the capture's next frame; breaks off when what follows is of no interest.
-    pub fn take(&mut self, record: &Record<'_>, judge: &mut Judge) -> ControlFlow<()> {
+    pub fn take(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
             return ControlFlow::Continue(());
@@ -151,7 +151,7 @@ impl<'a> Reel<'a> {
         self.order.push(bus, record.time.nanos, (bus, record.frame));
         while let Some(next) = self.order.pop() {
             self.settle(next);
-            self.place_settled(judge)?;
+            self.place_settled(comparator)?;
         }
         ControlFlow::Continue(())
     }
@@ -169,26 +169,26 @@ impl<'a> Reel<'a> {
     }
 
     /// Frames whose turn has come, as far as it is known what they are.
-    fn place_settled(&mut self, judge: &mut Judge) -> ControlFlow<()> {
+    fn place_settled(&mut self, comparator: &mut Comparator) -> ControlFlow<()> {
         while let Some((next, decoded)) = self.settler.pop() {
-            self.place(&next, &decoded, judge)?;
+            self.place(&next, &decoded, comparator)?;
         }
         ControlFlow::Continue(())
     }
 
     /// Takes in that the capture, or what is of interest of it, is at its end; another pass may follow.
-    pub fn end_pass(&mut self, judge: &mut Judge) {
+    pub fn end_pass(&mut self, comparator: &mut Comparator) {
         while let Some(next) = self.order.pop_last() {
             self.settle(next);
         }
         self.settler.finish();
-        let _ = self.place_settled(judge);
+        let _ = self.place_settled(comparator);
         self.order = Order::default();
         self.settler = Settler::new(None);
         if let Some((first, last)) = self.sent.take() {
             let (frames, joints) = self.counts;
             let steps = if joints > 1 { joints } else { frames }.saturating_sub(1).max(1);
-            let gap = ((last - first).checked_div(steps)).unwrap_or(0).max(LEAST_GAP_NS);
+            let gap = ((last - first).checked_div(steps)).unwrap_or(0).max(MIN_GAP_NS);
             self.offset += last - first + gap;
         }
         self.counts = (0, 0);
@@ -198,22 +198,22 @@ impl<'a> Reel<'a> {
     #[must_use]
     pub fn restoring(&self) -> Step {
         let bounds = self.survey.bounds();
-        let of = |(bus, lane): (&super::survey::Bus, &Option<usize>)| {
+        let of = |(bus, bus_link): (&super::survey::Bus, &Option<usize>)| {
             let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
-            Some(((*lane)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
+            Some(((*bus_link)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
         };
-        Step::Restore(self.survey.buses.iter().zip(&self.selection.lanes).filter_map(of).collect())
+        Step::Restore(self.survey.buses.iter().zip(&self.selection.bus_links).filter_map(of).collect())
     }
 
     /// What it came to.
     #[must_use]
-    pub fn into_cut(self) -> Cut {
-        self.cut
+    pub fn into_summary(self) -> PlanSummary {
+        self.plan_summary
     }
 
     /// Counts something that is not sent.
     pub fn skip(&mut self, reason: &'static str) {
-        *self.cut.skipped.entry(reason).or_default() += 1;
+        *self.plan_summary.skipped.entry(reason).or_default() += 1;
     }
 
     /// A frame's turn has come.
@@ -221,7 +221,7 @@ impl<'a> Reel<'a> {
         &mut self,
         next: &Ordered<(usize, Frame)>,
         decoded: &Decoded,
-        judge: &mut Judge,
+        comparator: &mut Comparator,
     ) -> ControlFlow<()> {
         let (from, to) = self.survey.bounds();
         if next.at >= to.saturating_add(LATE_REPLIES_NS) {
@@ -235,34 +235,34 @@ impl<'a> Reel<'a> {
         } else {
             self.unwanted(bus, &frame, decoded)
         };
-        let lane = self.lane(bus);
-        let role = lane.filter(|_| self.selection.reads).map_or(Role::Plain, |lane| {
+        let bus_link = self.bus_link(bus);
+        let role = bus_link.filter(|_| self.selection.reads).map_or(Role::Plain, |bus_link| {
             let is_in_part = (from..to).contains(&next.nanos);
-            read(lane, next.nanos, decoded, unwanted.is_none(), is_in_part, judge)
+            read(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
         });
         if let Some(reason) = unwanted {
             self.skip(reason);
             return ControlFlow::Continue(());
         }
-        let Some(lane) = lane else { return ControlFlow::Continue(()) };
-        self.cut.late += u64::from(next.is_late);
+        let Some(bus_link) = bus_link else { return ControlFlow::Continue(()) };
+        self.plan_summary.late += u64::from(next.is_late);
         let (first, last) = self.sent.get_or_insert((next.at, next.at));
         *last = next.at;
         let at = self.offset + (next.at - *first);
         self.counts.0 += 1;
-        self.counts.1 += u64::from(matches!(role, Role::Joints(_)) && lane == 0);
-        self.steps.push_back(Step::Frame(Due { at, lane, frame, role, is_late: next.is_late }));
+        self.counts.1 += u64::from(matches!(role, Role::Joints(_)) && bus_link == 0);
+        self.steps.push_back(Step::Frame(Due { at, bus_link, frame, role, is_late: next.is_late }));
         ControlFlow::Continue(())
     }
 
     /// Where a bus' frames go.
-    fn lane(&self, bus: usize) -> Option<usize> {
-        self.selection.lanes.get(bus).copied().flatten()
+    fn bus_link(&self, bus: usize) -> Option<usize> {
+        self.selection.bus_links.get(bus).copied().flatten()
     }
 
     /// Why a frame of the part is not sent.
     fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
-        let picked = self.lane(bus).is_some() && self.selection.pick.takes(0, 0, frame, decoded);
+        let picked = self.bus_link(bus).is_some() && self.selection.pick.takes(0, 0, frame, decoded);
         if frame.is_error() {
             return Some(reason::ERROR);
         }
@@ -282,24 +282,30 @@ impl<'a> Reel<'a> {
 
 /// Reads what a frame says, as far as that is of interest.
 fn read(
-    lane: usize,
+    bus_link: usize,
     nanos: u64,
     decoded: &Decoded,
     is_sent: bool,
     is_in_part: bool,
-    judge: &mut Judge,
+    comparator: &mut Comparator,
 ) -> Role {
     if let Decoded::Message(Message::Joints { epoch, joints }) = *decoded {
-        return Role::Joints(Open { epoch, joints, round: judge.record_joints(lane, nanos, epoch, is_sent) });
+        return Role::Joints(Open {
+            epoch,
+            joints,
+            round: comparator.record_joints(bus_link, nanos, epoch, is_sent),
+        });
     }
     if let Decoded::Message(message) = decoded {
-        judge.record(lane, message, is_in_part);
+        comparator.record(bus_link, message, is_in_part);
     }
     match *decoded {
-        Decoded::Half { id } | Decoded::Damaged { id, fault: PacketError::Incomplete } if is_joints(id) => {
-            Role::HalfOfJoints
+        Decoded::Segment { id } | Decoded::Damaged { id, fault: PacketError::Incomplete }
+            if is_joints(id) =>
+        {
+            Role::SegmentOfJoints
         }
-        Decoded::Half { .. }
+        Decoded::Segment { .. }
         | Decoded::Message(_)
         | Decoded::Foreign(_)
         | Decoded::Wire(..)

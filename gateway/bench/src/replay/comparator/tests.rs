@@ -1,4 +1,4 @@
-use super::lane::Excuse;
+use super::bus_comparator::KnownCell;
 use super::*;
 use crate::replay::survey::{Part, Survey};
 use protocol::can::Format;
@@ -45,9 +45,9 @@ fn joints(epoch: u8) -> Message {
 }
 
 /// A recording, 1 ms from one message to the next, and what is heard now to the same joints.
-fn judged(recording: &[Message], now: &[Message]) -> Judge {
+fn rated(recording: &[Message], now: &[Message]) -> Comparator {
     let mut survey = Survey::new(Part::default());
-    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
     let times = (1_u64..).map(|at| at * MS);
     for (nanos, message) in times.clone().zip(recording) {
         let time = Timestamp { nanos, nine_digits: false };
@@ -57,34 +57,34 @@ fn judged(recording: &[Message], now: &[Message]) -> Judge {
     }
     survey.finish();
     let cells = survey.buses[0].cells.clone();
-    judge.lanes[0].excuses = cells
+    comparator.bus_comparators[0].known = cells
         .into_iter()
-        .map(|(node, cell)| (node, Excuse { cell, ended_earlier: false, speaks: None }))
+        .map(|(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None }))
         .collect();
-    judge.mute(false);
+    comparator.mute(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {
-            judge.record_joints(0, nanos, epoch, true);
+            comparator.record_joints(0, nanos, epoch, true);
         } else {
-            judge.record(0, message, true);
+            comparator.record(0, message, true);
         }
     }
-    judge.record_end();
+    comparator.record_end();
     let mut round = 0;
     for message in now {
         if let Message::Joints { epoch, .. } = *message {
-            judge.announce(0, Some(round), epoch);
+            comparator.announce(0, Some(round), epoch);
             round += 1;
         } else {
-            judge.hear(0, message);
+            comparator.hear(0, message);
         }
     }
-    judge.finish(true);
-    judge
+    comparator.finish(true);
+    comparator
 }
 
-fn counts(judge: &Judge) -> [u64; 4] {
-    let Tally { equal, different, missing, extra, .. } = judge.tally;
+fn counts(comparator: &Comparator) -> [u64; 4] {
+    let Tally { equal, different, missing, extra, .. } = comparator.tally;
     [equal, different, missing, extra]
 }
 
@@ -106,21 +106,21 @@ fn run() -> Vec<Message> {
 
 #[test]
 fn the_same_again_is_equal_in_whatever_order_cells_speak() {
-    assert_eq!(counts(&judged(&run(), &run())), [3, 0, 0, 0]);
+    assert_eq!(counts(&rated(&run(), &run())), [3, 0, 0, 0]);
     // Late, but it says which joints it answers.
     let mut late = run();
     late.swap(3, 4);
-    assert_eq!(counts(&judged(&run(), &late)), [3, 0, 0, 0]);
-    assert_eq!(counts(&judged(&late, &run())), [3, 0, 0, 0]);
+    assert_eq!(counts(&rated(&run(), &late)), [3, 0, 0, 0]);
+    assert_eq!(counts(&rated(&late, &run())), [3, 0, 0, 0]);
 }
 
 #[test]
 fn one_step_is_a_difference() {
     let mut now = run();
     now[5] = torque(1, 2, 7);
-    let judge = judged(&run(), &now);
-    assert_eq!(counts(&judge), [2, 1, 0, 0]);
-    let first = judge.first().unwrap();
+    let comparator = rated(&run(), &now);
+    assert_eq!(counts(&comparator), [2, 1, 0, 0]);
+    let first = comparator.first().unwrap();
     assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (How::Different, Some((2, 2))));
     assert!(first.text.ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first:?}");
 }
@@ -129,18 +129,18 @@ fn one_step_is_a_difference() {
 fn a_reply_that_does_not_come_and_one_that_nobody_recorded_are_told_apart() {
     let mut now = run();
     now.remove(5);
-    let judge = judged(&run(), &now);
-    assert_eq!((counts(&judge), judge.first().unwrap().how), ([2, 0, 1, 0], How::Missing));
+    let comparator = rated(&run(), &now);
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([2, 0, 1, 0], How::Missing));
     let mut now = run();
     now.insert(9, torque(1, 4, 9));
-    let judge = judged(&[&run()[..], &[joints(5)]].concat(), &now);
-    assert_eq!((counts(&judge), judge.first().unwrap().how), ([3, 0, 0, 1], How::Extra));
+    let comparator = rated(&[&run()[..], &[joints(5)]].concat(), &now);
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([3, 0, 0, 1], How::Extra));
     // Twice the same is one answer, as of joints that were asked again; twice otherwise is not.
     let mut now = run();
     now.insert(4, torque(1, 1, 5));
-    assert_eq!(counts(&judged(&run(), &now)), [3, 0, 0, 0]);
+    assert_eq!(counts(&rated(&run(), &now)), [3, 0, 0, 0]);
     now[4] = torque(1, 1, 4);
-    assert_eq!(counts(&judged(&run(), &now)), [3, 0, 0, 1]);
+    assert_eq!(counts(&rated(&run(), &now)), [3, 0, 0, 1]);
 }
 
 #[test]
@@ -148,13 +148,13 @@ fn what_the_recording_lost_is_not_blamed_on_the_cell() {
     // The heartbeats say that it had sent one packet more.
     let mut lossy = run();
     lossy.remove(5);
-    let judge = judged(&lossy, &run());
-    assert_eq!((counts(&judge), judge.tally.lacking.unrecorded), ([2, 0, 0, 0], 1));
+    let comparator = rated(&lossy, &run());
+    assert_eq!((counts(&comparator), comparator.tally.lacking.unrecorded), ([2, 0, 0, 0], 1));
     // But only as many as they say.
     lossy.remove(3);
     lossy[7] = heartbeat(1, 4, 13, Flags::TEST_MODE);
-    let judge = judged(&lossy, &run());
-    assert_eq!((counts(&judge), judge.tally.lacking.unrecorded), ([1, 0, 0, 1], 1));
+    let comparator = rated(&lossy, &run());
+    assert_eq!((counts(&comparator), comparator.tally.lacking.unrecorded), ([1, 0, 0, 1], 1));
 }
 
 #[test]
@@ -175,12 +175,12 @@ fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
         Message::Report,
         heard(1, 105),
     ];
-    let judge = judged(&recording, &run());
-    let Lacking { untaken, said_later, .. } = judge.tally.lacking;
-    assert_eq!((counts(&judge), untaken, said_later), ([2, 0, 0, 0], 1, 1));
+    let comparator = rated(&recording, &run());
+    let Lacking { untaken, said_later, .. } = comparator.tally.lacking;
+    assert_eq!((counts(&comparator), untaken, said_later), ([2, 0, 0, 0], 1, 1));
     let mut knows = recording;
     knows[12] = heard(1, 106);
-    assert_eq!(counts(&judged(&knows, &run())), [2, 0, 1, 1], "it took all, by its own counters");
+    assert_eq!(counts(&rated(&knows, &run())), [2, 0, 1, 1], "it took all, by its own counters");
 }
 
 #[test]
@@ -189,24 +189,24 @@ fn a_cell_that_was_silent_then_may_speak_now() {
     recording.extend(std::iter::repeat_n(Message::Sync, 700));
     recording.extend([joints(5), joints(6)]);
     let now = [&run()[..], &[joints(5), torque(1, 5, 5), torque(2, 5, 1), joints(6)]].concat();
-    let judge = judged(&recording, &now);
+    let comparator = rated(&recording, &now);
     // Cell 2 is not in the recording at all.
-    assert_eq!((counts(&judge), judge.tally.lacking.silent), ([3, 0, 0, 0], 2));
+    assert_eq!((counts(&comparator), comparator.tally.lacking.silent), ([3, 0, 0, 0], 2));
 }
 
 #[test]
 fn the_end_of_a_recording_may_come_before_the_answers() {
     let recording = &run()[..7];
-    let judge = judged(recording, &run()[..8]);
-    assert_eq!((counts(&judge), judge.tally.lacking.ended), ([2, 0, 0, 0], 1));
+    let comparator = rated(recording, &run()[..8]);
+    assert_eq!((counts(&comparator), comparator.tally.lacking.ended), ([2, 0, 0, 0], 1));
 }
 
 #[test]
 fn answers_to_joints_that_were_not_recorded_are_named() {
     let mut recording = run();
     recording.remove(4);
-    let judge = judged(&recording, &run());
-    assert_eq!(judge.tally.lacking.joints_unrecorded, 1);
+    let comparator = rated(&recording, &run());
+    assert_eq!(comparator.tally.lacking.joints_unrecorded, 1);
 }
 
 #[test]
@@ -215,8 +215,8 @@ fn a_cell_that_measured_is_not_compared() {
     recording[0] = heartbeat(1, 0, 10, Flags::default());
     let mut now = run();
     now[5] = torque(1, 2, 7);
-    let judge = judged(&recording, &now);
-    assert_eq!((counts(&judge), judge.tally.lacking.measured), ([0, 0, 0, 0], 3));
+    let comparator = rated(&recording, &now);
+    assert_eq!((counts(&comparator), comparator.tally.lacking.measured), ([0, 0, 0, 0], 3));
 }
 
 #[test]
@@ -229,23 +229,23 @@ fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
     let at = run().len() - 1;
     let mut recording = run();
     recording.insert(at, says(5));
-    let judge = judged(&recording, &run());
-    assert_eq!(counts(&judge), [3, 0, 1, 0], "somebody had asked for it");
+    let comparator = rated(&recording, &run());
+    assert_eq!(counts(&comparator), [3, 0, 1, 0], "somebody had asked for it");
     let request = Request::Write { number: 7, words: [2, 0, 0, 0, 0, 0] };
     recording.insert(0, Message::Configure { to: Node::Everyone, tag: 0, request });
-    let judge = judged(&recording, &run());
-    assert_eq!((counts(&judge), judge.tally.lacking.sensed_otherwise), ([3, 0, 0, 0], 1));
+    let comparator = rated(&recording, &run());
+    assert_eq!((counts(&comparator), comparator.tally.lacking.sensed_otherwise), ([3, 0, 0, 0], 1));
     let mut now = run();
     now.insert(at, says(6));
     assert_eq!(
-        counts(&judged(&recording, &now)),
+        counts(&rated(&recording, &now)),
         [3, 1, 0, 0],
         "but what is said at the same joints is compared"
     );
 }
 
 #[test]
-fn what_a_cell_felt_before_it_had_taken_any_joints_is_of_none() {
+fn what_a_cell_contact_before_it_had_taken_any_joints_is_of_none() {
     let sensors = |epoch| {
         let page = SensorPage::Acceleration([Q3_12::from_bits(4), Q3_12::ZERO, Q3_12::ZERO]);
         Message::Sensors { from: cell(1), epoch: Epoch(epoch), page }
@@ -253,11 +253,11 @@ fn what_a_cell_felt_before_it_had_taken_any_joints_is_of_none() {
     // A report that was asked for before the first joints, and answered when they stood on the bus already.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 0), sensors(0)]);
-    assert_eq!(counts(&judged(&recording, &run())), [3, 0, 0, 0]);
+    assert_eq!(counts(&rated(&recording, &run())), [3, 0, 0, 0]);
     let late = |said: &[Message]| {
         let mut recording = recording.clone();
         recording.splice(5..5, said.iter().copied());
-        counts(&judged(&recording, &run()))
+        counts(&rated(&recording, &run()))
     };
     // Its counters, its torque and another epoch say that it has taken joints since.
     assert_eq!(late(&[heard(1, 1), sensors(0)]), [3, 0, 1, 0]);
@@ -266,20 +266,20 @@ fn what_a_cell_felt_before_it_had_taken_any_joints_is_of_none() {
     // And of a cell that had taken joints before, it is as ever.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 7), sensors(0)]);
-    assert_eq!(counts(&judged(&recording, &run())), [3, 0, 1, 0]);
+    assert_eq!(counts(&rated(&recording, &run())), [3, 0, 1, 0]);
 }
 
 #[test]
 fn joints_that_a_bus_did_not_take_have_no_answer() {
-    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
-    judge.mute(false);
-    judge.record_joints(0, 1, Epoch(1), true);
-    judge.record(0, &torque(1, 1, 5), true);
-    judge.announce(0, Some(0), Epoch(1));
-    judge.was_not_sent(0, 0);
-    judge.finish(true);
-    assert_eq!((counts(&judge), judge.tally.not_asked), ([0, 0, 0, 0], 1));
-    assert!(!judge.tally.is_good());
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    comparator.mute(false);
+    comparator.record_joints(0, 1, Epoch(1), true);
+    comparator.record(0, &torque(1, 1, 5), true);
+    comparator.announce(0, Some(0), Epoch(1));
+    comparator.was_not_sent(0, 0);
+    comparator.finish(true);
+    assert_eq!((counts(&comparator), comparator.tally.not_requested), ([0, 0, 0, 0], 1));
+    assert!(!comparator.tally.is_good());
 }
 
 #[test]
@@ -293,9 +293,9 @@ fn answers_to_configure_are_compared_in_their_order() {
     let recording =
         [joints(0), says(value(P::Pose, 1)), says(value(P::Identity, 1)), says(value(P::Pose, 2))];
     let now = [joints(0), says(value(P::Identity, 9)), says(value(P::Pose, 1)), says(value(P::Pose, 3))];
-    let judge = judged(&recording, &now);
-    assert_eq!(counts(&judge), [1, 1, 0, 0], "who a cell is, is not compared");
-    let text = judge.first().unwrap().text.clone();
+    let comparator = rated(&recording, &now);
+    assert_eq!(counts(&comparator), [1, 1, 0, 0], "who a cell is, is not compared");
+    let text = comparator.first().unwrap().text.clone();
     assert!(text.contains("recorded  configured 1 tag 3: wrote pose"), "{text}");
 }
 
@@ -306,14 +306,14 @@ fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
         let epoch = number.to_le_bytes()[0];
         all.extend([joints(epoch), torque(1, epoch, number)]);
     }
-    let judge = judged(&all, &all);
-    assert_eq!(counts(&judge), [1_000, 0, 0, 0]);
-    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let comparator = rated(&all, &all);
+    assert_eq!(counts(&comparator), [1_000, 0, 0, 0]);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
     for number in 0..1_000_u64 {
         let epoch = Epoch(number.to_le_bytes()[0]);
-        judge.record_joints(0, number, epoch, true);
-        judge.announce(0, Some(number), epoch);
-        assert!(judge.lanes[0].rounds.len() <= 102);
+        comparator.record_joints(0, number, epoch, true);
+        comparator.announce(0, Some(number), epoch);
+        assert!(comparator.bus_comparators[0].rounds.len() <= 102);
     }
 }
 
@@ -349,20 +349,20 @@ fn beside(own: [i16; 2]) -> Vec<Message> {
 
 #[test]
 fn sums_less_their_children_are_equal_in_another_tree() {
-    let judge = judged(&row(), &row());
-    assert_eq!((counts(&judge), judge.tally.sums), ([18, 0, 0, 0], 18), "all three spoke");
-    let judge = judged(&row(), &beside([10, 30]));
-    assert_eq!((counts(&judge), judge.tally.sums), ([12, 0, 0, 0], 12), "{:?}", judge.first());
-    assert!(judge.tally.is_good());
-    let judge = judged(&row(), &beside([11, 29]));
-    assert_eq!(counts(&judge), [12, 0, 0, 0], "one step is rounding");
+    let comparator = rated(&row(), &row());
+    assert_eq!((counts(&comparator), comparator.tally.sums), ([18, 0, 0, 0], 18), "all three spoke");
+    let comparator = rated(&row(), &beside([10, 30]));
+    assert_eq!((counts(&comparator), comparator.tally.sums), ([12, 0, 0, 0], 12), "{:?}", comparator.first());
+    assert!(comparator.tally.is_good());
+    let comparator = rated(&row(), &beside([11, 29]));
+    assert_eq!(counts(&comparator), [12, 0, 0, 0], "one step is rounding");
 }
 
 #[test]
 fn a_sum_that_differs_is_shown_with_its_children() {
-    let judge = judged(&row(), &beside([16, 30]));
-    assert_eq!(counts(&judge), [6, 6, 0, 0]);
-    let text = judge.first().unwrap().text.clone();
+    let comparator = rated(&row(), &beside([16, 30]));
+    assert_eq!(counts(&comparator), [6, 6, 0, 0]);
+    let text = comparator.first().unwrap().text.clone();
     let expected = "the first difference: cell 1 on vcan0, joints 0 (epoch 0, 0.007 s into the recording)
   recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; less its child 2: 0.039 0.000 0.000 \
                     0.000 0.000 0.000 Nm
@@ -378,9 +378,9 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
     now.retain(
         |message| !matches!(message, Message::Sum { from, epoch, .. } if from.get() == 3 && epoch.0 == 4),
     );
-    let judge = judged(&row(), &now);
+    let comparator = rated(&row(), &now);
     // The parent then may have taken it or not: nobody knows.
-    assert_eq!((counts(&judge), judge.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
 }
 
 #[test]
@@ -388,19 +388,24 @@ fn a_cell_that_spoke_and_did_not_say_the_end_did_not_come_to_its_slot() {
     let mut late = row();
     let silent = |epoch| move |message: &Message| matches!(message, Message::Sum { from, epoch: of, .. } if from.get() == 1 && of.0 == epoch);
     late.retain(|message| !silent(3)(message));
-    let judge = judged(&late, &row());
-    assert_eq!((counts(&judge), judge.tally.lacking.slot_missed), ([17, 0, 0, 0], 1));
+    let comparator = rated(&late, &row());
+    assert_eq!((counts(&comparator), comparator.tally.lacking.slot_skipped), ([17, 0, 0, 0], 1));
     // One that had said the end would have had to say the beginning.
     let mut ended = row();
     ended.retain(|message| !silent(2)(message) && !silent(3)(message));
     let at = ended.iter().position(|message| *message == joints(3)).unwrap();
     ended.insert(at, sum(1, 2, 0, 0));
-    let judge = judged(&ended, &row());
-    assert_eq!((judge.tally.extra, judge.tally.lacking.slot_missed), (1, 0), "{:?}", judge.tally);
+    let comparator = rated(&ended, &row());
+    assert_eq!(
+        (comparator.tally.extra, comparator.tally.lacking.slot_skipped),
+        (1, 0),
+        "{:?}",
+        comparator.tally
+    );
 }
 
 #[test]
-fn who_changes_its_parent_is_left_out_in_that_epoch_and_counted() {
+fn who_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
     let mut now = row();
     let at = now.iter().position(|message| *message == joints(3)).unwrap();
     // After joints 2: from joints 3 on it is a root.
@@ -414,80 +419,80 @@ fn who_changes_its_parent_is_left_out_in_that_epoch_and_counted() {
             };
         }
     }
-    let judge = judged(&row(), &now);
+    let comparator = rated(&row(), &now);
     // Cells 2 and 3 in the epoch before the change and in the one after it; later cell 2 has nothing to pass on.
-    assert_eq!((judge.tally.lacking.parent_changing, counts(&judge)), (4, [6 + 2 + 4, 0, 0, 0]));
-    assert!(judge.tally.is_good());
+    assert_eq!((comparator.tally.lacking.parent_changing, counts(&comparator)), (4, [6 + 2 + 4, 0, 0, 0]));
+    assert!(comparator.tally.is_good());
 }
 
 #[test]
 fn without_a_tree_nothing_is_compared_and_that_is_no_success() {
     let mut lost = row();
     lost.remove(5);
-    let judge = judged(&lost, &row());
-    assert_eq!((counts(&judge), judge.tally.lacking.tree_unknown), ([0, 0, 0, 0], 18));
-    assert!(!judge.tally.is_good());
+    let comparator = rated(&lost, &row());
+    assert_eq!((counts(&comparator), comparator.tally.lacking.tree_unknown), ([0, 0, 0, 0], 18));
+    assert!(!comparator.tally.is_good());
 }
 
 #[test]
-fn joints_that_are_asked_again_have_the_sums_of_the_last_time() {
-    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
-    judge.mute(false);
+fn joints_that_are_retried_have_the_sums_of_the_last_time() {
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    comparator.mute(false);
     for message in &row()[3..6] {
-        judge.record(0, message, true);
-        judge.hear(0, message);
+        comparator.record(0, message, true);
+        comparator.hear(0, message);
     }
-    judge.hear(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
-    judge.record_joints(0, 1, Epoch(7), true);
-    judge.record(0, &sum(1, 7, 40, 1), true);
-    judge.announce(0, Some(0), Epoch(7));
-    judge.hear(0, &sum(1, 7, 90, 2));
-    assert_eq!(judge.unanswered(0, 0), 0);
-    judge.announce(0, Some(0), Epoch(6));
-    assert_eq!(judge.unanswered(0, 0), 1);
-    judge.hear(0, &sum(1, 7, 90, 2));
-    judge.hear(0, &sum(1, 6, 40, 1));
-    assert_eq!(judge.unanswered(0, 0), 0);
-    judge.finish(true);
-    assert_eq!(counts(&judge), [1, 0, 0, 0]);
+    comparator.hear(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
+    comparator.record_joints(0, 1, Epoch(7), true);
+    comparator.record(0, &sum(1, 7, 40, 1), true);
+    comparator.announce(0, Some(0), Epoch(7));
+    comparator.hear(0, &sum(1, 7, 90, 2));
+    assert_eq!(comparator.unanswered(0, 0), 0);
+    comparator.announce(0, Some(0), Epoch(6));
+    assert_eq!(comparator.unanswered(0, 0), 1);
+    comparator.hear(0, &sum(1, 7, 90, 2));
+    comparator.hear(0, &sum(1, 6, 40, 1));
+    assert_eq!(comparator.unanswered(0, 0), 0);
+    comparator.finish(true);
+    assert_eq!(counts(&comparator), [1, 0, 0, 0]);
 }
 
 #[test]
 fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
-    let mut judge = Judge::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
     let beat = |number, epoch| heartbeat(number, epoch, 0, Flags::TEST_MODE);
-    judge.hear(0, &beat(1, 0));
-    judge.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
-    assert!(judge.is_done(0), "nothing was asked");
-    judge.announce(0, None, Epoch(9));
-    assert!(!judge.is_done(0));
-    judge.hear(0, &beat(1, 8));
-    assert!(!judge.is_done(0), "said before it took them");
-    judge.hear(0, &beat(1, 9));
-    assert!(judge.is_done(0), "who claims its number is not waited for");
-    judge.announce(0, None, Epoch(10));
+    comparator.hear(0, &beat(1, 0));
+    comparator.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
+    assert!(comparator.is_done(0), "nothing was asked");
+    comparator.announce(0, None, Epoch(9));
+    assert!(!comparator.is_done(0));
+    comparator.hear(0, &beat(1, 8));
+    assert!(!comparator.is_done(0), "said before it took them");
+    comparator.hear(0, &beat(1, 9));
+    assert!(comparator.is_done(0), "who claims its number is not waited for");
+    comparator.announce(0, None, Epoch(10));
     // One that refuses these joints says its old epoch: once because its time had come, once because of the sync.
-    judge.hear(0, &beat(1, 9));
-    assert!(!judge.is_done(0));
-    judge.hear(0, &beat(1, 9));
-    assert!(judge.is_done(0));
-    judge.announce(0, None, Epoch(11));
-    assert_eq!(judge.give_up(0), [cell(1)]);
-    assert!(judge.is_done(0), "given up");
-    judge.hear(0, &beat(1, 10));
-    assert!(!judge.is_done(0), "it speaks again");
-    judge.is_down(0);
-    assert!(judge.is_done(0), "nobody is waited for on a bus that is down");
+    comparator.hear(0, &beat(1, 9));
+    assert!(!comparator.is_done(0));
+    comparator.hear(0, &beat(1, 9));
+    assert!(comparator.is_done(0));
+    comparator.announce(0, None, Epoch(11));
+    assert_eq!(comparator.give_up(0), [cell(1)]);
+    assert!(comparator.is_done(0), "given up");
+    comparator.hear(0, &beat(1, 10));
+    assert!(!comparator.is_done(0), "it speaks again");
+    comparator.is_down(0);
+    assert!(comparator.is_done(0), "nobody is waited for on a bus that is down");
 }
 
 #[test]
-fn somebody_else_who_sends_joints_is_a_rival() {
-    let mut judge =
-        Judge::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, false);
-    judge.hear(1, &Message::Resume);
-    assert_eq!(judge.rival(), None, "anybody may resume");
-    judge.hear(1, &joints(0));
-    assert_eq!(judge.rival(), Some(1));
+fn somebody_else_who_sends_joints_is_a_other_gateway() {
+    let mut comparator =
+        Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, false);
+    comparator.hear(1, &Message::Resume);
+    assert_eq!(comparator.other_gateway(), None, "anybody may resume");
+    comparator.hear(1, &joints(0));
+    assert_eq!(comparator.other_gateway(), Some(1));
 }
 
 mod claims;

@@ -16,7 +16,7 @@ use crate::replay::survey::Cell as Surveyed;
 use crate::replay::touched::Touched;
 
 /// Unanswered requests of a cell that are remembered.
-const ASKED: usize = 256;
+const ANNOUNCED: usize = 256;
 /// What was asked within so many joints of the end may be answered after it.
 const AT_THE_END: u64 = 8;
 
@@ -44,7 +44,7 @@ pub(super) struct Both<T> {
 
 /// Joints as they were announced.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Asked {
+pub(super) struct Announced {
     pub(super) announcement: u64,
     /// Their number among the replayed ones; none for those that only restore a state.
     pub(super) round: Option<u64>,
@@ -63,9 +63,9 @@ pub(super) struct Round {
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were asked last.
-    pub(super) asked_as: Epoch,
+    pub(super) announced_as: Epoch,
     /// How often they were; 0 before they are sent.
-    pub(super) asked: u32,
+    pub(super) announced: u32,
     /// Who is touched at these joints and at the ones before, by what the recording says that was sent.
     pub(super) touched: [Touched; 2],
     /// Whether a pass begins with them.
@@ -86,7 +86,7 @@ impl Round {
 
 /// A cell of the capture.
 #[derive(Debug)]
-pub(super) struct Excuse {
+pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
     /// It said the end of a contact earlier now, because it took joints that it had not taken then.
     pub(super) ended_earlier: bool,
@@ -100,7 +100,7 @@ pub(super) struct Answers {
     /// With the number of rounds before it.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
     /// What was asked in the recording and not answered yet.
-    asked: VecDeque<Question>,
+    announced: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
 }
 
@@ -128,13 +128,13 @@ struct Pass {
 
 /// One bus.
 #[derive(Debug, Default)]
-pub(super) struct Lane {
+pub(super) struct LinkId {
     pub(super) name: String,
-    pub(super) roll: BTreeMap<CellId, Present>,
-    pub(super) excuses: BTreeMap<CellId, Excuse>,
+    pub(super) present: BTreeMap<CellId, Present>,
+    pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
     /// By epoch.
-    pub(super) asked: Vec<Option<Asked>>,
+    pub(super) announced: Vec<Option<Announced>>,
     /// The same of the capture: the round of its latest joints of each epoch.
     pub(super) recorded: Vec<Option<u64>>,
     /// The number of the first of `rounds`.
@@ -158,13 +158,13 @@ pub(super) struct Lane {
     pub(super) is_down: bool,
 }
 
-impl Lane {
+impl LinkId {
     pub(super) fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
-        let excuse = |(node, cell)| (node, Excuse { cell, ended_earlier: false, speaks: None });
+        let known_cell = |(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None });
         Self {
             name,
-            excuses: cells.into_iter().map(excuse).collect(),
-            asked: vec![None; 256],
+            known: cells.into_iter().map(known_cell).collect(),
+            announced: vec![None; 256],
             recorded: vec![None; 256],
             ..Self::default()
         }
@@ -187,13 +187,13 @@ impl Lane {
     }
 
     /// The announcement of the latest joints of an epoch.
-    fn asked(&self, epoch: Epoch) -> Option<Asked> {
-        self.asked.get(usize::from(epoch.0)).copied().flatten()
+    fn announced(&self, epoch: Epoch) -> Option<Announced> {
+        self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
     /// The round that was asked last under an epoch, and its number.
-    pub(super) fn asked_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
-        let number = self.asked(epoch)?.round?;
+    pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
+        let number = self.announced(epoch)?.round?;
         Some((number, self.round(number)?))
     }
 
@@ -209,7 +209,7 @@ impl Lane {
     /// All that was announced so far is to be done with another word of each cell.
     pub(super) fn announce(&mut self) {
         self.announcements += 1;
-        self.roll.values_mut().for_each(|present| present.heartbeats = 0);
+        self.present.values_mut().for_each(|present| present.heartbeats = 0);
     }
 
     /// Forgets recorded replies to what was not sent. What was sent after the last joints nobody knows, so replies to
@@ -244,8 +244,15 @@ impl Lane {
         let before = self.take_joints(epoch);
         if is_sent {
             let touched = [before, self.pass.touched];
-            let asked_as = epoch;
-            self.rounds.push_back(Round { epoch, nanos, asked_as, touched, is_first, ..Round::default() });
+            let announced_as = epoch;
+            self.rounds.push_back(Round {
+                epoch,
+                nanos,
+                announced_as,
+                touched,
+                is_first,
+                ..Round::default()
+            });
         } else {
             self.pass.begins_later |= is_first;
         }
@@ -270,12 +277,12 @@ impl Lane {
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
             let round = self.rounds_so_far();
             let nanos = self.rounds.back().map_or(0, |round| round.nanos);
-            for cell in self.excuses.keys().filter(|cell| to.names(**cell)) {
-                let asked = &mut self.answers.entry(*cell).or_default().asked;
-                if asked.len() == ASKED {
-                    asked.pop_front();
+            for cell in self.known.keys().filter(|cell| to.names(**cell)) {
+                let announced = &mut self.answers.entry(*cell).or_default().announced;
+                if announced.len() == ANNOUNCED {
+                    announced.pop_front();
                 }
-                asked.push_back(Question { tag, round, nanos });
+                announced.push_back(Question { tag, round, nanos });
             }
         }
     }
@@ -298,8 +305,8 @@ impl Lane {
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
         let rounds = self.rounds_so_far();
         let answers = self.answers.entry(from).or_default();
-        match answers.asked.iter().position(|asked| asked.tag == tag) {
-            Some(at) => drop(answers.asked.remove(at)),
+        match answers.announced.iter().position(|announced| announced.tag == tag) {
+            Some(at) => drop(answers.announced.remove(at)),
             None if self.pass.begins_later => return false,
             None => {}
         }
@@ -317,13 +324,13 @@ impl Lane {
 
     /// Where its sums go as it says now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
-        let last = self.asked(epoch).and_then(|asked| asked.round);
+        let last = self.announced(epoch).and_then(|announced| announced.round);
         self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
     pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
-        let announcement = self.asked(epoch);
-        let present = self.roll.entry(cell).or_default();
+        let announcement = self.announced(epoch);
+        let present = self.present.entry(cell).or_default();
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
                 if present.claim.hear(&heartbeat) == Word::Claimant {
@@ -331,8 +338,8 @@ impl Lane {
                 }
                 present.is_given_up = false;
                 present.heartbeats += 1;
-                if let Some(asked) = announcement {
-                    present.done = present.done.max(asked.announcement);
+                if let Some(announced) = announcement {
+                    present.done = present.done.max(announced.announcement);
                 }
                 if !present.claim.is_settled() {
                     self.hear_parent(cell, epoch, None);
@@ -358,26 +365,26 @@ impl Lane {
     pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
         let waits =
             |present: &Present| present.claim.is_settled() && !present.is_given_up && !self.has_done(present);
-        self.roll.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
+        self.present.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
     }
 }
 
 impl Answers {
     /// Whether the recording says why it has the question of this tag and not the answer; `rounds` are all there were.
-    pub(super) fn excuse_extra(
+    pub(super) fn explain_extra(
         &mut self,
         lacking: &mut Lacking,
-        excuse: Option<&mut Excuse>,
+        known_cell: Option<&mut KnownCell>,
         tag: u8,
         rounds: u64,
     ) -> bool {
-        let Some(Excuse { cell, .. }) = excuse else {
+        let Some(KnownCell { cell, .. }) = known_cell else {
             // A cell that the recording does not have.
             lacking.silent += 1;
             return true;
         };
-        let Some(at) = self.asked.iter().position(|asked| asked.tag == tag) else { return false };
-        let Some(Question { round, nanos, .. }) = self.asked.remove(at) else { return false };
+        let Some(at) = self.announced.iter().position(|announced| announced.tag == tag) else { return false };
+        let Some(Question { round, nanos, .. }) = self.announced.remove(at) else { return false };
         if cell.is_silent_at(nanos) {
             lacking.silent += 1;
         } else if round + AT_THE_END >= rounds {
@@ -419,20 +426,20 @@ pub(super) fn take_first_joints(untouched: &mut BTreeMap<CellId, Epoch>, message
 }
 
 /// Whether the recording says why it has no such reply.
-pub(super) fn excuse_extra(
+pub(super) fn explain_extra(
     lacking: &mut Lacking,
-    excuse: Option<&mut Excuse>,
+    known_cell: Option<&mut KnownCell>,
     (cell, round): (CellId, &Round),
     is_last: bool,
     now: [i16; WORDS],
 ) -> bool {
     let may_answer = round.may_answer(cell);
-    let Some(excuse) = excuse else {
+    let Some(known_cell) = known_cell else {
         // A cell that the recording does not have.
         lacking.silent += 1;
         return true;
     };
-    let cell = &mut excuse.cell;
+    let cell = &mut known_cell.cell;
     if cell.measured {
         return true;
     }
@@ -455,6 +462,6 @@ pub(super) fn excuse_extra(
         return false;
     }
     // Counters say how many, and not which: whatever it is that is lacking, the end may have been said later then.
-    excuse.ended_earlier = now == [0; WORDS];
+    known_cell.ended_earlier = now == [0; WORDS];
     true
 }

@@ -6,7 +6,7 @@ use model::table::{Notice, Sums};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
-use protocol::packet::{Epoch, Half, Packet, WORDS};
+use protocol::packet::{Epoch, Packet, Segment, WORDS};
 use protocol::skin::{Safety, Skin};
 use protocol::time::Micros;
 
@@ -27,7 +27,7 @@ pub struct Truth {
     /// That packet's number on this bench; 0 for what is no packet.
     pub number: u64,
     /// Which half of it; 0 for a whole one.
-    pub half: usize,
+    pub segment: usize,
     /// What was done to it.
     pub damage: Option<Harm>,
 }
@@ -36,13 +36,13 @@ impl Truth {
     /// The same after more damage; what is cut is cut, whatever else was done to it.
     #[must_use]
     pub(crate) fn and(self, damage: Option<Harm>) -> Self {
-        let cut = [self.damage, damage].contains(&Some(Harm::Cut));
-        Self { damage: if cut { Some(Harm::Cut) } else { self.damage.or(damage) }, ..self }
+        let link_down = [self.damage, damage].contains(&Some(Harm::LinkDown));
+        Self { damage: if link_down { Some(Harm::LinkDown) } else { self.damage.or(damage) }, ..self }
     }
 
     /// The same, knowing what came: bits that were turned twice are right again.
     fn on_arrival(self, frame: &Frame) -> Self {
-        let meant = self.packet.and_then(|packet| packet.frames(frame.format()).nth(self.half));
+        let meant = self.packet.and_then(|packet| packet.frames(frame.format()).nth(self.segment));
         if meant.is_some_and(|meant| meant == *frame) { Self { damage: None, ..self } } else { self }
     }
 }
@@ -63,7 +63,7 @@ pub struct Tally {
     /// Frames with turned bits.
     pub flipped: u64,
     /// Frames that were cut.
-    pub cut: u64,
+    pub link_down: u64,
     /// Frames that somebody babbled.
     pub babbled: u64,
     /// Own broadcasts.
@@ -86,7 +86,7 @@ struct Mirror {
 
 /// The witness of one bus.
 #[derive(Debug)]
-pub struct Witness {
+pub struct Oracle {
     /// What came.
     pub tally: Tally,
     /// Whether the sum is compared; several cells under one number are beyond it.
@@ -98,10 +98,10 @@ pub struct Witness {
     places: [Option<usize>; 256],
     broadcasts: Vec<Epoch>,
     /// The last frame of each identifier, and when it stood.
-    halves: Vec<Option<(Frame, Micros)>>,
+    segments: Vec<Option<(Frame, Micros)>>,
 }
 
-impl Witness {
+impl Oracle {
     /// Nothing seen yet.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
@@ -119,7 +119,7 @@ impl Witness {
             mirrors: vec![Mirror::default(); skin.cells.len()],
             places,
             broadcasts: Vec::new(),
-            halves: vec![None; 1 << 11],
+            segments: vec![None; 1 << 11],
         }
     }
 
@@ -140,7 +140,7 @@ impl Witness {
         let truth = &truth.on_arrival(frame);
         self.tally.frames += 1;
         match truth.damage {
-            Some(Harm::Cut) => self.tally.cut += 1,
+            Some(Harm::LinkDown) => self.tally.link_down += 1,
             Some(_) => self.tally.flipped += 1,
             None => self.tally.babbled += u64::from(truth.packet.is_none()),
         }
@@ -151,7 +151,7 @@ impl Witness {
         }
         self.tally.packets += 1;
         if message == Message::Halt {
-            self.mirrors.iter_mut().for_each(Mirror::let_go);
+            self.mirrors.iter_mut().for_each(Mirror::released);
         }
         let node = match Node::from_byte(packet.id.node) {
             Node::Cell(cell) => cell.get(),
@@ -184,7 +184,7 @@ impl Witness {
                 let claims = heartbeat.state.has(State::CLAIMING);
                 let challenges = claims && mirror.holder.is_some_and(|holder| holder != truth.from);
                 if !heartbeat.state.has(State::ACTIVE) && !challenges {
-                    mirror.let_go();
+                    mirror.released();
                 }
                 if !claims {
                     mirror.holder = Some(truth.from);
@@ -214,7 +214,7 @@ impl Witness {
                 let recent = self.broadcasts.iter().rev().take(LATEST);
                 let passed = recent.map(|&before| epoch.since(before)).min().unwrap_or(1);
                 if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
-                    self.mirrors.iter_mut().for_each(Mirror::let_go);
+                    self.mirrors.iter_mut().for_each(Mirror::released);
                 }
                 self.broadcasts.push(epoch);
                 let newest = self.broadcasts.len() - 1;
@@ -222,7 +222,7 @@ impl Witness {
                     mirror.grow_old(newest, &self.safety);
                 }
             }
-            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::let_go),
+            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::released),
             Message::Sync
             | Message::Resume
             | Message::Report
@@ -241,10 +241,10 @@ impl Witness {
         if self.format == Format::Fd {
             return truth.damage.is_none();
         }
-        if truth.damage == Some(Harm::Cut) {
+        if truth.damage == Some(Harm::LinkDown) {
             return false;
         }
-        let Some(last) = self.halves.get_mut(usize::try_from(frame.id()).unwrap_or(usize::MAX)) else {
+        let Some(last) = self.segments.get_mut(usize::try_from(frame.id()).unwrap_or(usize::MAX)) else {
             return false;
         };
         if truth.damage.is_some() {
@@ -254,9 +254,9 @@ impl Witness {
         // An equal first half is as good as the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
         let in_time =
-            |since| truth.packet.is_some_and(|packet| stood.since(since) <= Half::within(packet.id));
+            |since| truth.packet.is_some_and(|packet| stood.since(since) <= Segment::within(packet.id));
         let whole =
-            truth.half == 1 && last.is_some_and(|(waits, since)| Some(waits) == first && in_time(since));
+            truth.segment == 1 && last.is_some_and(|(waits, since)| Some(waits) == first && in_time(since));
         *last = if whole { None } else { Some((*frame, stood)) };
         whole
     }
@@ -266,7 +266,7 @@ impl Witness {
         let (Notice::Dead(cell) | Notice::Restarted(cell)) = notice else { return };
         let place = self.places.get(usize::from(cell.get())).copied().flatten();
         if let Some(mirror) = place.and_then(|place| self.mirrors.get_mut(place)) {
-            mirror.let_go();
+            mirror.released();
         }
     }
 
@@ -296,7 +296,7 @@ impl Witness {
 }
 
 impl Mirror {
-    fn let_go(&mut self) {
+    fn released(&mut self) {
         self.held = None;
         self.value = [0; WORDS];
     }
@@ -306,10 +306,10 @@ impl Mirror {
         let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
         let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);
         // The newest broadcast has had no time to be answered.
-        let missed = (newest - answered).saturating_sub(1);
-        let left = (hold + decay).saturating_sub(missed);
-        self.value = match missed {
-            missed if missed <= hold => held,
+        let nack = (newest - answered).saturating_sub(1);
+        let left = (hold + decay).saturating_sub(nack);
+        self.value = match nack {
+            nack if nack <= hold => held,
             _ if left == 0 => [0; WORDS],
             _ => held.map(|word| word * as_i32(left) / as_i32(decay)),
         };

@@ -10,7 +10,7 @@ use toml_edit::{DocumentMut, Item, Table, Value, value};
 /// Why there is no copy.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum NumbersError {
+pub enum NodeIdsError {
     /// Not all cells of a bus have shown their numbers.
     #[error("{missing} of the {cells} cells on {bus} were not heard, so their numbers are not known")]
     Missing {
@@ -27,30 +27,30 @@ pub enum NumbersError {
 }
 
 /// The numbers that cells have, by serial number; `None` of those that were not heard.
-pub type Numbers = BTreeMap<u32, Option<CellId>>;
+pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 
 /// The text of a description with other numbers, and everything else as it was: comments, order, what is left out.
-/// Cells that `numbers` does not have keep theirs. Neighbors are renumbered with the cells.
+/// Cells that `node_ids` does not have keep theirs. Neighbors are renumbered with the cells.
 ///
 /// # Errors
 /// When a number is not known, or the text is not the skin's.
-pub fn renumbered(skin: &Skin, text: &str, numbers: &Numbers) -> Result<String, NumbersError> {
+pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
-        let here = || skin.cells_of(bus).filter_map(|cell| numbers.get(&cell.serial));
+        let here = || skin.cells_of(bus).filter_map(|cell| node_ids.get(&cell.serial));
         let missing = here().filter(|number| number.is_none()).count();
         if missing > 0 {
-            return Err(NumbersError::Missing {
+            return Err(NodeIdsError::Missing {
                 bus: described.name.clone(),
                 missing,
                 cells: here().count(),
             });
         }
     }
-    let number = |serial: u32, own: CellId| numbers.get(&serial).copied().flatten().unwrap_or(own);
+    let number = |serial: u32, own: CellId| node_ids.get(&serial).copied().flatten().unwrap_or(own);
     // What each cell is called now, by its bus and its number in the file.
     let renamed: BTreeMap<_, _> =
         skin.cells.iter().map(|cell| ((cell.bus, cell.node), number(cell.serial, cell.node))).collect();
-    let not_the_text = |why: String| NumbersError::Text(why);
+    let not_the_text = |why: String| NodeIdsError::Text(why);
     let mut document: DocumentMut =
         text.parse().map_err(|error: toml_edit::TomlError| not_the_text(error.to_string()))?;
     let cells = document.get_mut("cell").and_then(Item::as_array_of_tables_mut);
@@ -107,7 +107,7 @@ fn put_after_node(table: &mut Table, serial: i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::{Wanted, generate};
+    use crate::generate::{Target, generate};
 
     fn cell(number: u8) -> CellId {
         CellId::new(number.into()).unwrap()
@@ -144,7 +144,7 @@ neighbors = [2, 0, 0, 0]
 "#;
 
     fn text() -> String {
-        let text = generate(&Wanted { cells: 3, ..Wanted::default() }).unwrap();
+        let text = generate(&Target { cells: 3, ..Target::default() }).unwrap();
         let (head, _) = text.split_once("\n[[cell]]").unwrap();
         format!("{head}{CELLS}")
     }
@@ -153,7 +153,7 @@ neighbors = [2, 0, 0, 0]
     fn numbers_and_neighbors_change_and_nothing_else_does() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let numbers = Numbers::from([(7, Some(cell(2))), (2, Some(cell(50))), (9, Some(cell(3)))]);
+        let node_ids = NodeIds::from([(7, Some(cell(2))), (2, Some(cell(50))), (9, Some(cell(3)))]);
         let expected = text
             .replace("node   = 1   # at the elbow", "node   = 2   # at the elbow")
             .replace("neighbors = [2, 0, 0, 0] # a cable", "neighbors = [50, 0, 0, 0] # a cable")
@@ -163,12 +163,12 @@ neighbors = [2, 0, 0, 0]
                 "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [2,",
                 "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [50,",
             );
-        let copy = renumbered(&skin, &text, &numbers).unwrap();
+        let copy = renumbered(&skin, &text, &node_ids).unwrap();
         assert_eq!(copy, expected);
         // The same cells by their serial numbers, wired as before.
         let copied = Skin::parse("copy.toml", &copy).unwrap();
         for (old, new) in skin.cells.iter().zip(&copied.cells) {
-            assert_eq!((old.serial, numbers[&old.serial]), (new.serial, Some(new.node)));
+            assert_eq!((old.serial, node_ids[&old.serial]), (new.serial, Some(new.node)));
             assert_eq!(skin.parameters(old), copied.parameters(new));
         }
     }
@@ -177,16 +177,16 @@ neighbors = [2, 0, 0, 0]
     fn the_numbers_that_are_there_already_change_nothing() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let numbers = skin.cells.iter().map(|cell| (cell.serial, Some(cell.node))).collect();
-        assert_eq!(renumbered(&skin, &text, &numbers).unwrap(), text);
+        let node_ids = skin.cells.iter().map(|cell| (cell.serial, Some(cell.node))).collect();
+        assert_eq!(renumbered(&skin, &text, &node_ids).unwrap(), text);
     }
 
     #[test]
     fn a_cell_that_was_not_heard_has_no_number_to_be_written() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let numbers = Numbers::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
-        let said = renumbered(&skin, &text, &numbers).unwrap_err().to_string();
+        let node_ids = NodeIds::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
+        let said = renumbered(&skin, &text, &node_ids).unwrap_err().to_string();
         assert_eq!(said, "1 of the 3 cells on vcan0 were not heard, so their numbers are not known");
     }
 }

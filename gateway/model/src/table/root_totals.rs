@@ -115,7 +115,7 @@ impl Expected {
 
 /// The sums of a bus.
 #[derive(Debug, Default)]
-pub(super) struct Trunk {
+pub(super) struct RootTotals {
     /// Newest first.
     epochs: [Option<Open>; LATEST + 1],
     pub(super) counts: SumCounts,
@@ -132,7 +132,7 @@ pub(super) enum Taken {
     Resent,
 }
 
-impl Trunk {
+impl RootTotals {
     /// Takes a root's sum for the epoch `lag` before the newest; `said` is what it has said for it so far.
     pub(super) fn take(&mut self, lag: usize, said: &mut Option<Sum>, sum: Sum) -> Taken {
         let before = *said;

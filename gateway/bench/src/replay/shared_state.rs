@@ -9,8 +9,8 @@ use protocol::bus::Inbox;
 use protocol::time::Micros;
 
 use super::checks::Checks;
-use super::judge::Judge;
-use super::start::Lane;
+use super::comparator::Comparator;
+use super::start::LinkId;
 use crate::run::realtime;
 use crate::run::roots::Roots;
 use model::decode::{Decoded, Decoder};
@@ -22,9 +22,9 @@ const DOWN: Duration = Duration::from_millis(20);
 
 /// What all threads of a replay look at.
 #[derive(Debug)]
-pub(super) struct Hall {
+pub(super) struct SharedState {
     pub(super) checks: Checks,
-    judge: Mutex<Judge>,
+    comparator: Mutex<Comparator>,
     heard: Condvar,
     /// Set once: sending ends.
     pub(super) over: AtomicBool,
@@ -38,13 +38,13 @@ pub(super) struct Hall {
     pub(super) at: AtomicU64,
 }
 
-impl Hall {
+impl SharedState {
     pub(super) fn new(checks: Checks) -> Self {
-        let judged = checks.lanes().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
-        let judge = Judge::new(judged, checks.survey.first.unwrap_or(0), checks.options.expect);
+        let rated = checks.bus_links().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
+        let comparator = Comparator::new(rated, checks.survey.first.unwrap_or(0), checks.options.expect);
         Self {
             checks,
-            judge: Mutex::new(judge),
+            comparator: Mutex::new(comparator),
             heard: Condvar::new(),
             over: AtomicBool::new(false),
             ready: AtomicBool::new(false),
@@ -54,9 +54,9 @@ impl Hall {
         }
     }
 
-    pub(super) fn judge(&self) -> MutexGuard<'_, Judge> {
+    pub(super) fn comparator(&self) -> MutexGuard<'_, Comparator> {
         // Who panics here ends the replay anyway.
-        self.judge.lock().unwrap_or_else(PoisonError::into_inner)
+        self.comparator.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Lets those look who wait for an answer.
@@ -65,8 +65,12 @@ impl Hall {
     }
 
     /// Waits until somebody has been heard, or a moment.
-    pub(super) fn wait<'a>(&self, judge: MutexGuard<'a, Judge>, time: Duration) -> MutexGuard<'a, Judge> {
-        let waited = self.heard.wait_timeout(judge, time);
+    pub(super) fn wait<'a>(
+        &self,
+        comparator: MutexGuard<'a, Comparator>,
+        time: Duration,
+    ) -> MutexGuard<'a, Comparator> {
+        let waited = self.heard.wait_timeout(comparator, time);
         waited.unwrap_or_else(PoisonError::into_inner).0
     }
 
@@ -75,25 +79,26 @@ impl Hall {
     }
 
     /// Takes in that a bus is down.
-    pub(super) fn is_down(&self, lane: usize) {
-        self.judge().is_down(lane);
+    pub(super) fn is_down(&self, bus_link: usize) {
+        self.comparator().is_down(bus_link);
         self.has_heard();
     }
 
     /// Hears a bus until it is over, and is the gateway's side of its roots' wires; returns how many frames came faster
     /// than they were heard.
-    pub(super) fn hear(&self, index: usize, lane: &Lane, mut roots: Option<Roots>) -> u64 {
+    pub(super) fn hear(&self, index: usize, bus_link: &LinkId, mut roots: Option<Roots>) -> u64 {
         realtime::prepare_receiver();
-        let (bus, mut inbox, mut decoder) = (&lane.bus, Inbox::new(), Decoder::new(Some(lane.format)));
+        let (bus, mut inbox, mut decoder) =
+            (&bus_link.bus, Inbox::new(), Decoder::new(Some(bus_link.format)));
         // Its cells may be there already, and organise themselves as they come.
         roots.iter_mut().for_each(Roots::explore);
         while !self.deaf.load(Ordering::Relaxed) {
             if let Some(roots) = &mut roots {
                 roots.speak(bus);
             }
-            let patience = roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.patience()));
+            let timeout = roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.timeout()));
             match bus
-                .wait(Some(patience))
+                .wait(Some(timeout))
                 .and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) })
             {
                 Ok(0) => continue,
@@ -108,17 +113,17 @@ impl Hall {
                     continue;
                 }
             }
-            let mut judge = self.judge();
+            let mut comparator = self.comparator();
             for received in inbox.frames().filter(|received| !received.own) {
                 if roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
                     continue;
                 }
                 let at = Micros(received.at_nanos / 1_000);
                 if let Decoded::Message(message) = decoder.decode(at, bus.name(), &received.frame) {
-                    judge.hear(index, &message);
+                    comparator.hear(index, &message);
                 }
             }
-            drop(judge);
+            drop(comparator);
             self.has_heard();
         }
         inbox.dropped().into()

@@ -38,14 +38,14 @@ impl Case {
 
     fn read(line: &str) -> Self {
         let (joint, rest) = line.split_once(',').unwrap();
-        let numbers: Vec<f64> = rest.split(',').map(|number| number.parse().unwrap()).collect();
+        let node_ids: Vec<f64> = rest.split(',').map(|number| number.parse().unwrap()).collect();
         Self {
             joint: joint.parse().unwrap(),
-            positions: per_joint(&numbers[..6]),
-            position: numbers[6..9].try_into().unwrap(),
-            direction: numbers[9..12].try_into().unwrap(),
-            force: numbers[12],
-            torques: per_joint(&numbers[13..]),
+            positions: per_joint(&node_ids[..6]),
+            position: node_ids[6..9].try_into().unwrap(),
+            direction: node_ids[9..12].try_into().unwrap(),
+            force: node_ids[12],
+            torques: per_joint(&node_ids[13..]),
         }
     }
 
@@ -70,11 +70,11 @@ pub(crate) struct Errors {
     /// The mean of the absolute errors.
     pub(crate) mean: f64,
     /// The greatest absolute error.
-    pub(crate) greatest: f64,
+    pub(crate) max: f64,
     /// How many torques were compared: those of loaded joints.
     pub(crate) torques: usize,
     /// How many cases were left out, because a torque lies beyond Q3.12.
-    pub(crate) left_out: usize,
+    pub(crate) omitted: usize,
 }
 
 impl Errors {
@@ -94,9 +94,9 @@ impl Errors {
             .collect();
         Self {
             mean: errors.iter().sum::<f64>() / errors.len() as f64,
-            greatest: errors.iter().copied().fold(0.0, f64::max),
+            max: errors.iter().copied().fold(0.0, f64::max),
             torques: errors.len(),
-            left_out: cases.len() - cases.iter().filter(fits).count(),
+            omitted: cases.len() - cases.iter().filter(fits).count(),
         }
     }
 

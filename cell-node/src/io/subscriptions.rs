@@ -1,0 +1,156 @@
+//! Which cell of a process hears what.
+
+use std::collections::{BTreeSet, HashMap};
+
+use protocol::bus::Filter;
+use protocol::can::{EXTENDED, REMOTE};
+use protocol::id::Id;
+use protocol::wire::{FLAG, LinkId};
+
+use super::sockets::Hearing;
+
+/// The frames of all simulated wires of a bus.
+const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
+
+/// By identifier and by lane, who hears it: cells by their place in the process.
+#[derive(Debug, Default)]
+pub(super) struct Subscriptions {
+    by_id: HashMap<Id, Heard>,
+    by_link_id: HashMap<LinkId, (usize, usize)>,
+}
+
+/// Who hears an identifier.
+#[derive(Debug, Default)]
+struct Heard {
+    by: Vec<usize>,
+    /// Somebody has to be woken for it.
+    wakes: bool,
+}
+
+impl Subscriptions {
+    /// The port of a cell hears this lane, for good.
+    pub(super) fn wire(&mut self, link_id: LinkId, cell: usize, port: usize) {
+        self.by_link_id.insert(link_id, (cell, port));
+    }
+
+    /// Forgets who hears which identifiers, and takes these in place of it: cell, identifier, and whether it is
+    /// enough to hear it aside.
+    pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
+        self.by_id.clear();
+        for (cell, id, deferred) in hears {
+            let heard = self.by_id.entry(id).or_default();
+            heard.by.push(cell);
+            heard.wakes |= !deferred;
+        }
+    }
+
+    /// The cells that hear an identifier.
+    pub(super) fn of_id(&self, id: Id) -> &[usize] {
+        self.by_id.get(&id).map_or(&[], |heard| &heard.by)
+    }
+
+    /// The cell, and its port, that hears a lane.
+    pub(super) fn of_link_id(&self, link_id: LinkId) -> Option<(usize, usize)> {
+        self.by_link_id.get(&link_id).copied()
+    }
+
+    /// One exact filter for each identifier and each lane; for more than a socket takes, one for each kind that is
+    /// heard, and one for all wires.
+    pub(super) fn hearing(&self) -> Hearing {
+        let link_ids: BTreeSet<_> = self.by_link_id.keys().copied().collect();
+        let ids = |wakes| -> BTreeSet<_> {
+            self.by_id.iter().filter(|(_, heard)| heard.wakes == wakes).map(|(id, _)| *id).collect()
+        };
+        if self.by_id.len() + link_ids.len() <= Filter::MAX {
+            let at_once =
+                ids(true).into_iter().map(Filter::exact).chain(link_ids.into_iter().map(Filter::link_id));
+            return Hearing {
+                at_once: at_once.collect(),
+                deferred: ids(false).into_iter().map(Filter::exact).collect(),
+            };
+        }
+        let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
+        let wires = (!link_ids.is_empty()).then_some(ALL_WIRES);
+        Hearing { at_once: kinds.into_iter().map(Filter::kind).chain(wires).collect(), deferred: Vec::new() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::id::{CellId, Kind, Node};
+
+    fn passes(filters: &[Filter], raw_id: u32) -> bool {
+        filters.iter().any(|filter| raw_id & filter.mask == filter.id & filter.mask)
+    }
+
+    fn subscriptions(cells: usize) -> Subscriptions {
+        let mut subscriptions = Subscriptions::default();
+        let id = |kind, cell| Id::new(kind, Node::Cell(cell));
+        let cells = || CellId::all().take(cells).enumerate();
+        let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell), false));
+        subscriptions.listen(cells().flat_map(hears));
+        for (at, cell) in cells() {
+            subscriptions.wire(LinkId { wire: cell.get().into(), back: true }, at, 2);
+        }
+        subscriptions
+    }
+
+    #[test]
+    fn each_identifier_and_link_id_has_an_exact_filter_as_long_as_they_fit() {
+        let link_id = |wire, back| LinkId { wire, back }.raw_id();
+        let filters = subscriptions(100).hearing().at_once;
+        assert_eq!(filters.len(), 300);
+        for id in [0x401, 0x464, 0x101, link_id(1, true), link_id(100, true)] {
+            assert!(passes(&filters, id), "{id:X}");
+        }
+        for id in [
+            0x465,
+            0x201,
+            0x165,
+            link_id(1, false),
+            link_id(101, true),
+            link_id(1, true) | REMOTE,
+            0x401 | EXTENDED,
+        ] {
+            assert!(!passes(&filters, id), "{id:X}");
+        }
+    }
+
+    #[test]
+    fn too_many_become_kinds_and_all_wires() {
+        let link_id = |wire, back| LinkId { wire, back }.raw_id();
+        let filters = subscriptions(254).hearing().at_once;
+        assert_eq!(filters.len(), 3);
+        for id in [0x401, 0x4FE, 0x101, link_id(1, false), link_id(65_535, true)] {
+            assert!(passes(&filters, id), "{id:X}");
+        }
+        for id in [0x201, 0x001, link_id(1, true) | REMOTE, 0x401 | EXTENDED, FLAG | 0x101 | REMOTE] {
+            assert!(!passes(&filters, id), "{id:X}");
+        }
+    }
+
+    #[test]
+    fn who_hears_an_identifier_changes_and_who_hears_a_link_id_does_not() {
+        let mut subscriptions = subscriptions(3);
+        let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
+        assert_eq!(subscriptions.of_id(id(Kind::Sum, 2)), [1]);
+        subscriptions.listen([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
+        assert_eq!(subscriptions.of_id(id(Kind::Sum, 2)), [0, 2]);
+        assert_eq!(subscriptions.of_id(id(Kind::Sum, 1)), [0; 0]);
+        assert_eq!(subscriptions.of_link_id(LinkId { wire: 2, back: true }), Some((1, 2)));
+        assert_eq!(subscriptions.of_link_id(LinkId { wire: 2, back: false }), None);
+    }
+
+    #[test]
+    fn nobody_is_woken_for_what_all_who_hear_it_receive_deferred() {
+        let mut subscriptions = Subscriptions::default();
+        let id = |number| Id::new(Kind::Sum, Node::Cell(CellId::new(number).unwrap()));
+        subscriptions
+            .listen([(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter());
+        let Hearing { at_once, deferred } = subscriptions.hearing();
+        assert_eq!(at_once, [id(2), id(3)].map(Filter::exact));
+        assert_eq!(deferred, [id(1)].map(Filter::exact));
+        assert_eq!(subscriptions.of_id(id(2)), [1, 2]);
+    }
+}
