@@ -9,6 +9,7 @@ use model::scenario::Scenario;
 use protocol::skin::{ControllerKind, Skin};
 
 const SKIN_MD: &str = include_str!("../../docs/reference/skin.md");
+const SCENARIO_MD: &str = include_str!("../../docs/reference/scenario.md");
 const CONTROLLER_MD: &str = include_str!("../../docs/how-to/external-controller.md");
 
 /// The fenced block of TOML that has this text.
@@ -25,13 +26,13 @@ fn skin_text() -> &'static str {
 }
 
 fn scenario_text() -> &'static str {
-    block(SKIN_MD, "# scenario.toml:")
+    block(SCENARIO_MD, "# scenario.toml:")
 }
 
 /// The keys in the first column of the table under a heading.
-fn documented(heading: &str) -> BTreeSet<String> {
-    let start = SKIN_MD.find(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("no heading {heading:?}"));
-    let section = &SKIN_MD[start + heading.len() + 2..];
+fn documented(page: &str, heading: &str) -> BTreeSet<String> {
+    let start = page.find(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("no heading {heading:?}"));
+    let section = &page[start + heading.len() + 2..];
     let section = section.split("\n#").next().unwrap();
     let rows = section.lines().filter_map(|line| line.strip_prefix("| `"));
     rows.map(|row| row.split('`').next().unwrap().to_owned()).collect()
@@ -95,22 +96,26 @@ fn what_may_be_omitted_has_the_default_that_the_text_says() {
 #[test]
 fn every_key_of_a_skin_is_documented_and_no_other() {
     let at_top = format!("zzz = 1\n{}", skin_text());
-    assert_eq!(documented("### At the top of a skin"), allowed(&at_top, read_skin));
+    assert_eq!(documented(SKIN_MD, "### At the top of a skin"), allowed(&at_top, read_skin));
     for line in ["[robot]", "[timing]", "[contact]", "[[bus]]", "[controller]", "[safety]", "[[cell]]"] {
         let text = spoilt(skin_text(), line);
-        assert_eq!(documented(&format!("### `{line}`")), allowed(&text, read_skin), "{line}");
+        assert_eq!(documented(SKIN_MD, &format!("### `{line}`")), allowed(&text, read_skin), "{line}");
     }
     let row = skin_text().replacen("{ a =", "{ zzz = 1, a =", 1);
-    assert_eq!(documented("### `robot.joints`"), allowed(&row, read_skin));
+    assert_eq!(documented(SKIN_MD, "### `robot.joints`"), allowed(&row, read_skin));
 }
 
 #[test]
 fn every_key_of_a_scenario_is_documented_and_no_other() {
     let at_top = format!("zzz = 1\n{}", scenario_text());
-    assert_eq!(documented("### At the top of a scenario"), allowed(&at_top, read_scenario));
+    assert_eq!(documented(SCENARIO_MD, "### At the top of a scenario"), allowed(&at_top, read_scenario));
     for line in ["[motion]", "[[mode]]", "[[touch]]", "[[fault]]"] {
         let text = spoilt(scenario_text(), line);
-        assert_eq!(documented(&format!("### `{line}`")), allowed(&text, read_scenario), "{line}");
+        assert_eq!(
+            documented(SCENARIO_MD, &format!("### `{line}`")),
+            allowed(&text, read_scenario),
+            "{line}"
+        );
     }
 }
 
@@ -120,8 +125,8 @@ fn every_kind_of_fault_is_documented_and_no_other() {
     let said = read_scenario(&text);
     let (_, kinds) = said.split_once("\"zzz\": ").unwrap_or_else(|| panic!("{said}"));
     let kinds: BTreeSet<&str> = kinds.split('"').skip(1).step_by(2).collect();
-    let start = SKIN_MD.find("### Kinds of faults").unwrap();
-    let rows = SKIN_MD[start..].lines().filter(|line| line.starts_with("| `"));
+    let start = SCENARIO_MD.find("### Kinds of faults").unwrap();
+    let rows = SCENARIO_MD[start..].lines().filter(|line| line.starts_with("| `"));
     let names = rows.flat_map(|row| row.split(" | ").next().unwrap().split('`').skip(1).step_by(2));
     assert_eq!(names.collect::<BTreeSet<_>>(), kinds);
 }

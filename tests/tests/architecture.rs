@@ -1,4 +1,4 @@
-//! Which crate may use which: the arrows of `docs/explanation/architecture.md`.
+//! Which crate may use which: the graph of `docs/explanation/architecture.md`.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -10,22 +10,35 @@ use std::process::Command;
 use quote::ToTokens;
 use syn::{Attribute, Item};
 
-/// Each crate of the workspace, and the others that it may use.
-const MAY_USE: [(&str, &[&str]); 12] = [
-    ("protocol", &[]),
-    ("cell-node", &["protocol"]),
-    ("vcan-setup", &["protocol"]),
-    ("model", &["protocol"]),
-    ("control", &["model", "protocol"]),
-    ("trace", &["model", "protocol"]),
-    ("analysis", &["model", "protocol", "trace"]),
-    ("bench", &["control", "model", "protocol", "trace", "vcan-setup"]),
-    ("paper", &["analysis", "cell-node", "control", "model", "protocol", "trace"]),
-    ("reference", &["cell-node", "model", "protocol"]),
-    ("gateway", &["analysis", "bench", "control", "model", "paper", "protocol", "trace", "vcan-setup"]),
-    // Whole benches are made of everything.
-    ("skinbus-tests", &["analysis", "bench", "cell-node", "control", "model", "paper", "protocol", "trace"]),
-];
+const DOCUMENT: &str = include_str!("../../docs/explanation/architecture.md");
+
+/// Who may use the cell's code directly: the gateway knows of cells what is on the bus.
+const USES_CELLS: [&str; 3] = ["paper", "reference", "skinbus-tests"];
+
+/// The crates of the document's graph, which has no cycle, and what the arrows of each lead to.
+fn arrows() -> BTreeMap<&'static str, BTreeSet<&'static str>> {
+    let (_, graph) = DOCUMENT.split_once("```mermaid\n").unwrap();
+    let mut arrows = BTreeMap::<_, BTreeSet<_>>::new();
+    for line in graph.lines().take_while(|line| *line != "```") {
+        if let Some((from, to)) = line.trim().split_once(" --> ") {
+            arrows.entry(to).or_default();
+            arrows.entry(from).or_default().insert(to);
+        }
+    }
+    let mut left = arrows.clone();
+    while !left.is_empty() {
+        let lowest = left.iter().find(|(_, uses)| uses.iter().all(|name| !left.contains_key(name)));
+        let lowest = *lowest.unwrap_or_else(|| panic!("a cycle among {:?}", left.keys())).0;
+        left.remove(lowest);
+    }
+    arrows
+}
+
+/// What an arrow leads to, and what that may use.
+fn reach<'a>(arrows: &'a BTreeMap<&str, BTreeSet<&str>>, from: &str) -> BTreeSet<&'a str> {
+    let direct = arrows[from].iter();
+    direct.flat_map(|&to| reach(arrows, to).into_iter().chain([to])).collect()
+}
 
 /// The crates of the workspace, and what each uses of the others, its tests included.
 fn used() -> BTreeMap<String, BTreeSet<String>> {
@@ -47,25 +60,22 @@ fn used() -> BTreeMap<String, BTreeSet<String>> {
 }
 
 #[test]
-fn crates_use_what_is_below_them_only() {
-    let used = used();
-    let allowed = BTreeMap::from(MAY_USE);
+fn crates_use_what_the_documents_arrows_lead_to_only() {
+    let (used, arrows) = (used(), arrows());
     let known: BTreeSet<_> = used.keys().map(String::as_str).collect();
-    assert_eq!(known, allowed.keys().copied().collect(), "every crate says what it may use");
+    assert_eq!(known, arrows.keys().copied().collect(), "every crate is in the graph, and nothing else");
     for (name, uses) in &used {
+        let allowed = reach(&arrows, name);
         for other in uses {
-            assert!(allowed[name.as_str()].contains(&other.as_str()), "{name} must not use {other}");
+            assert!(allowed.contains(other.as_str()), "{name} must not use {other}");
+            let of_cells = other != "cell-node" || USES_CELLS.contains(&name.as_str());
+            assert!(of_cells, "{name} must not use {other} directly");
         }
     }
-}
-
-#[test]
-fn the_allowed_directions_have_no_cycle() {
-    let mut left = BTreeMap::from(MAY_USE);
-    while !left.is_empty() {
-        let lowest = left.iter().find(|(_, uses)| uses.iter().all(|name| !left.contains_key(name)));
-        let lowest = *lowest.unwrap_or_else(|| panic!("a cycle among {:?}", left.keys())).0;
-        left.remove(lowest);
+    for (from, to) in arrows.iter().flat_map(|(from, all)| all.iter().map(move |to| (*from, *to))) {
+        assert!(used[from].contains(to), "{from} does not use {to}: the arrow leads nowhere");
+        let round = arrows[from].iter().any(|&other| other != to && reach(&arrows, other).contains(to));
+        assert!(!round, "{from} --> {to}: other arrows lead there");
     }
 }
 
