@@ -18,7 +18,7 @@ use super::print::json;
 ///
 /// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as free
 /// of errors. Heartbeats count; commands and what only a bench sends do not. What a run asked for says `gateway shadow`. Without rates: those of the description where it has
-/// them for every bus, else a table over common ones. docs/how-to/size-a-bus.md says how it is computed.
+/// them for every bus, else a table over common ones. docs/reference/bus-timing.md says how it is computed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway fit gateway/examples/ur5-253.toml

@@ -23,7 +23,7 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 /// Put a capture back on a bus, and compare what the cells answer with what they answered then
 ///
 /// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
-/// bus answer; with --expect their answers have to be the recorded ones, bit for bit. docs/how-to/replay.md says what is
+/// bus answer; with --expect their answers have to be the recorded ones, bit for bit. docs/reference/replay.md says what is
 /// compared and how. Exit code 0: all was sent, and all answers were right; 1: not so; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
@@ -78,7 +78,7 @@ pub(crate) struct Replay {
     /// End before anything is sent when a line of a log cannot be read
     #[arg(long)]
     strict: bool,
-    /// Write the figures of the end as JSON; docs/how-to/replay.md explains its keys
+    /// Write the figures of the end as JSON; docs/reference/replay.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]

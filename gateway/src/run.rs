@@ -56,7 +56,7 @@ struct Common {
 /// What is recorded beside frames as text.
 #[derive(Args, Debug)]
 struct Recording {
-    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/how-to/record.md has the topics
+    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md has the topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
     /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice

@@ -32,7 +32,7 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 /// log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, through a model of a bus with bit rates:
 /// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the moment at
 /// which it was to be sent. What only a bench sends is left out, start-up stands apart, and where the skin is known (attached
-/// to a recording, or --skin) its worst case stands beside the run. docs/how-to/size-a-bus.md says what the figures mean and what the model
+/// to a recording, or --skin) its worst case stands beside the run. docs/reference/bus-timing.md says what the figures mean and what the model
 /// leaves out.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -41,7 +41,7 @@ const RECEIVE_BUFFER: usize = 8 << 20;
   gateway shadow run.log --nominal 500k --data 2M
   gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
   gateway shadow run.log --skin skin.toml
-  gateway shadow run.log --json | jq -c 'select(.end_s - .time > 0.016)'
+  gateway shadow run.log --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   gateway shadow vcan0 vcan1 --duration 10")]
 pub(crate) struct ShadowCommand {
     /// A candump log or MCAP recording when there is a file of this name, all parts of a split recording in any order,

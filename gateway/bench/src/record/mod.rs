@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Nobody waits for the recorder: what does not fit into a queue is counted, and said in the recording where it is
-//! missing. Nothing that happens to a file ends the run. `docs/how-to/record.md` has the topics.
+//! missing. Nothing that happens to a file ends the run. `docs/reference/recording.md` has the topics.
 
 pub(crate) mod backlog;
 pub mod facts;

@@ -1,6 +1,6 @@
 //! What a replay came to: the figures of the table at its end, and of `--summary` and `--json`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/how-to/replay.md` says what they mean.
+//! The keys of the JSON are the names of the fields here; `docs/reference/replay.md` says what they mean.
 
 use std::collections::BTreeMap;
 

@@ -8,7 +8,7 @@
 //! The answer to the last tick must be there when the next one begins, else the cycle is bad. The other
 //! program says hello first; who said it last is the peer, and only the peer is listened to. Nothing
 //! that anybody sends can stop a tick: it is counted, by reason. The bytes are in
-//! `docs/how-to/external-controller.md`.
+//! `docs/reference/external-controller.md`.
 
 mod datagram;
 mod exchange;
