@@ -1,13 +1,17 @@
 //! `vcan-setup serve` as a process.
-#![allow(clippy::unwrap_used, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::io::{BufRead, BufReader, Read};
-use std::path::Path;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Inbox, Options};
-use protocol::can::Frame;
+use protocol::bus::embedded::{Answer, Hello, address, encode_dropped, seqpacket};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::can::{EXTENDED, Frame};
+use protocol::candump::{self, Line};
+use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
@@ -164,4 +168,156 @@ fn wrong_use_is_2_and_failure_is_1_each_in_one_line() {
     assert!(said.starts_with("vcan-setup: the embedded bus vcan0 is already served at "), "{said}");
     signal(&child, Signal::TERM);
     ended(child, &parent);
+}
+
+const DOCUMENT: &str = include_str!("../../docs/reference/embedded-bus.md");
+
+/// The document's program in a language, as a file.
+fn listing(language: &str, folder: &Path) -> PathBuf {
+    let fence = format!("\n```{language}\n");
+    let mut blocks = DOCUMENT.split(&fence).skip(1);
+    let text = blocks.next().and_then(|rest| rest.split("\n```").next()).unwrap();
+    assert_eq!(blocks.next(), None, "one program in {language}");
+    let path = folder.join(format!("attach.{language}"));
+    std::fs::write(&path, format!("{text}\n")).unwrap();
+    path
+}
+
+/// The document's programs, ready to be run.
+fn listings(folder: &Path) -> [Vec<PathBuf>; 2] {
+    let program = folder.join("attach");
+    let mut compiler = Command::new("cc");
+    let compiler =
+        compiler.args(["-Wall", "-Wextra", "-Werror", "-o"]).arg(&program).arg(listing("c", folder));
+    assert!(compiler.status().expect("cc is needed: apt install gcc libc6-dev").success());
+    [vec![program], vec!["python3".into(), listing("python", folder)]]
+}
+
+/// Attaches one of them to the bus `vcan0` in a directory.
+fn attach(listing: &[PathBuf], directory: &Path) -> Child {
+    let mut command = Command::new(&listing[0]);
+    command.args(&listing[1..]).arg(directory).arg("vcan0").stdout(Stdio::piped()).stderr(Stdio::piped());
+    command.spawn().expect("python3 is needed: apt install python3")
+}
+
+/// The frames that the documents' programs send.
+fn sent_by_listings() -> [Frame; 2] {
+    let mut data = [0; 12];
+    data[..3].copy_from_slice(&[1, 2, 3]);
+    let id = 0x123_4567 | EXTENDED;
+    [Frame::classic(id, &data[..3]).unwrap(), Frame::fd(id, 1, &data).unwrap()]
+}
+
+fn nanos_now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos().try_into().unwrap()
+}
+
+#[test]
+fn the_documents_programs_send_receive_and_end_with_the_server() {
+    let parent = TempDir::new().unwrap();
+    let folder = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let frames = [
+        Frame::classic(0x001, &[1, 2, 3, 4, 5, 6, 7, 8]).unwrap(),
+        Frame::fd(0x20C, 1, &[0xA5; 64]).unwrap(),
+        Frame::classic(0x7FF, &[]).unwrap(),
+        Frame::fd(0x1FFF_FFFF | EXTENDED, 0, &[0xFF]).unwrap(),
+    ];
+    for listing in listings(folder.path()) {
+        for end in [Signal::TERM, Signal::KILL] {
+            let mut server = serve(&directory, &[]);
+            let options = Options { directory: Some(directory.clone()), ..Options::default() };
+            let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+            let mut program = attach(&listing, &directory);
+            let (mut inbox, mut received) = (Inbox::new(), Vec::new());
+            while received.len() < 2 {
+                assert!(bus.wait(Some(Duration::from_secs(20))).unwrap(), "{listing:?}: {received:?}");
+                bus.receive(&mut inbox).unwrap();
+                received.extend(inbox.frames().map(|received| received.frame));
+            }
+            assert_eq!(received, sent_by_listings(), "{listing:?}");
+
+            let before = nanos_now() - 1_000;
+            bus.send(&frames).unwrap();
+            let mut output = BufReader::new(program.stdout.take().unwrap());
+            for frame in frames {
+                let mut line = String::new();
+                output.read_line(&mut line).unwrap();
+                let Ok(Line::Frame(record)) = candump::parse(line.trim_end()) else { panic!("{line}") };
+                assert_eq!((record.interface, record.frame), ("vcan0", frame));
+                assert!((before..=nanos_now()).contains(&record.time.nanos), "{line}");
+            }
+            signal(&server, end);
+            let (mut rest, mut errors) = (String::new(), String::new());
+            output.read_to_string(&mut rest).unwrap();
+            program.stderr.take().unwrap().read_to_string(&mut errors).unwrap();
+            assert_eq!((program.wait().unwrap().code(), rest.as_str(), errors.as_str()), (Some(0), "", ""));
+            server.wait().unwrap();
+        }
+    }
+}
+
+/// What a program meets that attaches to this listener: its hello, and the connection.
+fn greeted(listener: &OwnedFd, answer: Answer) -> OwnedFd {
+    let socket = rustix::net::accept(listener).unwrap();
+    let mut bytes = [0; 64];
+    let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::empty()).unwrap();
+    let filters = vec![Filter::ALL];
+    let hello = Hello { filters, own_frames: false, fd: true, error_mask: 0, buffer: 1 << 20 };
+    assert_eq!(Hello::decode(&bytes[..len]), Some(hello));
+    rustix::net::send(&socket, &answer.encode(), SendFlags::empty()).unwrap();
+    socket
+}
+
+#[test]
+fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let listener = seqpacket(SocketFlags::empty()).unwrap();
+    rustix::net::bind(&listener, &address(folder.path(), "vcan0").unwrap()).unwrap();
+    rustix::net::listen(&listener, 1).unwrap();
+    for listing in listings(folder.path()) {
+        let program = attach(&listing, folder.path());
+        let socket = greeted(&listener, Answer::Welcome { granted: 1 << 21 });
+        for (frame, flags) in sent_by_listings().iter().zip([RecvFlags::empty(), RecvFlags::PEEK]) {
+            let mut bytes = [0; 73];
+            let (len, _) = rustix::net::recv(&socket, &mut bytes, flags).unwrap();
+            assert_eq!(len, frame.byte_len());
+            rustix::net::send(&socket, &encode_dropped(3), SendFlags::empty()).unwrap();
+            rustix::net::send(&socket, &frame.to_bytes()[..len], SendFlags::empty()).unwrap();
+        }
+        // With a frame of the program unread, which the system reports to it.
+        drop(socket);
+        let output = program.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stdout).unwrap();
+        assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+        let frames: Vec<_> = said.lines().map(|line| line.split(' ').next_back().unwrap()).collect();
+        assert_eq!(frames, ["01234567#010203", "01234567##5010203000000000000000000"]);
+
+        let program = attach(&listing, folder.path());
+        drop(greeted(&listener, Answer::Refused { version: 3 }));
+        let output = program.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), said.lines().count()), (Some(1), 1), "{said}");
+        assert!(said.ends_with("refused, it speaks version 3\n"), "{said}");
+    }
+}
+
+#[test]
+fn what_was_ignored_is_said_at_the_end() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
+    command.args(["serve", "vcan0"]).env("SKINBUS_DIR", &directory);
+    let mut server = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    first_line(&mut server);
+    let options = Options { directory: Some(directory), ..Options::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    rustix::net::send(&a, &[0; 13], SendFlags::empty()).unwrap();
+    a.send(&[Frame::classic(1, &[]).unwrap()]).unwrap();
+    assert!(b.wait(Some(Duration::from_secs(20))).unwrap(), "what came before has been read");
+    signal(&server, Signal::TERM);
+    let output = server.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!((output.status.code(), said.lines().count()), (Some(0), 1), "{said}");
+    assert!(said.contains("vcan0: ignored 1 datagrams") && said.contains("refused 0 clients"), "{said}");
 }

@@ -1,20 +1,7 @@
-//! The embedded bus as a client sees it: where it lives, and what is said beside frames.
+//! The embedded bus as a client sees it: where it is, and the control datagrams beside frames.
 //!
-//! A frame is a datagram of 16 or 72 bytes, exactly the kernel's struct; anything else is control, and no
-//! control datagram has either length. Numbers are little endian.
-//!
-//! ```text
-//!   hello    client -> bus, first     "skinbus", version, own 0/1, fd 0/1, error mask u32, buffer u64,
-//!                                     reserved u8, then id u32 and mask u32 per filter: 23 + 8n bytes
-//!   answer   bus -> client, first     "skinbus", version, 0 welcome / 1 refused, granted buffer u64: 17 bytes
-//!   filters  client -> bus, later     "F", 1 first part + 2 last part, then id u32 and mask u32 per filter, at most
-//!                                     8: 2 + 8n bytes
-//!   dropped  bus -> client, later     "D", frames dropped so far u32: 5 bytes
-//! ```
-//!
-//! After a welcome the filters are in force. A client changes them by *filters*, in one part or several; with the last
-//! part they are in force for what the bus takes from then on, frames of this client and of others. In a frame that is given back to its sender, the reserved
-//! byte 6 is 1; the bus clears that byte in every other frame.
+//! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, exactly the kernel's
+//! struct; no control datagram has either length.
 
 use super::Filter;
 

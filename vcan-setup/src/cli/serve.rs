@@ -8,7 +8,7 @@ use clap::Args;
 use protocol::usage::Failure;
 use rustix::process::Signal;
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::embedded::Server;
+use vcan_setup::embedded::{Server, Totals};
 
 use super::bus_name;
 
@@ -61,6 +61,14 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
-    server.run(stopped)?;
+    let Totals { garbage, refused, .. } = server.run(stopped)?;
+    if garbage > 0 || refused > 0 {
+        // Nobody else can tell: a client gets no error for what it sends. Without standard error nobody reads it.
+        let _ = writeln!(
+            std::io::stderr(),
+            "vcan-setup: {name}: ignored {garbage} datagrams that were neither frames nor filters, and refused \
+             {refused} clients: check their program against docs/reference/embedded-bus.md"
+        );
+    }
     Ok(())
 }
