@@ -407,7 +407,7 @@ fn the_age_of_a_packet_is_that_of_its_last_segment() {
         node.handle_frame(NOW + Span(segment as u64 * 10_000), age, &frame);
     }
     drain(&mut node);
-    assert_eq!(heard(&mut node).0, Heard { joints: 1, ..Heard::default() });
+    assert_eq!(node.heard, Heard { joints: 1, ..Heard::default() });
 }
 
 #[test]
@@ -423,40 +423,6 @@ fn skipped_joints_leave_active_as_it_is() {
     assert!(heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::ACTIVE));
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, 0.0)]);
     assert!(!heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::ACTIVE));
-}
-
-#[test]
-fn hellos_of_a_claiming_cell_have_the_node_id_that_it_claims() {
-    // CLAIM-8, HELLO-1
-    let node = Node::new(identity(), Format::Fd, &Flash::Empty, true, Micros(0));
-    let mut node = node.with_ports(0b1);
-    let mut hellos = vec![];
-    while !node.state().has(State::CLAIMING) || hellos.is_empty() {
-        node.handle_timeout(node.poll_timeout());
-        drain(&mut node);
-        hellos.extend(core::iter::from_fn(|| node.poll_port_transmit()));
-    }
-    assert!(matches!(hellos[..], [(0, PortMessage::Hello(hello))] if hello.number == 12), "{hellos:?}");
-}
-
-#[test]
-fn a_cell_without_ports_does_not_sum_and_one_with_ports_reads_back_what_it_was_told() {
-    // OPT-1, CONF-3, CONF-4, CONF-10, CONF-11
-    let words = [1, 1_500, 6, 1, -7, -7];
-    let request = Request::Write { number: Parameter::Reply.number(), words };
-    let write = Message::Configure { to: Address::Everyone, tag: 0, request };
-    let answers = [0, 0b1].map(|ports| {
-        let mut node = settle(
-            Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0)).with_ports(ports),
-        );
-        match tell(&mut node, &write).as_slice() {
-            [Message::Configured { answer, .. }] => *answer,
-            other => panic!("{other:?}"),
-        }
-    });
-    let number = Parameter::Reply.number();
-    let refused = Answer::Refused { number, reason: Answer::CANNOT_BE };
-    assert_eq!(answers, [refused, Answer::Value { number, written: true, words: padded([1, 1_500, 6, 1]) }]);
 }
 
 #[test]
