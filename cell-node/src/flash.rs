@@ -134,6 +134,7 @@ mod tests {
         Parameters { joint: 2, joints: 6, pose, period_us: 16_000, ..Parameters::default() }
     }
 
+    // ID-3, CONF-8
     #[test]
     fn what_was_kept_comes_back_to_the_same_cell_only() {
         let bytes = encode(100_012, &kept());

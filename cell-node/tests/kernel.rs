@@ -14,6 +14,7 @@ mod oracle;
 
 use oracle::{Case, Errors, equation_8, per_joint};
 
+// J-1
 #[test]
 fn the_wrench_kernel_errs_less_than_its_bars_on_a_ur5() {
     let errors = Errors::of_words(|parameters, joints| Wrench::new(parameters).jacobian(joints));
@@ -47,6 +48,21 @@ fn the_projection_kernel_errs_less_than_the_papers_0_0054_nm_on_a_ur5() {
     assert!(with_the_papers_sine.mean <= 1e-3, "{with_the_papers_sine:?}");
 }
 
+// J-3
+#[test]
+fn words_of_j_err_by_2_steps_at_most_on_a_ur5() {
+    for case in Case::all() {
+        let (parameters, joints) = (case.parameters(), case.words());
+        let exact = equation_8(&parameters, &joints);
+        let steps = [
+            steps_apart::<Wrench>(&parameters, &joints, exact),
+            steps_apart::<Projection>(&parameters, &joints, exact),
+        ];
+        assert!(steps.into_iter().all(|steps| steps <= 2), "{steps:?}");
+    }
+}
+
+// J-2
 #[test]
 fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
     // Two links of 1.5 m, stretched out, and a cell at the end that looks up or down.
@@ -108,15 +124,9 @@ fn what_nobody_reads_is_not_computed_behind_an_odd_twist_either() {
     assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
 }
 
-/// The words of an arm: any at all.
+/// The words of an arm of 1 to 6 joints, any at all, with quarter turns and zeros more often than by chance.
 fn any_arm() -> impl Strategy<Value = Parameters> {
-    arm(any::<i16>())
-}
-
-/// An arm of 1 to 6 joints whose lengths are drawn from `length`, with quarter turns and zeros more
-/// often than by chance.
-fn arm(length: impl Strategy<Value = i16> + Clone) -> impl Strategy<Value = Parameters> {
-    let length = prop_oneof![1 => Just(0), 3 => length];
+    let length = prop_oneof![1 => Just(0), 3 => any::<i16>()];
     let alpha = prop_oneof![
         2 => Just(0), 1 => Just(0x4000), 1 => Just(-0x4000), 1 => Just(i16::MIN), 2 => any::<i16>()
     ];
@@ -139,20 +149,44 @@ fn arm(length: impl Strategy<Value = i16> + Clone) -> impl Strategy<Value = Para
     )
 }
 
-/// An arm that fits Q1.14: no part longer than 0.15 m, a normal of unit length.
-fn sound_arm() -> impl Strategy<Value = Parameters> {
+/// An arm of any shape in reach: the lengths of its rows and of the cell's position add up to less than 2 m.
+fn arm_in_reach() -> impl Strategy<Value = Parameters> {
     let direction = (-1.0..1.0_f64, -1.0..1.0_f64, -1.0..1.0_f64)
         .prop_filter("has a direction", |(x, y, z)| (0.1..1.0).contains(&(x * x + y * y + z * z)));
-    (arm(-2_458_i16..=2_458), direction).prop_map(|(parameters, (x, y, z))| {
+    (any_arm(), direction, 0.1..2.0_f64).prop_map(|(mut parameters, (x, y, z), reach)| {
+        let rows = parameters.chain().iter().flat_map(|row| [row.a, row.d]);
+        let all: f64 = rows.chain(parameters.pose.position).map(|word| word.to_f64().abs()).sum();
+        let scale = if all > reach { reach / all } else { 1.0 };
+        let shorter = |word: Q1_14| Q1_14::from_bits((f64::from(word.to_bits()) * scale) as i16);
+        for row in &mut parameters.rows {
+            (row.a, row.d) = (shorter(row.a), shorter(row.d));
+        }
         let length = (x * x + y * y + z * z).sqrt();
         let normal = [x, y, z].map(|n| Q1_14::nearest(n / length));
-        Parameters { pose: Pose { normal, ..parameters.pose }, ..parameters }
+        let position = parameters.pose.position.map(shorter);
+        Parameters { pose: Pose { position, normal }, ..parameters }
     })
 }
 
 /// The greatest difference of two Jacobians.
 fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
     lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
+}
+
+/// J-3: how many steps of 2^-14 m a cell's J may differ from the nearest word of the exact one.
+const STEPS_OF_J: u32 = 8;
+
+/// How many steps a kernel's J differs from the nearest word of the exact one.
+fn steps_apart<K: Kernel>(
+    parameters: &Parameters,
+    joints: &[Q1_14; MAX_JOINTS],
+    exact: [f64; MAX_JOINTS],
+) -> u32 {
+    let words = K::new(parameters).jacobian(joints);
+    let apart = |(word, exact): (Q1_14, f64)| {
+        i32::from(word.to_bits()).abs_diff(Q1_14::nearest(exact).to_bits().into())
+    };
+    words.into_iter().zip(exact).map(apart).max().unwrap()
 }
 
 fn in_words<K: Kernel>(parameters: &Parameters, joints: &[Q1_14; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
@@ -172,14 +206,13 @@ proptest! {
         prop_assert!(apart(projection, expected) <= 1e-9, "{projection:?} is not {expected:?}");
     }
 
+    // J-3
     #[test]
-    fn words_err_by_half_a_millimetre_at_most(parameters in sound_arm(), joints: [i16; MAX_JOINTS]) {
+    fn words_of_j_err_by_8_steps_at_most(parameters in arm_in_reach(), joints: [i16; MAX_JOINTS]) {
         let joints = joints.map(Q1_14::from_bits);
-        let expected = equation_8(&parameters, &joints);
-        let wrench = in_words::<Wrench>(&parameters, &joints);
-        let projection = in_words::<Projection>(&parameters, &joints);
-        prop_assert!(apart(wrench, expected) <= 5e-4, "{wrench:?} is not {expected:?}");
-        prop_assert!(apart(projection, expected) <= 5e-4, "{projection:?} is not {expected:?}");
+        let exact = equation_8(&parameters, &joints);
+        prop_assert!(steps_apart::<Wrench>(&parameters, &joints, exact) <= STEPS_OF_J);
+        prop_assert!(steps_apart::<Projection>(&parameters, &joints, exact) <= STEPS_OF_J);
     }
 
     #[test]

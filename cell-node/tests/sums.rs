@@ -29,6 +29,7 @@ fn said(sum: &mut Sum, after: u64) -> Option<Words> {
     sum.say(Micros(after + 8_000)).map(|(_, words, _)| words)
 }
 
+// LEASE-1, LEASE-2
 #[test]
 fn a_sum_that_came_after_its_epoch_is_not_taken_for_that_of_another() {
     let mut sum = Sum::default();
@@ -42,6 +43,7 @@ fn a_sum_that_came_after_its_epoch_is_not_taken_for_that_of_another() {
     assert_eq!(said(&mut sum, 9_000), Some(words(-151)));
 }
 
+// LEASE-2
 #[test]
 fn a_sum_that_came_before_its_child_said_whom_it_is_for_is_taken_then() {
     let mut sum = Sum::default();

@@ -131,7 +131,7 @@ struct Stimulus {
 ///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries what rounding took away)
 ///   sensing off | continuous PERIOD | event   (ms)
 ///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
-///   cuts none | 0+2   (ports that hear nothing, in test mode only)
+///   links_down none | 0+2   (ports that receive nothing, in test mode only)
 ///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
 ///   commit HASH   (hexadecimal)
 ///

@@ -1,16 +1,28 @@
-//! The tables of `docs/reference/protocol.md` that list fields come from the schema.
+//! The tables of `docs/reference/protocol.md` that list fields come from the schema, and every requirement on a cell has an
+//! id of its own and a test that names it.
 //!
-//! Each one stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test writes them
+//! Each table stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test writes them
 //! instead of comparing.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 
 use core::fmt::Write;
+use std::collections::BTreeSet;
+use std::path::Path;
 
 use protocol::id::{Command, Kind};
 use protocol::message::State;
 use protocol::parameters::Parameter;
 use protocol::schema::{Field, Format, Layout, PacketSchema, Range, packets, reasons, wires};
+
+/// Where the requirements are.
+const REQUIREMENTS: [&str; 3] = [
+    include_str!("../../docs/reference/cell.md"),
+    include_str!("../../docs/reference/sensing.md"),
+    include_str!("../../docs/reference/tree.md"),
+];
+/// Where the tests are that name them.
+const TESTS: [&str; 4] = ["cell-node", "protocol", "gateway/reference/tests", "tests/tests"];
 
 const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/protocol.md");
 
@@ -194,4 +206,55 @@ fn the_document_names_every_bit_of_the_state() {
         let row = format!("| {} | {} |", bit.0.trailing_zeros(), name.to_uppercase().replace('-', "_"));
         assert!(document.contains(&row), "{row}");
     }
+}
+
+/// What looks like the id of a requirement: letters, a dash, a number.
+fn ids(text: &str) -> impl Iterator<Item = (&str, u32)> {
+    let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '-'));
+    words.filter_map(|word| {
+        let (topic, number) = word.split_once('-')?;
+        let is_topic = !topic.is_empty() && topic.bytes().all(|byte| byte.is_ascii_uppercase());
+        Some((topic, number.parse().ok().filter(|_| is_topic)?))
+    })
+}
+
+/// The requirements in their order.
+fn requirements() -> Vec<(&'static str, u32)> {
+    let lines = REQUIREMENTS.into_iter().flat_map(str::lines);
+    let bold = lines.filter_map(|line| line.strip_prefix("- **")?.split_once("**"));
+    bold.flat_map(|(id, _)| ids(id)).collect()
+}
+
+/// Test sources, and the program that writes the golden logs.
+fn test_sources(path: &Path, found: &mut String) {
+    for entry in std::fs::read_dir(path).unwrap() {
+        let path = entry.unwrap().path();
+        let is_source = path.extension().is_some_and(|extension| extension == "rs" || extension == "py");
+        if path.is_dir() && !path.ends_with("target") {
+            test_sources(&path, found);
+        } else if is_source {
+            found.push_str(&std::fs::read_to_string(path).unwrap());
+        }
+    }
+}
+
+#[test]
+fn requirements_are_numbered_and_named_by_a_test_or_said_to_have_none() {
+    let requirements = requirements();
+    assert!(requirements.len() > 80, "{} requirements", requirements.len());
+    for (index, &(topic, number)) in requirements.iter().enumerate() {
+        let before = requirements.iter().take(index).filter(|(other, _)| *other == topic).count();
+        assert_eq!(u32::try_from(before + 1), Ok(number), "{topic}-{number} is out of turn");
+    }
+    let mut sources = String::new();
+    let top = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    TESTS.into_iter().for_each(|tests| test_sources(&top.join(tests), &mut sources));
+    let all: BTreeSet<_> = requirements.into_iter().collect();
+    let is_known = |(topic, _): &(&str, u32)| all.iter().any(|(known, _)| known == topic);
+    let named: BTreeSet<_> = ids(&sources).filter(is_known).collect();
+    let unknown: Vec<_> = named.difference(&all).collect();
+    assert!(unknown.is_empty(), "tests name what no document has: {unknown:?}");
+    let [cell, ..] = REQUIREMENTS;
+    let (_, without) = cell.split_once("## What no test checks").unwrap();
+    assert_eq!(all.difference(&named).copied().collect::<BTreeSet<_>>(), ids(without).collect());
 }

@@ -30,6 +30,7 @@ const SESSION: &str = include_str!("golden/session.log");
 const REFUSALS: &str = include_str!("golden/refusals.log");
 const WIRE: &str = include_str!("golden/wire.log");
 const DOCUMENT: &str = include_str!("golden/document.log");
+const EXCHANGE: &str = include_str!("golden/exchange.log");
 
 /// One frame of a log, with the comment above it.
 struct Golden<'a> {
@@ -81,6 +82,21 @@ fn bytes_and_meaning_agree_both_ways() {
 }
 
 #[test]
+fn the_exchanges_mean_what_they_say() {
+    let mut both_ways = 0;
+    for golden in lines(EXCHANGE) {
+        let (_, meaning) = golden.comment.split_once(' ').unwrap();
+        if golden.frame.format() == Format::Fd && !meaning.starts_with("of another") {
+            let message = Meaning::new(meaning).message();
+            assert_eq!(read(&golden.frame), Ok(message), "{}", golden.text);
+            both_ways += u32::from(only_frame(&message) == golden.text);
+        }
+    }
+    // The others write words into parameters that have none.
+    assert!(both_ways > 150, "{both_ways}");
+}
+
+#[test]
 fn every_kind_command_and_page_has_its_golden_frame() {
     let seen: Vec<_> = lines(FD).iter().map(|golden| Packet::from_fd(&golden.frame).unwrap()).collect();
     for kind in Kind::ALL {
@@ -112,6 +128,7 @@ fn every_kind_command_and_page_has_its_golden_frame() {
     }
 }
 
+// OPT-2
 #[test]
 fn what_a_page_does_not_use_is_not_looked_at() {
     for golden in lines(LENIENT) {
@@ -128,6 +145,7 @@ fn bad_frames_are_refused_for_the_reason_given() {
     }
 }
 
+// COUNT-3
 #[test]
 fn classic_frames_pair_as_the_log_says() {
     let mut segments = BTreeMap::<u16, Segment>::new();
@@ -214,6 +232,7 @@ fn the_hash_of_the_session_is_that_of_its_commit() {
     }
 }
 
+// CONF-6, CONF-10, CONF-13, SENSE-3
 #[test]
 fn unsound_parameters_are_refused_with_the_code_of_the_log() {
     let (sound, _) = staged(SESSION);
@@ -273,8 +292,8 @@ fn wires_bytes_and_meaning_agree_both_ways() {
     }
     assert!(kinds.into_iter().eq(1..=12), "every kind is there");
     assert_eq!(odd, 4, "frames that nobody should write so");
-    let hello = lines(WIRE).into_iter().find(|golden| golden.comment.contains("number=7")).unwrap();
-    assert!(PROTOCOL_MD.contains(hello.text), "the document's hello is {}", hello.text);
+    let hello = lines(WIRE).into_iter().find(|golden| golden.comment.contains("node_id=7")).unwrap();
+    assert!(DOCUMENTS.contains(hello.text), "the document's hello is {}", hello.text);
 }
 
 /// The document's arithmetic of Algorithm 1, on its own example: 3 N on a cell with
@@ -293,10 +312,16 @@ fn the_documents_torque_comes_out() {
     assert!(lines(SESSION).iter().any(|golden| golden.text == expected), "{expected}");
 }
 
-const PROTOCOL_MD: &str = include_str!("../../docs/reference/protocol.md");
+/// The documents of the protocol, one after the other.
+const DOCUMENTS: &str = concat!(
+    include_str!("../../docs/reference/protocol.md"),
+    include_str!("../../docs/reference/cell.md"),
+    include_str!("../../docs/reference/sensing.md"),
+    include_str!("../../docs/reference/tree.md"),
+);
 
-fn frames_of_the_document() -> Vec<Frame> {
-    let tokens = PROTOCOL_MD.split(|c: char| c.is_whitespace() || c == '`');
+fn frames_of_the_documents() -> Vec<Frame> {
+    let tokens = DOCUMENTS.split(|c: char| c.is_whitespace() || c == '`');
     tokens
         .filter(|token| token.len() > 30 && token.contains("##"))
         .map(|token| candump::parse_frame(token).unwrap())
@@ -304,11 +329,11 @@ fn frames_of_the_document() -> Vec<Frame> {
 }
 
 #[test]
-fn the_document_spells_out_the_frames_of_its_log_and_no_others() {
+fn the_documents_spell_out_the_frames_of_their_log_and_no_others() {
     let same = |a: &Frame, b: &Frame| {
         (a.raw_id(), a.data(), a.flags() | FD_FORMAT) == (b.raw_id(), b.data(), b.flags() | FD_FORMAT)
     };
-    let (written, golden) = (frames_of_the_document(), lines(DOCUMENT));
+    let (written, golden) = (frames_of_the_documents(), lines(DOCUMENT));
     for golden in &golden {
         assert!(written.iter().any(|frame| same(frame, &golden.frame)), "{} is missing", golden.text);
     }
@@ -322,13 +347,13 @@ fn the_documents_crc_example_is_right() {
     // Section "CRC": the identifier 20C, six words, epoch 7, count 1.
     let bytes = [0x0C, 0x02, 0x00, 0x10, 0x00, 0xF8, 0x01, 0x00, 0, 0, 0, 0, 0, 0, 0x07, 0x01];
     assert_eq!(crc16(&bytes), 0xD675);
-    assert!(PROTOCOL_MD.contains("0C 02 00 10 00 F8 01 00 00 00 00 00 00 00 07 01"));
-    assert!(PROTOCOL_MD.contains("D675") && PROTOCOL_MD.contains("29B1"));
+    assert!(DOCUMENTS.contains("0C 02 00 10 00 F8 01 00 00 00 00 00 00 00 07 01"));
+    assert!(DOCUMENTS.contains("D675") && DOCUMENTS.contains("29B1"));
     let segments = lines(DOCUMENT)[0].frame;
     let (head, tail) = segments.data().split_at(8);
     for segment in [head, tail] {
         let segment = Frame::classic(0x20C, segment).unwrap().to_string();
-        assert!(PROTOCOL_MD.contains(&segment), "{segment}");
+        assert!(DOCUMENTS.contains(&segment), "{segment}");
     }
 }
 

@@ -188,6 +188,8 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
     assert_eq!(of(&|epochs| epochs > 12), 0, "all are, soon");
 }
 
+// All of these together: SUM-1, SUM-7, LEASE-1, LEASE-3, NACK-1, NACK-3, NACK-4, NACK-5, HELLO-2, HELLO-3, JOIN-1, JOIN-2,
+// JOIN-3, JOIN-4, JOIN-5, LOSS-1, LOSS-2, LOSS-3, LOSS-4, REPAIR-1, REPAIR-2, REPAIR-3, REPAIR-4, LINK-1.
 #[test]
 fn random_wirings_organise_themselves_and_never_count_a_cell_twice() {
     campaign((0..wirings()).step_by(2));

@@ -170,6 +170,7 @@ impl Side {
     }
 }
 
+// ID-2, ID-3, NODE-1, NODE-2, NODE-3
 #[test]
 fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
     for format in [Target::Fd, Target::Classic] {

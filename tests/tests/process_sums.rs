@@ -87,6 +87,7 @@ fn without_a_touch_hellos_tell_who_is_gone_and_the_rest_finds_another_way() {
     keeps_ways_without_a_touch(&Place::new(), Format::Fd);
 }
 
+// JOIN-6
 #[test]
 fn who_is_unreachable_any_more_is_named_and_the_rest_finds_another() {
     goes_on_without_a_wire(&Place::new(), Format::Fd);

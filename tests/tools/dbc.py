@@ -85,7 +85,7 @@ def switch(fields):
         said = {"sensing": ["off", "continuous", "event"].index(fields["sensing"])}
         keys = {"period_ms": "sensing_period"}
     elif "deaf" in fields:
-        return {f"cut_port_{port}": int(port in bits(fields["deaf"])) for port in range(5)}
+        return {f"link_down_port_{port}": int(port in bits(fields["deaf"])) for port in range(5)}
     elif "hysteresis" in fields:
         said = {}
         keys = {key: f"events_{key}" for key in ("contact", "proximity", "temperature", "acceleration", "hysteresis")}

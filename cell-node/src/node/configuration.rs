@@ -51,9 +51,10 @@ impl Configuration {
         self.in_use.as_ref().map_or(&self.staged, |in_use| &in_use.parameters).words(parameter)
     }
 
-    /// Stages one parameter; else why not.
-    pub(super) fn stage(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), i16> {
-        self.staged.set(parameter, words).map_err(ParameterError::code)
+    /// Stages one parameter; the words that are staged now, or why not.
+    pub(super) fn stage(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
+        self.staged.set(parameter, words).map_err(ParameterError::code)?;
+        Ok(self.staged.words(parameter))
     }
 
     /// What is staged, if it can be and has the hash that a commit names; else why not.

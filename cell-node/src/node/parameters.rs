@@ -48,9 +48,7 @@ impl Node {
                     Err(reason) => Err(reason),
                 }
             }
-            (Some(parameter), Request::Write { words, .. }) => {
-                self.write(now, parameter, words).map(|()| words)
-            }
+            (Some(parameter), Request::Write { words, .. }) => self.write(now, parameter, words),
         };
         self.answer(tag, number, written, words);
     }
@@ -95,18 +93,23 @@ impl Node {
         }
     }
 
-    /// Sets a switch at once, or stages what is kept; else why not. Ports are cut in test mode only.
-    fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<(), i16> {
-        let (switches, test_mode) = (&mut self.switches, self.flags.has(State::TEST_MODE));
+    /// Sets a switch at once, or stages what is kept: the words as they are now, or why not. Without ports there are
+    /// neither sums nor links; links go down in test mode only.
+    fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
+        let (switches, has_ports) = (&mut self.switches, self.summing.network.exists());
         let set = match parameter {
-            Parameter::Reply => Reply::from_words(words).map(|reply| switches.reply = reply),
+            Parameter::Reply => Reply::from_words(words)
+                .filter(|reply| has_ports || *reply == Reply::Torque)
+                .map(|reply| switches.reply = reply),
             Parameter::Sensing => Sensing::from_words(words).map(|sensing| switches.sensing = sensing),
             Parameter::Events => Events::from_words(words).map(|events| switches.events = events),
-            Parameter::LinksDown => test_mode.then(|| switches.links_down = LinksDown::from_words(words)),
+            Parameter::LinksDown => Some(LinksDown::from_words(words))
+                .filter(|links_down| self.flags.has(State::TEST_MODE) && (has_ports || links_down.deaf == 0))
+                .map(|links_down| switches.links_down = links_down),
             Parameter::Mode => {
                 self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
                 self.stimuli.clear();
-                return Ok(());
+                Some(())
             }
             Parameter::Identity
             | Parameter::Mount
@@ -122,7 +125,7 @@ impl Node {
             Reply::Sum(slots) => Some(slots),
         });
         self.after_network(now);
-        set.ok_or(Answer::CANNOT_BE)
+        set.ok_or(Answer::CANNOT_BE).map(|()| self.read(parameter))
     }
 
     fn identity_words(&self) -> [i16; WORDS] {

@@ -88,6 +88,7 @@ mod tests {
         stimuli.sensed.skin.contact[0].to_f64()
     }
 
+    // STIM-3
     #[test]
     fn a_stimulus_waits_for_its_epoch_even_around_the_corner() {
         let mut stimuli = Stimuli::default();
@@ -101,6 +102,7 @@ mod tests {
         assert!(course.iter().eq(&[0.0, 1.0, 1.0, 2.0, 2.0]), "{course:?}");
     }
 
+    // STIM-5
     #[test]
     fn a_late_stimulus_holds_from_the_next_joints() {
         let mut stimuli = Stimuli::default();
@@ -111,6 +113,7 @@ mod tests {
         assert!(sensed(&stimuli) > 0.5);
     }
 
+    // STIM-6
     #[test]
     fn the_ninth_waiting_stimulus_is_refused() {
         let mut stimuli = Stimuli::default();

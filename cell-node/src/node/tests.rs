@@ -102,6 +102,7 @@ fn heard(node: &mut Node) -> (Heard, Refused) {
     }
 }
 
+// JOINTS-3, JOINTS-5, JOINTS-6
 #[test]
 fn a_pressed_cell_answers_each_joints_frame_and_says_once_that_the_contact_has_ended() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -119,6 +120,7 @@ fn a_pressed_cell_answers_each_joints_frame_and_says_once_that_the_contact_has_e
     assert_eq!(refused, Refused::default());
 }
 
+// JOINTS-1, JOINTS-4
 #[test]
 fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -135,6 +137,7 @@ fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
     assert_eq!((heard.joints, heard.joints_repeated, heard.joints_late), (3, 1, 1));
 }
 
+// JOINTS-4, STIM-8
 #[test]
 fn a_cell_that_hung_feels_what_came_meanwhile() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -153,6 +156,7 @@ fn a_cell_that_hung_feels_what_came_meanwhile() {
     assert_eq!((heard.joints, heard.joints_late, refused.stimuli), (2, 20, 0));
 }
 
+// CMD-1, CMD-2, STATE-1, SUM-7
 #[test]
 fn a_halted_cell_is_silent_until_a_resume() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -166,6 +170,7 @@ fn a_halted_cell_is_silent_until_a_resume() {
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
 }
 
+// BEAT-2
 #[test]
 fn a_heartbeat_that_is_due_before_the_next_joints_comes_with_the_answer_and_shifts_no_other() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -190,6 +195,7 @@ fn a_heartbeat_that_is_due_before_the_next_joints_comes_with_the_answer_and_shif
     assert_eq!(drain(&mut node).len(), 1);
 }
 
+// CLAIM-1, CLAIM-5, BEAT-1, BEAT-4
 #[test]
 fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
     let mut node = Node::new(identity(), Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
@@ -210,6 +216,7 @@ fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
     assert_eq!(node.poll_timeout(), Micros(2_055_764));
 }
 
+// CLAIM-3, CLAIM-6, CLAIM-7
 #[test]
 fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
     let mut other = settled(Flash::Sound(wheel()));
@@ -226,6 +233,7 @@ fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
     assert!(heartbeat(&tell(&mut other, &Message::Sync)).state.has(State::DUPLICATE));
 }
 
+// CLAIM-3
 #[test]
 fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
     let (mut low, from_low) = claiming(Identity { serial: 1, ..identity() });
@@ -235,6 +243,7 @@ fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
     assert_eq!((low.taken(), high.taken()), (None, Some(1)));
 }
 
+// CLAIM-2, JOINTS-5, STIM-8
 #[test]
 fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
     let (mut node, _) = claiming(identity());
@@ -248,6 +257,7 @@ fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
     assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)], "it has felt all the while");
 }
 
+// CONF-8, STATE-3
 #[test]
 fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
     let mut node = settled(Flash::Damaged);
@@ -258,6 +268,7 @@ fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
     assert_eq!((heartbeat.configuration, heartbeat.state.joint()), (0, 0));
 }
 
+// CONF-1, CONF-2, CONF-5, CONF-7, CONF-12
 #[test]
 fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     let mut node = settled(Flash::Damaged);
@@ -313,6 +324,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     );
 }
 
+// STIM-1
 #[test]
 fn a_cell_that_measures_refuses_stimuli() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -326,6 +338,7 @@ fn a_cell_that_measures_refuses_stimuli() {
     assert_eq!(heard(&mut node).1.stimuli, 1);
 }
 
+// COUNT-1, JOINTS-2
 #[test]
 fn what_cannot_be_used_is_counted_by_its_reason() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -345,6 +358,7 @@ fn what_cannot_be_used_is_counted_by_its_reason() {
     assert_eq!(heartbeat(&tell(&mut node, &Message::Sync)).rejected, 6);
 }
 
+// TORQUE-2, STATE-2
 #[test]
 fn a_torque_that_does_not_fit_is_marked_as_saturated() {
     let mut node = settled(Flash::Sound(wheel()));
@@ -354,6 +368,7 @@ fn a_torque_that_does_not_fit_is_marked_as_saturated() {
     assert!(!heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::SATURATED), "since the last one");
 }
 
+// COUNT-3
 #[test]
 fn the_classic_format_works_in_segments() {
     let flash = Flash::Sound(wheel());
@@ -380,6 +395,34 @@ fn the_classic_format_works_in_segments() {
     };
     assert_eq!(apart(3, NOW + within + Span(7), Span(7)), [torque(3, -2.0)]);
     assert_eq!(apart(4, NOW + within + Span(7), Span(6)), []);
+}
+
+#[test]
+fn the_age_of_a_packet_is_that_of_its_last_segment() {
+    // JOINTS-4: the segments come 10 ms apart, which is twice the period.
+    let flash = Flash::Sound(Parameters { period_us: 5_000, ..wheel() });
+    let mut node = settle(Node::new(identity(), Format::Classic, &flash, true, Micros(0)));
+    for (segment, age) in [(0, Span(0)), (1, Span(5_000))] {
+        let frame = joints(1).encode().frames(Format::Classic).nth(segment).unwrap();
+        node.handle_frame(NOW + Span(segment as u64 * 10_000), age, &frame);
+    }
+    drain(&mut node);
+    assert_eq!(node.heard, Heard { joints: 1, ..Heard::default() });
+}
+
+#[test]
+fn skipped_joints_leave_active_as_it_is() {
+    // STATE-1
+    let mut node = settled(Flash::Sound(wheel()));
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!(tell(&mut node, &joints(0)), [torque(0, -2.0)]);
+    tell(&mut node, &press(0.0, From::Next));
+    for frame in joints(1).encode().frames(Format::Fd) {
+        node.handle_frame(NOW, Span(16_001), &frame);
+    }
+    assert!(heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::ACTIVE));
+    assert_eq!(tell(&mut node, &joints(2)), [torque(2, 0.0)]);
+    assert!(!heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::ACTIVE));
 }
 
 #[test]

@@ -38,6 +38,7 @@ fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     said
 }
 
+// SUM-4, SUM-6
 #[test]
 fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
     let mut sum = sum(false);
@@ -53,6 +54,7 @@ fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
     assert_eq!(says(&mut sum, 5), [(2_000, 1, 1, true)], "stated anew");
 }
 
+// SUM-2
 #[test]
 fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
     for (carry, target) in [(true, [0, 1, 0, 1, 0]), (false, [0; 5])] {
@@ -71,6 +73,7 @@ fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
     assert_eq!(says(&mut sum, 2).first().map(|said| said.1), Some(0), "nothing was left");
 }
 
+// SUM-4, SUM-5
 #[test]
 fn a_late_child_makes_one_more_sum_of_all_in_the_next_slot() {
     let mut sum = sum(false);
@@ -85,6 +88,7 @@ fn a_late_child_makes_one_more_sum_of_all_in_the_next_slot() {
     assert_eq!((sum.sent, sum.taken, sum.dropped), (2, 2, 0));
 }
 
+// LEASE-2, NACK-3
 #[test]
 fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     let mut sum = sum(false);
@@ -110,6 +114,7 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     assert_eq!(sum.taken, 2, "stated for another epoch");
 }
 
+// LEASE-2
 #[test]
 fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
     let mut sum = sum(false);
@@ -125,6 +130,7 @@ fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
     assert_eq!(sum.comparator(), Some((Epoch(3), 0)));
 }
 
+// LEASE-3
 #[test]
 fn an_end_closes_the_lease_without_a_word() {
     let mut sum = sum(false);
@@ -135,6 +141,7 @@ fn an_end_closes_the_lease_without_a_word() {
     assert_eq!((sum.poll_timeout(), sum.comparator()), (None, Some((Epoch(2), 0))), "nobody is missed");
 }
 
+// SUM-3
 #[test]
 fn saturation_passes_upwards_word_by_word() {
     let mut sum = sum(false);
@@ -154,6 +161,7 @@ fn saturation_passes_upwards_word_by_word() {
     assert_eq!(said.torque, [Q7_8::MAX; WORDS]);
 }
 
+// NACK-2
 #[test]
 fn a_machine_that_hears_late_blames_nobody() {
     for (age, rated) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {

@@ -1,8 +1,8 @@
-//! `protocol/vectors.json`, for people who write cells elsewhere: frames and what they say, frames that are refused, a
-//! cell's life in frames, and rows of configuration, joints, what is felt, and torque.
+//! `protocol/vectors.json`, for people who write cells elsewhere: packets and what they mean, frames that are refused,
+//! segments and what they come to, exchanges of one cell with its bus, messages over wires, and rows of arithmetic.
 //!
-//! The frames are those of `protocol/tests/golden`, which another program wrote from the document. The torques are the
-//! cell's own, compared here with Eq. 8 in double precision. With `SKINBUS_TAKE_OVER=yes` this test writes the file
+//! All but the torques are those of `protocol/tests/golden`, which another program wrote from the documents. The torques
+//! are the cell's own, compared here with Eq. 8 in double precision. With `SKINBUS_TAKE_OVER=yes` this test writes the file
 //! instead of comparing.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
@@ -25,7 +25,12 @@ const PACKETS: [&str; 2] = [
     include_str!("../../../protocol/tests/golden/fd.log"),
 ];
 const REFUSED: &str = include_str!("../../../protocol/tests/golden/bad.log");
+const REASSEMBLY: &str = include_str!("../../../protocol/tests/golden/classic.log");
 const SESSION: &str = include_str!("../../../protocol/tests/golden/session.log");
+const REFUSALS: &str = include_str!("../../../protocol/tests/golden/refusals.log");
+const EXCHANGE: &str = include_str!("../../../protocol/tests/golden/exchange.log");
+const WIRE: &str = include_str!("../../../protocol/tests/golden/wire.log");
+const ARITHMETIC: &str = include_str!("../../../protocol/tests/golden/arithmetic.json");
 
 /// Each frame of a log and what it says.
 fn said<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
@@ -61,6 +66,68 @@ fn session(record: &Record<'_>, says: Map<String, Value>) -> Value {
     json!({ "from": from, "fd": record.frame.to_string(), "kind": says["kind"] })
 }
 
+/// The frames of a log with the comment above each, and the title above that.
+fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
+    let (mut title, mut comment) = ("", "");
+    log.lines().filter_map(move |line| {
+        title = line.strip_prefix("## ").unwrap_or(title);
+        comment = line.strip_prefix("# ").unwrap_or(comment);
+        if let Line::Frame(record) = candump::parse(line).unwrap() {
+            Some((title, comment, record))
+        } else {
+            None
+        }
+    })
+}
+
+/// Segments in the order and at the times in which they arrive, and what becomes of each.
+fn reassembly() -> Vec<Value> {
+    let rows = commented(REASSEMBLY).map(|(title, comment, record)| {
+        let outcome = match comment.split_once(' ') {
+            None => comment,
+            Some(("whole", _)) => "complete",
+            Some(_) => "refused",
+        };
+        let at_us = record.time.nanos / 1_000 % 10_000_000;
+        json!({ "case": title, "at_us": at_us, "frame": record.frame.to_string(), "outcome": outcome })
+    });
+    rows.collect()
+}
+
+/// What one cell receives and sends from its start on: a row for each start, and one for each frame.
+fn exchanges() -> Vec<Value> {
+    let mut rows = Vec::new();
+    let mut title = "";
+    let mut frames = commented(EXCHANGE);
+    for line in EXCHANGE.lines() {
+        title = line.strip_prefix("## ").unwrap_or(title);
+        if let Some(fields) = line.strip_prefix("# start ") {
+            let fields = fields.split(' ').map(|field| field.split_once('=').unwrap());
+            let number = |text: &str| text.parse::<u32>().map_or(Value::from(text), Value::from);
+            let start: Map<_, _> = fields.map(|(key, value)| (key.to_owned(), number(value))).collect();
+            rows.push(json!({ "exchange": title, "start": start }));
+        } else if line.starts_with('(') {
+            let (_, comment, record) = frames.next().unwrap();
+            let (from, meaning) = comment.split_once(' ').unwrap();
+            let at_us = record.time.nanos / 1_000 % 10_000_000;
+            let frame = record.frame.to_string();
+            rows.push(json!({ "at_us": at_us, "from": from, "frame": frame, "meaning": meaning }));
+        }
+    }
+    rows
+}
+
+/// Messages over wires, and what they mean; what is refused has an error.
+fn wires() -> Vec<Value> {
+    let row = |(_, meaning, record): (&str, &str, Record<'_>)| json!({ "frame": record.frame.to_string(), "meaning": meaning });
+    commented(WIRE).map(row).collect()
+}
+
+fn arithmetic(section: &str) -> Vec<Value> {
+    let all: Value = serde_json::from_str(ARITHMETIC).unwrap();
+    all[section].as_array().unwrap().clone()
+}
+
 fn torques() -> Vec<Value> {
     let row = |case: Case| {
         let (jacobian, torque) = case.answer();
@@ -71,8 +138,9 @@ fn torques() -> Vec<Value> {
             "pose": case.parameters.words(Parameter::Pose),
             "contact": case.parameters.words(Parameter::Contact),
             "q": case.q.map(|word| word.to_bits()),
-            "felt": case.contact_state(),
+            "sensors": case.contact_state(),
             "jacobian": jacobian.map(|word| word.to_bits()),
+            "jacobian_exact": case.exact_jacobian().map(|word| word.to_bits()),
             "torque": torque.map(|word| word.to_bits()),
         })
     };
@@ -81,13 +149,25 @@ fn torques() -> Vec<Value> {
 
 /// The file: an array's elements are a line each.
 fn file() -> String {
-    let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean. torques: all numbers are \
-                 words as they stand in packets: parameters 1, 16 to 21, 2, 3, joints, sensors page 0, and what the cell \
-                 answers; its jacobian may differ by a step or two of 2^-14, and its torque accordingly.";
+    let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean, and cell.md what a cell \
+                 does. packets: frames and what they say. refused: frames that are none. reassembly: segments in their order, and \
+                 what each comes to. session: a cell is configured and pressed. refusals: a write to that cell, and its answer (of \
+                 parameter 127: of a commit after it). exchanges: from each start on all that one cell receives (bus) and has to \
+                 send (cell), in names of requirements; flash is empty, or what session commits. wires: messages over wires. All \
+                 other numbers are words as they stand in packets. forces: parameter 3, sensors page 0, F_z with 16 fraction bits, \
+                 J, torque. sums: epochs of one cell, whose own J and F_z, children's sums and sum. torques: parameters 1, 16 to 21, \
+                 2, 3, joints, sensors page 0, and what the cell of this project answers; another cell's jacobian may differ from \
+                 jacobian_exact as J-3 allows, and its torque accordingly.";
     let parts = [
         ("packets", PACKETS.iter().flat_map(|log| said(log, packet)).collect()),
         ("refused", said(REFUSED, refused)),
+        ("reassembly", reassembly()),
         ("session", said(SESSION, session)),
+        ("refusals", said(REFUSALS, session)),
+        ("exchanges", exchanges()),
+        ("wires", wires()),
+        ("forces", arithmetic("forces")),
+        ("sums", arithmetic("sums")),
         ("torques", torques()),
     ];
     let array = |(name, rows): &(&str, Vec<Value>)| {

@@ -14,7 +14,12 @@ use protocol::packet::{Packet, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
-const DOCUMENT: &str = include_str!("../../../docs/reference/protocol.md");
+/// The documents that spell out frames.
+const DOCUMENT: &str = concat!(
+    include_str!("../../../docs/reference/protocol.md"),
+    include_str!("../../../docs/reference/cell.md"),
+    include_str!("../../../docs/reference/sensing.md"),
+);
 const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
 
 fn gateway(arguments: &str) -> Command {

@@ -36,13 +36,13 @@ impl Reply {
         }
     }
 
-    /// What the words say; `None` when they cannot be: no such reply, no slot, or a depth above 253.
+    /// What the words say; `None` when they cannot be: no such reply, no slot, a depth above 253, or a carry that is
+    /// neither 0 nor 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
-        let [kind, slot_us, deepest, carry, ..] = words;
-        match kind {
-            0 => Some(Self::Torque),
-            1 if slot_us != 0 => Some(Self::Sum(Slots {
+        match words {
+            [0, ..] => Some(Self::Torque),
+            [1, slot_us, deepest, carry @ (0 | 1), ..] if slot_us != 0 => Some(Self::Sum(Slots {
                 slot_us: slot_us.cast_unsigned(),
                 deepest: u8::try_from(deepest).ok().filter(|deepest| *deepest <= 253)?,
                 carry: carry == 1,
@@ -138,8 +138,9 @@ impl Events {
     /// What the words say; `None` when one is negative, or the hysteresis above 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
-        let [contact, proximity, temperature, acceleration, hysteresis, ..] = words;
-        let sound = words.iter().all(|&word| word >= 0) && hysteresis <= 1 << 14;
+        let [thresholds @ .., _] = words;
+        let [contact, proximity, temperature, acceleration, hysteresis] = thresholds;
+        let sound = thresholds.iter().all(|&word| word >= 0) && hysteresis <= 1 << 14;
         sound.then_some(Self {
             contact: Q5_10::from_bits(contact),
             proximity: Q1_14::from_bits(proximity),

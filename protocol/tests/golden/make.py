@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes the golden frames of this folder. Needs nothing but Python's standard library.
 
-This is a second implementation of docs/reference/protocol.md, made from the document and not from the Rust
+This is a second implementation of docs/reference/cell.md and protocol.md, made from the document and not from the Rust
 code, and it shares nothing with it: when the two disagree, one of them, or the document, is wrong.
 Never "fix" a line of a log by copying what the Rust code prints.
 
@@ -16,12 +16,15 @@ in the units of the document (quarter turns, Nm, N, g, degrees Celsius, m), as e
     lenient.log     frames that are read although nobody should write them so: bytes -> meaning
     bad.log         frames that are refused, and why
     classic.log     pairs of classic frames, with the times between them
-    session.log     a cell is configured, hears joints, is pressed and answers
+    session.log     a cell is configured, receives joints, is pressed and answers
+    exchange.log    what one cell receives and sends, with times, from its start on: the cell of cell-node is run against it
     refusals.log    writes that a commit refuses, and the refusal
     wire.log        what cells say over the wires between them: bytes <-> meaning, and what is refused
-    document.log    the frames spelled out in docs/reference/protocol.md
+    document.log    the frames spelled out in docs/reference
+    arithmetic.json forces, torques and sums in words
 """
 
+import json
 import math
 import pathlib
 import random
@@ -305,7 +308,7 @@ def events(contact_n, proximity, temperature, acceleration_g, hysteresis):
     return 8, text, words
 
 
-def cuts(*deaf):
+def links_down(*deaf):
     return 9, f"deaf={'+'.join(map(str, deaf)) or 'none'}", [sum(1 << port for port in deaf)]
 
 
@@ -395,13 +398,13 @@ def hello(lane, number_here, port, flags=(), label=None, version=1):
     bits = port | sum(1 << HELLO[flag] for flag in flags) | (label is not None) << 6
     text = "none" if label is None else f"{label[0]}/{label[1]}"
     meaning = (
-        f"hello version={version} number={number_here} port={port} flags={'+'.join(flags) or 'none'} label={text}"
+        f"hello version={version} node_id={number_here} port={port} flags={'+'.join(flags) or 'none'} label={text}"
     )
     return Wire(over(lane, meaning), lane, 1, version, number_here, bits, *(label or (0, 0)))
 
 
 def bare_wire(lane, name):
-    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "left": 6, "ask": 12}[name])
+    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "leave_ack": 6, "probe": 12}[name])
 
 
 def grant(lane, round_, depth):
@@ -412,16 +415,16 @@ def state_of(lane, epoch):
     return Wire(over(lane, f"state epoch={epoch}"), lane, 7, epoch)
 
 
-def missed(lane, epoch):
-    return Wire(over(lane, f"missed epoch={epoch}"), lane, 8, epoch)
+def nack(lane, epoch):
+    return Wire(over(lane, f"nack epoch={epoch}"), lane, 8, epoch)
 
 
-def seek(lane, round_):
-    return Wire(over(lane, f"seek round={round_}"), lane, 9, round_)
+def repair(lane, round_):
+    return Wire(over(lane, f"repair round={round_}"), lane, 9, round_)
 
 
 def walk(lane, name, which, first, last):
-    kind = {"number": 10, "return": 11}[name]
+    kind = {"node_id": 10, "result": 11}[name]
     return Wire(over(lane, f"{name} walk={which} first={first} last={last}"), lane, kind, which, first, last)
 
 
@@ -615,9 +618,9 @@ def fd():
         write(12, 26, sensing("off")),
         write(12, 27, events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5"))),
         write(12, 28, events(Fraction(MAX, 1024), Fraction(MAX, 2**14), Fraction(MAX, 64), Fraction(MAX, 4096), 1)),
-        write(12, 29, cuts(0, 2)),
-        write(12, 30, cuts(0, 1, 2, 3, 4)),
-        write(12, 31, cuts()),
+        write(12, 29, links_down(0, 2)),
+        write(12, 30, links_down(0, 1, 2, 3, 4)),
+        write(12, 31, links_down()),
     )
 
     log.title("configured: values, and every reason of a refusal")
@@ -630,7 +633,7 @@ def fd():
         value(12, 4, reply_sum(1500, 6, 1), True),
         value(12, 5, sensing("off"), False),
         value(12, 6, events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5")), False),
-        value(12, 7, cuts(3), True),
+        value(12, 7, links_down(3), True),
         *(refusal(12, 200, 1, reason) for reason in (1, 2, 3, 4, 5, 6, 16, 17, 18, 19)),
         refusal(254, 255, 127, 16),
     )
@@ -913,6 +916,351 @@ def session():
     return log
 
 
+# --- What one cell receives and sends ------------------------------------------------------------
+
+# The first heartbeat, (serial mod 64) ms after the start, and the one that ends claiming, in us.
+FIRST = SERIAL % 64 * 1_000
+SETTLED = FIRST + 250_000 + 250_000 * CELL // 255
+HASH = configuration_hash(PARAMETERS)
+
+
+class Exchange:
+    """One cell from its start on: `bus` is what it receives, `cell` what it sends, at times in us after the start."""
+
+    def __init__(self, log, title, flash="empty", test=0, form="fd"):
+        self.log, self.form, self.sent = log, form, 0
+        self.start = (log.micros // 10_000_000 + 1) * 10_000_000
+        log.title(title)
+        log.micros = self.start
+        log.lines.append(f"# start node={CELL} serial={SERIAL} flash={flash} test={test} format={form}")
+        self.configured = flash == "session"
+        self.test = test
+
+    def put(self, who, at, packet):
+        frames = [packet.fd()] if self.form == "fd" else packet.halves()
+        for index, frame in enumerate(frames):
+            part = "" if self.form == "fd" else f"{index + 1}/2 "
+            self.frame(f"{who} {part}{packet.meaning}", at + 200 * index * (who == "bus"), frame)
+
+    def frame(self, meaning, at, frame):
+        self.log.add(meaning, frame, self.start + at - self.log.micros)
+
+    def bus(self, at, *packets):
+        for index, packet in enumerate(packets):
+            self.put("bus", at + 1_000 * index, packet)
+
+    def cell(self, at, *packets):
+        for packet in packets:
+            self.put("cell", at, packet)
+            self.sent += 1
+
+    def beat(self, at, *state, epoch=0, rejected=0):
+        """A heartbeat of the cell; what is always so of its state need not be said."""
+        known = [*(["configured"] if self.configured else []), *(["test-mode"] if self.test else [])]
+        state = [name for name in STATE if name in (*state, *known)]
+        value_of, joint = (HASH, JOINT) if self.configured else (0, 0)
+        self.cell(at, heartbeat(CELL, epoch, SERIAL, value_of, self.sent, rejected, tuple(state), joint))
+
+    def settle(self, epoch=0):
+        self.beat(FIRST, "claiming")
+        self.beat(SETTLED, epoch=epoch)
+
+
+def claim_of(serial, claims=True):
+    return heartbeat(CELL, 0, serial, 0, 0, 0, ("claiming",) if claims else ())
+
+
+def exchange():
+    log = Log(
+        "exchange.log",
+        "What one cell receives (bus) and sends (cell), from its start on. What it sends at once has here the time of what",
+        "it answers; docs/reference/cell.md says how much later it may be. Nothing else is sent between the lines.",
+    )
+    words = [angle(q) for q in ANGLES]
+    pressed = answer([1024] * 3)[3]
+
+    x = Exchange(log, "CLAIM-1 CLAIM-2 CLAIM-5 BEAT-1 BEAT-3 BEAT-4 CMD-1 CMD-2 CMD-3 CMD-4 JOINTS-2 STIM-1 SENSE-1 TIME-3: a start without a configuration")
+    x.beat(FIRST, "claiming")
+    x.bus(FIRST + 1_000, command("sync"), command("report"), read(CELL, 1, 0), write(CELL, 2, mode(1)))
+    x.beat(SETTLED)
+    x.beat(SETTLED + 250_000)
+    x.bus(600_000, command("sync"))
+    x.beat(600_000)
+    x.beat(SETTLED + 500_000)
+    x.bus(800_000, command("halt"), joints(7, words), command("sync"))
+    x.beat(802_000, "halted", epoch=7)
+    x.bus(803_000, command("resume"), stimulus(CELL, None, PRESSED), joints(8, words), command("sync"))
+    x.beat(806_000, epoch=8, rejected=1)
+    x.bus(807_000, read(CELL, 3, 0))
+    state = 1 << 12
+    x.cell(807_000, value(CELL, 3, raw(0, [signed(SERIAL & 0xFFFF), SERIAL >> 16, 1, 0, state, 0]), False))
+    x.bus(808_000, command("report"))
+    x.cell(808_000, counters(CELL, 8, 1, [2, 0, 0, 0, 0, 0]), counters(CELL, 8, 2, [0, 0, 0, 0, 0, 1]))
+    x.cell(808_000, sensors(CELL, 8, skin([0, 0, 0])), sensors(CELL, 8, acceleration([0, 0, 0])))
+
+    x = Exchange(log, "CLAIM-3 CLAIM-7 STATE-2: two claim a node id, and the lower serial number stays: before and after its first heartbeat")
+    x.bus(10_000, claim_of(200_000))
+    x.beat(10_000, "claiming", "duplicate")
+    x.bus(15_000, claim_of(200_000))
+    x.beat(FIRST, "claiming", "duplicate")
+    x.bus(50_000, claim_of(200_000))
+    x.beat(50_000, "claiming", "duplicate")
+    x.beat(SETTLED)
+
+    x = Exchange(log, "CLAIM-3 CLAIM-4: two claim a node id, and the higher serial number gives way")
+    x.beat(FIRST, "claiming")
+    x.bus(FIRST + 5_000, claim_of(99_999))
+    x = Exchange(log, "CLAIM-3 CLAIM-4: a claimant gives way to a cell that is settled, before its own first heartbeat")
+    x.bus(5_000, claim_of(500_000, claims=False))
+    x = Exchange(log, "CLAIM-3 CLAIM-4: a claimant gives way to anything but a heartbeat under its node id")
+    x.beat(FIRST, "claiming")
+    x.bus(FIRST + 5_000, counters(CELL, 0, 1, [0] * 6))
+
+    x = Exchange(log, "CLAIM-6 CLAIM-7: a settled cell answers a claimant, at most every 10 ms, and nobody else")
+    x.settle()
+    x.bus(300_000, claim_of(7))
+    x.beat(300_000, "duplicate")
+    x.bus(305_000, claim_of(7))
+    x.bus(310_000, claim_of(7))
+    x.beat(310_000, "duplicate")
+    x.bus(320_000, claim_of(500_000, claims=False))
+    x.beat(SETTLED + 250_000, "duplicate")
+    x.beat(SETTLED + 500_000)
+
+    x = Exchange(log, "OPT-1 CONF-1 CONF-2 CONF-3 CONF-4 CONF-5 CONF-6 CONF-7 CONF-9 CONF-12 CONF-13 COUNT-2 SENSE-3 SENSE-4: configuration without ports")
+    x.settle()
+    x.bus(295_000, read(CELL, 0, 1))
+    x.cell(295_000, value(CELL, 0, raw(1, [0] * 6), False))
+    at, tag = 300_000, 0
+
+    def ask(request, reply):
+        nonlocal at, tag
+        at, tag = at + 1_000, tag + 1
+        x.bus(at, request)
+        x.cell(at, reply)
+
+    def writes(parameter, now=None):
+        """`now`: the words that it has then, where they are not those that were written."""
+        changed = parameter if now is None else raw(parameter[0], now)
+        ask(write(CELL, tag, parameter), value(CELL, tag, changed, True))
+
+    def reads(parameter):
+        ask(read(CELL, tag, parameter[0]), value(CELL, tag, parameter, False))
+
+    def refuses(parameter, reason, of=None):
+        ask(write(CELL, tag, parameter), refusal(CELL, tag, parameter[0] if of is None else of, reason))
+
+    for number_of_parameter, _, given in PARAMETERS:
+        unused = [-7] * (6 - len(given))
+        writes(raw(number_of_parameter, [*given, *unused]), [*given, *[0] * len(unused)])
+    refuses(raw(1, [300, 300]), 2)
+    refuses(raw(1, [300, 6]), 3)
+    reads(mount(JOINT, 6))
+    refuses(commit(HASH ^ 1), 16)
+    writes(raw(127, [signed(HASH), 1, 2, 3, 4, 5]), [signed(HASH), 0, 0, 0, 0, 0])
+    x.configured = True
+    reads(PARAMETERS[2])
+    reads(raw(127, [0] * 6))
+    refuses(raw(0, [1] * 6), 1)
+    refuses(raw(99, [1] * 6), 18)
+    ask(read(CELL, tag, 126), refusal(CELL, tag, 126, 18))
+    # The one with the lowest number of several reasons.
+    writes(raw(1, [0, 7]))
+    writes(raw(2, [0] * 6))
+    writes(raw(4, [0]))
+    refuses(commit(0), 2, of=127)
+    writes(raw(1, [0, 6]))
+    refuses(commit(0), 3, of=127)
+    writes(mount(JOINT, 6))
+    refuses(commit(0), 4, of=127)
+    reads(PARAMETERS[3])
+    refuses(links_down(), 19)
+    writes(raw(5, [7, 1]), [0] * 6)
+    writes(raw(5, [1, 2, 3, 4, 5, 6]), [1, 0, 0, 0, 0, 0])
+    x.test = 1
+    reads(reply_torque())
+    writes(raw(6, [0, 1500, 6, 1]), [0] * 6)
+    refuses(reply_sum(1500, 6, 1), 19)
+    writes(raw(9, [0b100000]), [0] * 6)
+    refuses(links_down(0), 19)
+    thresholds = events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5"))
+    reads(thresholds)
+    writes(raw(8, [1, 2, 3, 4, 5, -1]), [1, 2, 3, 4, 5, 0])
+    refuses(raw(8, [1, 2, 3, 4, -1, 0]), 19)
+    reads(raw(8, [1, 2, 3, 4, 5, 0]))
+    writes(raw(7, [2, 77]), [2, 0, 0, 0, 0, 0])
+    x.cell(at, sensors(CELL, 0, skin([0, 0, 0])), sensors(CELL, 0, acceleration([0, 0, 0])))
+    refuses(sensing("continuous", 0), 19)
+    writes(raw(7, [0, 16]), [0] * 6)
+    x.bus(at + 1_000, command("sync"))
+    x.beat(at + 1_000)
+
+    x = Exchange(log, "JOINTS-1 JOINTS-3 JOINTS-5 JOINTS-6 TORQUE-1 TORQUE-2 STATE-1 STATE-2 STATE-3 STIM-3 STIM-4 STIM-5 STIM-7 STIM-8: contact", "session", test=1)
+    x.beat(FIRST, "claiming")
+    x.bus(290_000, stimulus(CELL, None, PRESSED), joints(1, words))
+    x.beat(SETTLED, epoch=1)
+    x.bus(300_000, joints(2, words))
+    x.cell(300_000, torque(CELL, 2, pressed))
+    x.bus(301_000, joints(2, words), joints(3, [*words[:5], 0], in_use=5))
+    x.bus(316_000, joints(3, words))
+    x.cell(316_000, torque(CELL, 3, pressed))
+    x.bus(320_000, stimulus(CELL, None, skin([MAX] * 3)))
+    x.bus(332_000, joints(4, words))
+    x.cell(332_000, torque(CELL, 4, answer([MAX] * 3)[3]))
+    x.bus(333_000, command("sync"))
+    x.beat(333_000, "active", "saturated", epoch=4, rejected=1)
+    x.bus(334_000, command("sync"))
+    x.beat(334_000, "active", epoch=4, rejected=1)
+    x.bus(335_000, command("halt"))
+    x.bus(348_000, joints(5, words), command("sync"))
+    x.beat(349_000, "halted", epoch=5, rejected=1)
+    x.bus(350_000, command("resume"), stimulus(EVERYONE, None, PRESSED))
+    x.bus(364_000, joints(6, words))
+    x.cell(364_000, torque(CELL, 6, pressed))
+    x.bus(365_000, stimulus(CELL, 7, skin([0, 0, 0])))
+    x.bus(380_000, joints(7, words))
+    x.cell(380_000, torque(CELL, 7, [0] * 6))
+    x.bus(396_000, joints(8, words), stimulus(CELL, 10, PRESSED))
+    x.bus(412_000, joints(9, words))
+    x.bus(428_000, joints(10, words))
+    x.cell(428_000, torque(CELL, 10, pressed))
+    x.bus(429_000, stimulus(CELL, 10, skin([0, 0, 0])))
+    x.bus(444_000, joints(200, words))
+    x.cell(444_000, torque(CELL, 200, [0] * 6))
+    x.bus(445_000, command("report"))
+    x.cell(445_000, counters(CELL, 200, 1, [11, 0, 1, 6, 1, 7]), counters(CELL, 200, 2, [0, 0, 0, 1, 0, 0]))
+    x.cell(445_000, sensors(CELL, 200, skin([0, 0, 0])), sensors(CELL, 200, acceleration([0, 0, 0])))
+
+    x = Exchange(log, "COUNT-1 COUNT-3: segments on a classic bus: interleaved, lost, of another length", "session", 1, "classic")
+    x.settle()
+
+    def segment(at, packet, index):
+        x.frame(f"bus {index}/2 {packet.meaning}", at, packet.halves()[index - 1])
+
+    x.bus(300_000, stimulus(CELL, None, PRESSED), joints(1, words))
+    x.cell(301_200, torque(CELL, 1, pressed))
+    # Of joints 2 only the first segment comes: the next one that comes is a segment of joints 3.
+    segment(317_000, joints(2, words), 1)
+    x.bus(333_000, joints(3, words))
+    x.cell(333_200, torque(CELL, 3, pressed))
+    let_go = stimulus(CELL, None, skin([0, 0, 0]))
+    for at, packet, index in ((349_000, let_go, 1), (349_100, joints(4, words), 1), (349_200, let_go, 2)):
+        segment(at, packet, index)
+    segment(349_300, joints(4, words), 2)
+    x.cell(349_300, torque(CELL, 4, [0] * 6))
+    segment(365_000, joints(5, words), 1)
+    x.frame("bus of another length", 365_100, "001#00")
+    x.frame("bus of another format", 365_200, joints(5, words).fd())
+    segment(365_300, joints(5, words), 2)
+    # The two segments come further apart than 15 ms: the second one waits, and goes with the next first one.
+    segment(380_000, joints(6, words), 1)
+    segment(395_001, joints(6, words), 2)
+    x.bus(396_000, joints(7, words), command("sync"))
+    x.beat(397_200, epoch=7, rejected=4)
+    x.bus(398_000, command("report"))
+    x.cell(398_200, counters(CELL, 7, 1, [5, 0, 0, 2, 0, 3]), counters(CELL, 7, 2, [2, 0, 0, 0, 2, 0]))
+    x.cell(398_200, sensors(CELL, 7, skin([0, 0, 0])), sensors(CELL, 7, acceleration([0, 0, 0])))
+    return log
+
+
+# --- Arithmetic ----------------------------------------------------------------------------------
+
+
+class Rows:
+    """A JSON file with a row a line."""
+
+    name = "arithmetic.json"
+
+    def __init__(self, **sections):
+        self.sections = sections
+
+    def text(self):
+        section = lambda rows: ",\n".join(f"    {json.dumps(row)}" for row in rows)
+        sections = (f'  "{name}": [\n{section(rows)}\n  ]' for name, rows in self.sections.items())
+        return "{\n" + ",\n".join(sections) + "\n}\n"
+
+
+def forces():
+    """Parameter 3, a sensors page and J: F_z with 16 fraction bits, and the words of the torque."""
+    plain = [4096, 0, 0, 0, 0]
+    fused = [4096, 512, 256, 2048, 256]
+    cases = [
+        (plain, [1024, 1024, 1024, 0]),
+        (plain, [MAX, MAX, MAX, 0]),
+        (plain, [MIN, MIN, MIN, 0]),
+        (plain, [1, 0, 0, 0]),
+        (plain, [-5, 3, 3, 0]),
+        (fused, [256, 0, 0, 0]),
+        (fused, [255, 0, 0, 0]),
+        (fused, [100, 100, 56, 2048]),
+        (fused, [0, 0, 0, 8192]),
+        (fused, [0, 0, 0, 8191]),
+        (fused, [0, 0, 0, 2047]),
+        ([MAX, MAX, 0, 0, 0], [MAX, MAX, MAX, MAX]),
+        ([1, 0, 0, 0, 0], [1, 0, 0, 0]),
+        ([1, 1, 0, 0, 0], [0, 0, 0, 127]),
+        ([1, 1, 0, 0, 0], [0, 0, 0, 128]),
+    ]
+    jacobians = [[-1433, 4260, 0, 0, 0, 0], [MAX, MIN, 1, -1, 8191, -8192], [3, -3, 7, -7, 13_926, 0]]
+    rows = []
+    for index, (rule, felt) in enumerate(cases):
+        f_z, active = fused_force(rule, felt[:3], felt[3])
+        f_z = max(0, (f_z + (1 << 7)) >> 8) if active else 0
+        jacobian = jacobians[index % len(jacobians)]
+        words = [max(MIN, min(MAX, (j * f_z + (1 << 17)) >> 18)) for j in jacobian]
+        rows.append({"contact": rule, "sensors": [*felt, 0, 0], "force": f_z, "jacobian": jacobian, "torque": words})
+    return rows
+
+
+def sums():
+    """Epochs of one cell: J and F_z of the cell itself, the children's sums, and what is sent. Carry begins at 0."""
+    slow, j = [], [1433, -4260, 16_384, 1, -1, 0]
+    own = lambda f_z: {"jacobian": j, "force": f_z}
+    child = lambda *words, count=1: {"words": (list(words) + [0] * 6)[:6], "count": count}
+    slow = [(own(9_000 + 700 * step), []) for step in range(8)]
+    mixed = [
+        (own(196_608), [child(256, -256, 1, -1)]),
+        (own(196_608), [child(MAX - 300, MIN + 300, count=3), child(200, -200, 5, count=2)]),
+        (own(196_608), [child(MAX, MIN, 0, 7, count=4), child(-400, 400, count=2)]),
+        (None, [child(1, 2, 3, 4, 5, 6, count=9), child(-1, -2, -3, -4, -5, -6, count=1)]),
+        (own(2**31 - 1), []),
+        (own(1), []),
+        (None, []),
+        (None, []),
+    ]
+    rows = []
+    for carries, course in ((1, slow), (0, slow), (1, mixed)):
+        carry, before, epochs = [0] * 6, 0, []
+        for own_of, children in course:
+            total_of, count, saturated = [0] * 6, 0, [False] * 6
+            if own_of is None:
+                carry = [0] * 6
+            else:
+                count = 1
+                for l in range(6):
+                    x = own_of["jacobian"][l] * own_of["force"] + (carry[l] if carries else 0)
+                    total_of[l] = (x + (1 << 21)) >> 22
+                    carry[l] = x - (total_of[l] << 22)
+            for sum_of in children:
+                count += sum_of["count"]
+                for l, word in enumerate(sum_of["words"]):
+                    saturated[l] |= word in (MAX, MIN)
+                    total_of[l] += word
+            held = [
+                (MIN if t < 0 else MAX) if s or not MIN <= t <= MAX else t for t, s in zip(total_of, saturated, strict=True)
+            ]
+            sends = {"words": held, "count": count} if count or before else None
+            epochs.append({"own": own_of, "children": children, "sends": sends})
+            before = count
+        rows.append({"carry": carries, "epochs": epochs})
+    return rows
+
+
+def arithmetic():
+    return Rows(forces=forces(), sums=sums())
+
+
+
 def refusals():
     log = Log(
         "refusals.log",
@@ -948,20 +1296,22 @@ def refusals():
     for parameter, reason in at_once:
         assert parameter[0] in by_number
         case(parameter, parameter[0], reason)
-    log.title("words that a switch cannot have, and a cut outside test mode")
+    log.title("words that a switch cannot have, and a link taken down outside test mode")
     for parameter in (
         raw(6, [2, 1500, 6, 1]),
         raw(6, [-1, 1500, 6, 1]),
         raw(6, [1, 0, 6, 1]),
         raw(6, [1, 1500, -1, 1]),
         raw(6, [1, 1500, 254, 1]),
+        raw(6, [1, 1500, 6, 2]),
+        raw(6, [1, 1500, 6, -1]),
         raw(7, [3, 16]),
         raw(7, [-1, 16]),
         raw(7, [1, 0]),
         *(raw(8, [-1 if i == word else 1 for i in range(5)]) for word in range(5)),
         raw(8, [1, 1, 1, 1, 16385]),
-        cuts(0),
-        cuts(),
+        links_down(0),
+        links_down(),
     ):
         case(parameter, parameter[0], 19)
     log.title("what only the commit finds")
@@ -982,13 +1332,13 @@ def wire():
         grant(here, 3, 0),
         state_of(there, 255),
         hello(there, 7, 2, ["hears", "up"], (3, 1)),
-        missed(here, 9),
-        seek(there, 3),
-        walk(here, "number", 5, 1, 254),
-        walk(there, "return", 5, 200, 199),
+        nack(here, 9),
+        repair(there, 3),
+        walk(here, "node_id", 5, 1, 254),
+        walk(there, "result", 5, 200, 199),
         bare_wire(there, "leave"),
-        bare_wire(there, "ask"),
-        bare_wire(here, "left"),
+        bare_wire(there, "probe"),
+        bare_wire(here, "leave_ack"),
         bare_wire(here, "refuse"),
     )
     log.title("the greatest and the least of everything")
@@ -997,10 +1347,10 @@ def wire():
         hello((65535, 1), 254, 7, list(HELLO), (255, 255), version=255),
         grant((65535, 0), 255, 255),
         state_of((0, 1), 0),
-        missed((1, 0), 128),
-        seek((255, 1), 255),
-        walk((256, 0), "number", 255, 255, 0),
-        walk((257, 1), "return", 0, 1, 1),
+        nack((1, 0), 128),
+        repair((255, 1), 255),
+        walk((256, 0), "node_id", 255, 255, 0),
+        walk((257, 1), "result", 0, 1, 1),
     )
     log.title("a label that nobody says is there is not looked at; the highest bit of a hello's flags neither")
 
@@ -1034,7 +1384,7 @@ def wire():
 
 
 def document():
-    log = Log("document.log", "The frames that docs/reference/protocol.md spells out; it must hold each of them.")
+    log = Log("document.log", "The frames that the documents in docs/reference spell out; they must hold each of them.")
     value_of = configuration_hash(PARAMETERS)
     log.title("the worked example of the CRC, as one frame")
     log.put(torque(12, 7, [4096, -2048, 1, 0, 0, 0]))
@@ -1055,7 +1405,8 @@ def document():
 
 def main():
     stale = 0
-    for log in (fd(), lenient(), bad(), classic(), session(), refusals(), wire(), document()):
+    logs = (fd(), lenient(), bad(), classic(), session(), exchange(), refusals(), wire(), document(), arithmetic())
+    for log in logs:
         path = HERE / log.name
         if "--check" in sys.argv[1:]:
             if not path.exists() or path.read_text() != log.text():

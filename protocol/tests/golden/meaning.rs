@@ -146,7 +146,7 @@ impl<'a> Meaning<'a> {
                 let [hears, up, unnumbered] = self.flags(flags, ["hears", "up", "unnumbered"]);
                 PortMessage::Hello(Hello {
                     version: self.number("version"),
-                    number: self.number("number"),
+                    number: self.number("node_id"),
                     port: self.number("port"),
                     hears,
                     up,
@@ -158,13 +158,13 @@ impl<'a> Meaning<'a> {
             "grant" => PortMessage::Grant(self.rank().expect(self.text)),
             "refuse" => PortMessage::Refuse,
             "leave" => PortMessage::Leave,
-            "left" => PortMessage::LeaveAck,
-            "ask" => PortMessage::Probe,
+            "leave_ack" => PortMessage::LeaveAck,
+            "probe" => PortMessage::Probe,
             "state" => PortMessage::State(self.epoch()),
-            "missed" => PortMessage::Nack(self.epoch()),
-            "seek" => PortMessage::Repair(self.number("round")),
-            "number" => PortMessage::NodeId(self.walk()),
-            "return" => PortMessage::Return(self.walk()),
+            "nack" => PortMessage::Nack(self.epoch()),
+            "repair" => PortMessage::Repair(self.number("round")),
+            "node_id" => PortMessage::NodeId(self.walk()),
+            "result" => PortMessage::Return(self.walk()),
             _ => panic!("{}: not understood", self.text),
         };
         assert!(self.fields.is_empty(), "{}: {:?} left over", self.text, self.fields);

@@ -151,6 +151,7 @@ fn eventful() -> Cell {
     cell
 }
 
+// SENSE-1, SENSE-2
 #[test]
 fn off_says_nothing_whatever_is_sensed() {
     let mut cell = Cell::new(Mode::Off);
@@ -160,6 +161,7 @@ fn off_says_nothing_whatever_is_sensed() {
     }
 }
 
+// SENSE-9
 #[test]
 fn touch_and_release_have_two_thresholds() {
     let mut cell = eventful();
@@ -178,6 +180,7 @@ fn noise_below_the_threshold_says_nothing() {
     }
 }
 
+// SENSE-9
 #[test]
 fn a_release_is_said_however_softly_it_comes_and_so_is_the_zero_after_it() {
     let mut cell = eventful();
@@ -186,6 +189,7 @@ fn a_release_is_said_however_softly_it_comes_and_so_is_the_zero_after_it() {
     assert_eq!(said, [49, 0], "neither moved by a threshold from what was sent");
 }
 
+// SENSE-8
 #[test]
 fn a_slow_drift_is_seen_because_it_is_measured_from_what_was_sent() {
     let mut cell = eventful();
@@ -206,6 +210,7 @@ fn a_touch_is_the_sum_of_the_three_contact_words() {
     assert_eq!(cell.feels(of([16, 16, 17])), [of([16, 16, 17])]);
 }
 
+// SENSE-7
 #[test]
 fn every_sensor_has_its_threshold() {
     let mut cell = eventful();
@@ -225,6 +230,7 @@ fn every_sensor_has_its_threshold() {
     assert_eq!(cell.feels(near(49)), [near(49)], "a release of what came near");
 }
 
+// SENSE-10
 #[test]
 fn a_heartbeat_in_event_mode_brings_the_present_state_and_every_fourth_the_acceleration() {
     let mut cell = eventful();
@@ -239,6 +245,7 @@ fn a_heartbeat_in_event_mode_brings_the_present_state_and_every_fourth_the_accel
     assert!(!cell.says(60) && cell.says(160));
 }
 
+// SENSE-10
 #[test]
 fn a_heartbeat_with_an_event_does_not_say_it_twice() {
     let mut cell = eventful();
@@ -256,6 +263,7 @@ fn a_heartbeat_with_an_event_does_not_say_it_twice() {
     assert_eq!(said, expected, "the torque first");
 }
 
+// SENSE-5
 #[test]
 fn continuous_keeps_its_period_and_the_phase_of_its_number() {
     let mut cell = Cell::new(Mode::Off);
@@ -271,6 +279,7 @@ fn continuous_keeps_its_period_and_the_phase_of_its_number() {
     assert_eq!(cell.sends(), []);
 }
 
+// SENSE-5
 #[test]
 fn a_hang_skips_what_was_missed_and_keeps_the_phase() {
     let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
@@ -282,6 +291,7 @@ fn a_hang_skips_what_was_missed_and_keeps_the_phase() {
     assert_eq!(cell.times(2), [last + 100_000, last + 110_000]);
 }
 
+// SENSE-11
 #[test]
 fn what_is_sensed_during_a_hang_is_told_with_the_next_joints() {
     let mut cell = eventful();
@@ -293,6 +303,7 @@ fn what_is_sensed_during_a_hang_is_told_with_the_next_joints() {
     assert_eq!(cell.joints(), [pressed(900)]);
 }
 
+// SENSE-6
 #[test]
 fn a_long_period_comes_with_the_answer_before_it_and_a_short_one_keeps_its_own_time() {
     let mut cell = Cell::new(Mode::Continuous { period_ms: 100 });
@@ -311,6 +322,7 @@ fn a_long_period_comes_with_the_answer_before_it_and_a_short_one_keeps_its_own_t
     assert_eq!(cell.times(1), [due]);
 }
 
+// SENSE-4
 #[test]
 fn switching_starts_again_and_the_same_again_changes_nothing() {
     let mut cell = eventful();
@@ -330,6 +342,7 @@ fn switching_starts_again_and_the_same_again_changes_nothing() {
     assert!(!cell.says(900));
 }
 
+// SENSE-8
 #[test]
 fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
     let mut cell = eventful();
@@ -340,6 +353,7 @@ fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
     );
 }
 
+// SENSE-11
 #[test]
 fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
     let mut cell = eventful();
@@ -357,6 +371,7 @@ fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
     assert_eq!(cell.sends(), []);
 }
 
+// SENSE-7, CONF-9
 #[test]
 fn other_thresholds_hold_at_once() {
     let mut cell = eventful();
@@ -365,6 +380,7 @@ fn other_thresholds_hold_at_once() {
     assert_eq!(cell.write(Parameter::Events, finer.words()), [pressed(60)]);
 }
 
+// STIM-2, SENSE-7
 #[test]
 fn who_leaves_test_mode_has_released() {
     let mut cell = eventful();
@@ -372,6 +388,7 @@ fn who_leaves_test_mode_has_released() {
     assert_eq!(cell.write(Parameter::Mode, [0; WORDS]), [pressed(0)]);
 }
 
+// SENSE-11, CMD-1
 #[test]
 fn a_halted_cell_goes_on_to_say_what_it_feels() {
     let mut cell = eventful();

@@ -190,7 +190,7 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
     assert_eq!(signal(0x701, "from_next").1, [(0, "from this epoch on"), (1, "from the next joints on")]);
     assert_eq!(signal(0x501, "parameter").1.len(), 17);
-    assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "no way up")]));
+    assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "unreachable")]));
     assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
     let refusal = signal(0x601, "parameter").1;
     assert_eq!(refusal.last(), Some(&(126, "refusal")));

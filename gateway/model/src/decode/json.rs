@@ -374,23 +374,23 @@ mod tests {
         let sensing = values("write to=12 tag=26 parameter=7 sensing=off");
         assert_eq!(sensing, json!({ "parameter": "sensing", "write": true, "sensing": "off" }));
         assert_eq!(values("write to=12 tag=28 parameter=8")["hysteresis"], json!(1.0));
-        let links_down = json!({ "parameter": "cuts", "write": true, "deaf_ports": [0, 2] });
+        let links_down = json!({ "parameter": "links_down", "write": true, "deaf_ports": [0, 2] });
         assert_eq!(values("write to=12 tag=29 parameter=9"), links_down);
     }
 
     #[test]
     fn wires_have_their_number_and_what_is_said_over_them() {
-        let hello = object(WIRE, "hello wire=12 back=0 version=1 number=7 port=2 flags=hears+up label=3/1");
+        let hello = object(WIRE, "hello wire=12 back=0 version=1 node_id=7 port=2 flags=hears+up label=3/1");
         assert_eq!((&hello["kind"], &hello["verdict"]), (&json!("wire"), &json!("ok")));
         assert_eq!((hello.get("node"), hello.get("epoch")), (None, None));
         let expected = json!({
-            "wire": 12, "back": false, "says": "hello", "version": 1, "number": 7, "port": 2, "hears": true,
+            "wire": 12, "back": false, "says": "hello", "version": 1, "node_id": 7, "port": 2, "hears": true,
             "up": true, "unnumbered": false, "round": 3, "depth": 1,
         });
         assert_eq!(hello["values"], expected);
-        let nack = object(WIRE, "missed wire=12 back=1 epoch=9");
+        let nack = object(WIRE, "nack wire=12 back=1 epoch=9");
         assert_eq!(nack["epoch"], json!(9));
-        assert_eq!(nack["values"], json!({ "wire": 12, "back": true, "says": "missed" }));
+        assert_eq!(nack["values"], json!({ "wire": 12, "back": true, "says": "nack" }));
     }
 
     #[test]

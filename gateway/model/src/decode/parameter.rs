@@ -18,7 +18,7 @@ const MAX: u8 = 127;
 pub enum ParameterTextError {
     /// No such name.
     #[error(
-        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to \
+        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to \
          row6 and commit are, and every number from 0 to {MAX}"
     )]
     Unknown {
@@ -27,7 +27,7 @@ pub enum ParameterTextError {
     },
     /// It cannot be written.
     #[error(
-        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to row6 \
+        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to row6 \
          or commit"
     )]
     ReadOnly,
@@ -242,7 +242,7 @@ mod tests {
     fn what_cannot_be_written_says_what_can() {
         assert_eq!(
             says("poes", &["1"]),
-            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, cuts, \
+            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
              row1 to row6 and commit are, and every number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
@@ -260,7 +260,7 @@ mod tests {
         assert_eq!(says("commit", &["12345"]), "hash = 12345: a hash has up to 4 hexadecimal digits");
         assert_eq!(
             says("identity", &["1"]),
-            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, cuts, row1 to \
+            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to \
              row6 or commit"
         );
         assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
@@ -279,9 +279,9 @@ mod tests {
         assert_eq!(words("sensing", "continuous 16"), (7, [1, 16, 0, 0, 0, 0]));
         assert_eq!(words("sensing", "event"), (7, [2, 0, 0, 0, 0, 0]));
         assert_eq!(words("events", "0.1 0.05 0.5 0.1 0.5").1, Events::default().words());
-        assert_eq!(words("cuts", "0+2"), (9, [5, 0, 0, 0, 0, 0]));
-        assert_eq!(words("cuts", "3,uplink"), (9, [24, 0, 0, 0, 0, 0]));
-        assert_eq!(words("cuts", "none"), (9, [0; WORDS]));
+        assert_eq!(words("links_down", "0+2"), (9, [5, 0, 0, 0, 0, 0]));
+        assert_eq!(words("links_down", "3,uplink"), (9, [24, 0, 0, 0, 0, 0]));
+        assert_eq!(words("links_down", "none"), (9, [0; WORDS]));
         assert_eq!(says("reply", &["sums"]), "reply = sums: torque is, and sum SLOT_US DEEPEST CARRY");
         assert_eq!(
             says("reply", &["sum", "1500"]),
@@ -302,7 +302,7 @@ mod tests {
             "hysteresis = 1.5: a part of the threshold is 0 to 1"
         );
         assert_eq!(
-            says("cuts", &["4"]),
+            says("links_down", &["4"]),
             "deaf_ports = 4: none is, or ports 0 to 3 and uplink with a plus between them: 0+2"
         );
     }
@@ -318,7 +318,7 @@ mod tests {
                 "0.1 0.05 0.5 0.1 1",
                 "contact 0.100 N, proximity 0.0500, temperature 0.50 °C, acceleration 0.1001 g, hysteresis 1.0000",
             ),
-            ("cuts", "0+3+uplink", "deaf ports 0+3+4"),
+            ("links_down", "0+3+uplink", "deaf ports 0+3+4"),
         ] {
             let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
             let (number, words) = write(parameter, &values).unwrap();

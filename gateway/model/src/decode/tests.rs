@@ -173,7 +173,7 @@ fn every_other_kind_has_its_text() {
             (
                 "tree from=9 epoch=200 parent=none up=0 depth=0 round=7 children=none works=1 sent=5 taken=6 \
                  dropped=7",
-                "ok      network 9 epoch 200 tree: no way up (last round 7), children at ports none, working ports 1, \
+                "ok      network 9 epoch 200 tree: unreachable (last round 7), children at ports none, working ports 1, \
                  sums sent 5, taken 6, not taken 7",
             ),
             (
@@ -184,7 +184,7 @@ fn every_other_kind_has_its_text() {
             ),
             (
                 "ports from=1 epoch=0 port0=0/4/hears+works port1=0/0/none port2=0/0/none port3=0/0/none changes=0",
-                "ok      network 1 epoch 0 ports: 0 leads to uplink of somebody without a number, 1 silent, 2 silent, \
+                "ok      network 1 epoch 0 ports: 0 leads to uplink of a cell without a node id, 1 silent, 2 silent, \
                  3 silent; parent changed 0 times",
             ),
             (
@@ -193,8 +193,8 @@ fn every_other_kind_has_its_text() {
             ),
             (
                 "refusal from=12 tag=200 parameter=1 reason=19",
-                "ok      configured 12 tag 200: refuses mount: it cannot be that, or ports are cut outside test mode \
-                 (reason 19)",
+                "ok      configured 12 tag 200: refuses mount: it cannot have this value, or a link is taken down \
+                 outside test mode (reason 19)",
             ),
             ("read to=12 tag=2 parameter=2", "ok      configure 12 tag 2: read pose"),
             ("read to=254 tag=0 parameter=99", "ok      configure 254 tag 0: read parameter 99"),
@@ -342,21 +342,21 @@ fn on_a_bus_of_one_format_the_other_is_refused() {
 #[test]
 fn what_is_said_over_wires_has_its_text() {
     let expected = [
-        "wire 12 ->: hello, no number, port 2, somebody has no number, no way up",
-        "wire 12 <-: hello, no number, uplink, hears, round 3 depth 0",
+        "wire 12 ->: hello, no node id, port 2, a node id is missing, unreachable",
+        "wire 12 <-: hello, no node id, uplink, hears, round 3 depth 0",
         "wire 12 ->: join",
         "wire 12 <-: grant, round 3 depth 0",
         "wire 12 ->: state, sums from epoch 255 on",
-        "wire 12 ->: hello, number 7, port 2, hears, sums go here, round 3 depth 1",
-        "wire 12 <-: missed, the sum of epoch 9",
-        "wire 12 ->: seek, a round later than 3",
-        "wire 12 <-: number, walk 5, 1 to 254",
-        "wire 12 ->: return, walk 5, none left",
+        "wire 12 ->: hello, node id 7, port 2, hears, sums go here, round 3 depth 1",
+        "wire 12 <-: nack, the sum of epoch 9",
+        "wire 12 ->: repair, a round later than 3",
+        "wire 12 <-: node_id, walk 5, 1 to 254",
+        "wire 12 ->: result, walk 5, none remaining",
         "wire 12 ->: leave",
-        "wire 12 ->: ask",
-        "wire 12 <-: left",
+        "wire 12 ->: probe",
+        "wire 12 <-: leave_ack",
         "wire 12 <-: refuse",
-        "wire 0 ->: hello, version 0, no number, port 0, no way up",
+        "wire 0 ->: hello, version 0, no node id, port 0, unreachable",
     ];
     let all = decoded(WIRE, Some(Format::Fd));
     for ((comment, text), expected) in all.iter().zip(expected) {

@@ -40,7 +40,11 @@ impl Display for Said {
         }
         if let PortMessage::Return(Walk { walk, first, last }) = message {
             write!(f, ", walk {walk}, ")?;
-            return if first > last { f.write_str("none left") } else { write!(f, "{first} to {last} left") };
+            return if first > last {
+                f.write_str("none remaining")
+            } else {
+                write!(f, "{first} to {last} remaining")
+            };
         }
         text::say(f, layout, &bytes)
     }
@@ -52,11 +56,11 @@ fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
         write!(f, ", version {version}")?;
     }
     match number {
-        0 => f.write_str(", no number")?,
-        number => write!(f, ", number {number}")?,
+        0 => f.write_str(", no node id")?,
+        number => write!(f, ", node id {number}")?,
     }
     write!(f, ", {}", Port(i64::from(port)))?;
-    for (set, word) in [(hears, "hears"), (up, "sums go here"), (unnumbered, "somebody has no number")] {
+    for (set, word) in [(hears, "hears"), (up, "sums go here"), (unnumbered, "a node id is missing")] {
         if set {
             write!(f, ", {word}")?;
         }
@@ -71,7 +75,7 @@ impl Display for Far {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self.0 {
             Some(Rank { round, depth }) => write!(f, "round {round} depth {depth}"),
-            None => f.write_str("no way up"),
+            None => f.write_str("unreachable"),
         }
     }
 }
@@ -101,7 +105,7 @@ pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports
         }
         write!(f, "leads to {} of ", Port(part("port")))?;
         match part("node") {
-            0 => f.write_str("somebody without a number")?,
+            0 => f.write_str("a cell without a node id")?,
             number => write!(f, "{number}")?,
         }
         f.write_str(match (part("other_version"), part("works")) {

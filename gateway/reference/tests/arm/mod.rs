@@ -74,8 +74,19 @@ impl Case {
         (cell.jacobian(&self.q), cell.torque(&self.q, &contact_state))
     }
 
+    /// J in double precision, rounded once.
+    pub(crate) fn exact_jacobian(&self) -> [Q1_14; MAX_JOINTS] {
+        let mut real = self.under(1.0).into_iter();
+        core::array::from_fn(|_| Q1_14::nearest(real.next().unwrap_or(0.0)))
+    }
+
     /// The torques in Nm: what a force against the normal does about each axis below the cell.
     pub(crate) fn real(&self) -> Vec<f64> {
+        self.under(self.contact.iter().map(|word| word.to_f64()).sum())
+    }
+
+    /// The same under so many newtons.
+    fn under(&self, force_n: f64) -> Vec<f64> {
         let Pose { position, normal } = self.parameters.pose;
         let turn =
             |axis: Unit<Vector3<f64>>, angle: Q1_14| Rotation3::from_axis_angle(&axis, angle.to_radians());
@@ -86,7 +97,6 @@ impl Case {
             let next = frames.last().unwrap() * about_z * link * turn(Vector3::x_axis(), row.alpha);
             frames.push(next);
         }
-        let force_n: f64 = self.contact.iter().map(|word| word.to_f64()).sum();
         let last = frames.pop().unwrap();
         let at = last * Point3::from(position.map(Q::to_f64));
         let force = last.rotation * Vector3::from(normal.map(Q::to_f64)) * -force_n;

@@ -99,7 +99,7 @@ impl Said {
             }
             Some(Parameter::LinksDown) => {
                 for port in 0..5 {
-                    self.put(format!("cut_port_{port}"), words[0] >> port & 1);
+                    self.put(format!("link_down_port_{port}"), words[0] >> port & 1);
                 }
             }
             Some(Parameter::Row(row)) => {

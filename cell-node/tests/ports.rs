@@ -1,0 +1,104 @@
+//! A cell with ports and one without: what they say over wires, and what parameter 6 is to them.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
+use protocol::can::Format;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::id::{CellId, Node as Address};
+use protocol::message::{Answer, From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, WORDS, words};
+use protocol::parameters::{Contact, Parameter, Parameters, Pose};
+use protocol::time::{Micros, Span};
+use protocol::wire::{Hello, PortMessage, Rank, UPLINK};
+
+const REPLY: u8 = 6;
+
+fn start(wired: u8) -> Node {
+    let [zero, one] = [Q1_14::ZERO, Q1_14::nearest(1.0)];
+    let parameters = Parameters {
+        joint: 1,
+        joints: 1,
+        pose: Pose { position: [one, zero, zero], normal: [zero, one, zero] },
+        contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
+        period_us: 16_000,
+        ..Parameters::default()
+    };
+    let identity = Identity { cell: Some(CellId::new(12).unwrap()), serial: 1 };
+    Node::new(identity, Format::Fd, &Flash::Sound(parameters), true, Micros(0)).with_ports(wired)
+}
+
+/// Lets time pass; what it says over its wires.
+fn until(node: &mut Node, at: Micros) -> Vec<(usize, PortMessage)> {
+    while node.poll_timeout() <= at {
+        node.handle_timeout(node.poll_timeout());
+        while node.poll_transmit().is_some() {}
+    }
+    core::iter::from_fn(|| node.poll_port_transmit()).collect()
+}
+
+fn tell(node: &mut Node, now: Micros, message: &Message) -> Vec<Message> {
+    for frame in message.encode().frames(Format::Fd) {
+        node.handle_frame(now, Span(0), &frame);
+    }
+    core::iter::from_fn(|| node.poll_transmit()).map(|packet| Message::decode(&packet).unwrap()).collect()
+}
+
+fn sum_with(words: [i16; WORDS]) -> Message {
+    let number = Parameter::Reply.number();
+    Message::Configure { to: Address::Everyone, tag: 0, request: Request::Write { number, words } }
+}
+
+// CLAIM-8, HELLO-1
+#[test]
+fn hellos_of_a_claiming_cell_have_the_node_id_that_it_claims() {
+    let mut node = start(0b1);
+    // It is settled 250 ms after its first heartbeat at the earliest.
+    let hellos = until(&mut node, Micros(200_000));
+    assert!(
+        matches!(hellos[..], [(0, PortMessage::Hello(Hello { number: 12, rank: None, .. }))]),
+        "{hellos:?}"
+    );
+}
+
+// OPT-1, CONF-3, CONF-4, CONF-10, CONF-11
+#[test]
+fn a_cell_without_ports_does_not_sum_and_one_with_ports_reads_back_what_it_was_told() {
+    let now = Micros(400_000);
+    let answers = [0, 0b1].map(|wired| {
+        let mut node = start(wired);
+        until(&mut node, now);
+        match tell(&mut node, now, &sum_with([1, 1_500, 6, 1, -7, -7])).as_slice() {
+            [Message::Configured { answer, .. }] => *answer,
+            other => panic!("{other:?}"),
+        }
+    });
+    let refused = Answer::Refused { number: REPLY, reason: Answer::CANNOT_BE };
+    let taken = Answer::Value { number: REPLY, written: true, words: words([1, 1_500, 6, 1]) };
+    assert_eq!(answers, [refused, taken]);
+}
+
+// LEASE-1, JOIN-5
+#[test]
+fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
+    let mut node = start(1 << UPLINK);
+    let now = Micros(400_000);
+    until(&mut node, now);
+    let rank = Rank { round: 1, depth: 0 };
+    let hello =
+        Hello { version: 1, number: 0, port: 0, hears: true, up: false, unnumbered: false, rank: Some(rank) };
+    node.handle_port(now, Span(0), UPLINK, PortMessage::Hello(hello));
+    node.handle_port(now, Span(0), UPLINK, PortMessage::Grant(rank));
+    tell(&mut node, now, &sum_with([1, 1_500, 0, 1, 0, 0]));
+    let contact = [Q5_10::nearest(4.0), Q5_10::ZERO, Q5_10::ZERO];
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: From::Next, page });
+    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+    let sent = tell(&mut node, now, &Message::Joints { epoch: Epoch(7), joints });
+    assert!(sent.iter().any(|message| matches!(message, Message::Sum { count: 1, .. })), "{sent:?}");
+    let said: Vec<_> = core::iter::from_fn(|| node.poll_port_transmit()).collect();
+    let is_up = |message: &PortMessage| matches!(message, PortMessage::Hello(Hello { up: true, .. }));
+    assert!(said.iter().any(|(port, message)| *port == UPLINK && is_up(message)), "{said:?}");
+    assert!(!said.iter().any(|(_, message)| matches!(message, PortMessage::State(_))), "{said:?}");
+}
