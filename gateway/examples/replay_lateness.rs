@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             pace: Pace::Timed(1.0),
             spin: Duration::from_micros(spin),
             lockstep: false,
-            expect: false,
+            expect: None,
             spawn: None,
             vcan_setup: None,
             test_mode: false,

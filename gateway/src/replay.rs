@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use bench::replay::comparator::Steps;
 use bench::replay::player::Pace;
 use bench::replay::replay_plan::Only;
 use bench::replay::report::{Expect, Summary};
@@ -23,8 +24,9 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 /// Put a capture back on a bus, and compare what the cells answer with what they answered then
 ///
 /// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
-/// bus answer; with --expect their answers have to be the recorded ones, bit for bit. docs/reference/replay.md says what is
-/// compared and how. Exit code 0: all was sent, and all answers were right; 1: not so; 2: wrong use.
+/// bus answer; with --expect their answers have to be the recorded ones, bit for bit or within a tolerance.
+/// docs/reference/replay.md says what is compared and how. Exit code 0: all was sent, and all answers were right; 1: not
+/// so; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
     "cells_per_process" | "cell_node" | "vcan_setup" => arg.requires("spawn"),
@@ -61,6 +63,9 @@ pub(crate) struct Replay {
     /// Compare the answers with the recorded ones; with --max in lockstep
     #[arg(long)]
     expect: bool,
+    /// Take torques for equal whose words differ by at most so many steps of 1/4096 Nm; they are counted
+    #[arg(long, value_name = "STEPS", default_value_t = 0, requires = "expect")]
+    tolerance: u16,
     /// Start the cells, as processes, and end them afterwards
     #[arg(long)]
     spawn: bool,
@@ -185,7 +190,7 @@ impl Replay {
             pace: if self.max { Pace::Max } else { Pace::Timed(self.speed) },
             spin: Duration::from_micros(self.spin.into()),
             lockstep: self.lockstep || (self.expect && self.max),
-            expect: self.expect,
+            expect: self.expect.then_some(self.tolerance),
             spawn: self.spawn.then(|| Spawn {
                 skin: self.skin.clone(),
                 cells_per_process: self.programs.cells_per_process.into(),
@@ -238,8 +243,11 @@ fn table(summary: &Summary) -> String {
 fn expectation(rows: &mut Rows, expect: &Expect) {
     let tally = &expect.tally;
     rows.section("replies", "against the recording", "");
-    rows.row("equal", tally.equal, "bit for bit");
+    let within = format!("{} of them within the tolerance of {} steps", tally.tolerated, expect.tolerance);
+    rows.row("equal", tally.equal, if tally.tolerated > 0 { &within } else { "bit for bit" });
     rows.row("different", tally.different, "");
+    off(rows, "torque", &tally.torque_words, 0);
+    off(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
         count => format!("cells came too late for joints {count} times"),
@@ -252,4 +260,17 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     }
     rows.any("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
     rows.any("unknown configurations", expect.unchecked_cells, "not told before they were changed");
+}
+
+/// The words that differ by more than so many steps, where there are any: by how many steps how many do.
+fn off(rows: &mut Rows, what: &str, steps: &Steps, usual: usize) {
+    let counts = steps.by_steps.iter().enumerate().skip(1);
+    let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();
+    let Some((worst, _)) = found.last().filter(|(worst, _)| *worst > usual) else { return };
+    let last = steps.by_steps.len() - 1;
+    let of = format!("of {}, at most {} steps off", steps.by_steps.iter().sum::<u64>(), steps.max);
+    for (by, count) in &found {
+        let more = if *by == last { " or more" } else { "" };
+        rows.row(format!("{what} words {by}{more} off"), count, if by == worst { &of } else { "" });
+    }
 }

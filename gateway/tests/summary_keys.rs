@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bench::summary::{
-    BusSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording, RepliesSummary, Summary,
-    SumsSummary, TickBefore, Written,
+    BusSummary, CellSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording, RepliesSummary,
+    Summary, SumsSummary, TickBefore, Written,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -28,11 +28,11 @@ fn skin() -> Skin {
 }
 
 /// A run of which everything is known that may be unknown.
-fn summary(bus: BusSummary) -> Summary {
+fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
     let quantiles = Quantiles::of(&histogram(), 1.0);
     Summary {
         skin: "two-cells".to_owned(),
-        cells: 2,
+        cells,
         outcome: Outcome::Failed,
         failure: Some("lost at the end of the run: vcan0".to_owned()),
         duration_s: 1.0,
@@ -150,13 +150,22 @@ fn maps() -> BTreeSet<String> {
     rows().filter(|(_, _, kind)| *kind == "map").map(|(_, key, _)| key.to_owned()).collect()
 }
 
+/// The figures of each cell.
+fn of_each(skin: &Skin, table: &Table) -> Vec<CellSummary> {
+    let both = skin.cells.iter().zip(table.cells());
+    both.map(|(described, cell)| CellSummary::new(skin, described, Some(cell))).collect()
+}
+
 fn serialised(summary: &Summary) -> Value {
     serde_json::from_str(&serde_json::to_string(summary).unwrap()).unwrap()
 }
 
 #[test]
 fn every_key_is_documented_with_its_type_and_no_other() {
-    let bus = BusSummary::new("vcan0", "embedded", 0, &Table::new(&skin(), 0), 0, Micros(0));
+    let (skin, table) = (skin(), Table::new(&skin(), 0));
+    let mut cells = of_each(&skin, &table);
+    cells.iter_mut().for_each(|cell| cell.mode = Some("test"));
+    let bus = BusSummary::new("vcan0", "embedded", 0, &table, 0, Micros(0));
     let bus = BusSummary {
         sums: Some(SumsSummary::default()),
         network: Some(NetworkSummary {
@@ -167,7 +176,7 @@ fn every_key_is_documented_with_its_type_and_no_other() {
         ..bus
     };
     let mut found = BTreeMap::new();
-    keys("", &serialised(&summary(bus)), &maps(), &mut found);
+    keys("", &serialised(&summary(bus, cells)), &maps(), &mut found);
     assert_eq!(documented(|heading| !["Quantiles", "Errors"].contains(&heading)), found);
 }
 
@@ -197,7 +206,7 @@ fn the_names_in_maps_are_documented() {
 
 /// A bus whose two cells are pressed: one answers in time, the other one's replies are lost, refused, late
 /// and repeated.
-fn troubled_bus() -> (BusSummary, u64) {
+fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
     let skin = skin();
     let mut table = Table::new(&skin, 0);
     let mut broadcasts = 0;
@@ -251,12 +260,18 @@ fn troubled_bus() -> (BusSummary, u64) {
         say(&mut table, false, &word, false);
     }
     table.finish();
-    (BusSummary::new("vcan0", "embedded", 0, &table, 1, Micros(1_000)), broadcasts)
+    let bus = BusSummary::new("vcan0", "embedded", 0, &table, 1, Micros(1_000));
+    (bus, of_each(&skin, &table), broadcasts)
+}
+
+/// Joints that move a cell of the skin.
+fn joints_of(place: usize) -> u64 {
+    skin().cells[place].joint.into()
 }
 
 #[test]
 fn what_the_document_says_adds_up_does() {
-    let (bus, broadcasts) = troubled_bus();
+    let (bus, cells, broadcasts) = troubled_bus();
     let up = bus.uplink;
     assert_eq!(
         up.sent + up.surplus,
@@ -276,4 +291,35 @@ fn what_the_document_says_adds_up_does() {
     assert_eq!(bus.received["torque"], counted, "{bus:?}");
     let seen = (due, in_time, late, up.rejected, event("repeated torque"));
     assert_eq!(seen, (16, 11, 1, 1, 1), "the bus was troubled: {bus:?}");
+
+    let of = |figure: fn(&CellSummary) -> u64| cells.iter().map(figure).sum::<u64>();
+    assert_eq!((of(|cell| cell.due), of(|cell| cell.in_time), of(|cell| cell.late)), (due, in_time, late));
+    assert_eq!(of(|cell| cell.missing.values().sum()), missing, "{cells:?}");
+    for (why, count) in replies.missing() {
+        assert_eq!(
+            cells.iter().filter_map(|cell| cell.missing.get(why)).sum::<u64>(),
+            count,
+            "{why}: {cells:?}"
+        );
+        assert!(documented(|_| true).contains_key(&format!("buses[].replies.{why}")), "{why}");
+    }
+    let [first, second] = cells.as_slice() else { panic!("{cells:?}") };
+    assert_eq!((first.node, first.due, first.in_time, first.missing.len()), (1, 8, 8, 0));
+    assert_eq!((second.node, second.in_time, second.late), (2, 3, 1));
+    // The same torque is right for none of the two, whose joints are compared.
+    assert_eq!((first.error.count(), second.error.count()), (8 * joints_of(0), 4 * joints_of(1)));
+    assert!(cells.iter().all(|cell| cell.error.max() > 0.1 && cell.mode == Some("test")), "{cells:?}");
+}
+
+#[test]
+fn a_cell_that_measures_is_said_to_and_one_that_was_never_heard_is_in_no_mode() {
+    let skin = skin();
+    let mut table = Table::new(&skin, 0);
+    let page = NetworkPage::Heartbeat(Heartbeat { state: State::CONFIGURED, ..Heartbeat::default() });
+    let beat = Message::Network { from: Node::Cell(skin.cells[0].node), epoch: Epoch(0), page };
+    for frame in beat.encode().frames(Format::Fd) {
+        table.handle_frame(Micros(0), false, &frame, &mut |_| None);
+    }
+    let modes: Vec<_> = of_each(&skin, &table).iter().map(|cell| (cell.mode, cell.measures())).collect();
+    assert_eq!(modes, [(Some("measure"), true), (None, false)]);
 }

@@ -185,7 +185,7 @@ fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparat
     part.iter().for_each(|seen| survey.take(&record(seen)));
     survey.finish();
     let bus = &survey.buses[0];
-    let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, true);
+    let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, Some(0));
     comparator.record_begin();
     bus.latched.iter().for_each(|message| comparator.record(0, message, false));
     let selection =

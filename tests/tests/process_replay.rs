@@ -212,6 +212,20 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
     assert_eq!(lines[3], "joint 2: 3 steps less (0.0007 Nm)", "{text}");
 
+    // Within a tolerance it is equal, and counted.
+    for (steps, code, replies) in [("2", 1, [1, 0]), ("3", 0, [0, 1])] {
+        let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max --tolerance {steps}"));
+        let [equal, different, missing, extra] = replayed.replies();
+        let tolerated = replayed.number("/expect/tolerated");
+        assert_eq!((ended.code(), missing, extra), (Some(code), 0, 0), "{:#}", replayed.0);
+        assert_eq!([different, tolerated], replies, "{:#}", replayed.0);
+        let words = &replayed.0["expect"]["torque_words"];
+        assert_eq!((&words["by_steps"][3], &words["max"]), (&1.into(), &3.into()), "{:#}", replayed.0);
+        assert!(equal > 50 && ended.stdout.contains("torque words 3 off"), "{}", ended.stdout);
+        let said = "1 different, torque words by up to 3 steps (--tolerance 2)";
+        assert_eq!(ended.stderr.contains(said), code == 1, "{ended:#?}");
+    }
+
     // One that was not recorded, and one that cannot come.
     let counted = Counter::new(0);
     let gone = without(&log, |message| {

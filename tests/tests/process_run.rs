@@ -6,8 +6,13 @@ mod process;
 use std::fs;
 
 use process::log::{Log, same_torques};
+use process::replay::{by_hand, cell};
 use process::{PRESSED, Place, Summary, example, skin_of, until};
 use protocol::can::Format;
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, Request, State};
+use protocol::packet::WORDS;
+use protocol::parameters::Parameter;
 use rustix::process::Signal;
 
 /// Every frame on the buses is in the log: packets by their kinds, as both sides counted them, and what was
@@ -36,7 +41,7 @@ fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
 
     let summary = place.summary();
     summary.adds_up();
-    assert_eq!((summary.number("/cells"), summary.silent().len()), (253, 0));
+    assert_eq!((summary.cells().len(), summary.silent().len()), (253, 0));
     assert!(summary.0["halted"].is_null() && summary.0["interrupted"] == false, "{:#}", summary.0);
     // Every cell feels the touch from the first epoch on.
     summary.all_were_due(253, &ended.stderr);
@@ -202,6 +207,39 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
         assert_eq!(ended.refusal(1), said);
     }
     place.is_left_clean();
+}
+
+#[test]
+fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
+    let place = Place::new();
+    place.pressed();
+    let bench = by_hand(&place, "1-8");
+    let test_client = place.test_client();
+    let third = cell(3);
+    test_client.waits_for("cell 3", |message| {
+        matches!(*message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
+            if from == Node::Cell(third) && !beat.state.has(State::CLAIMING))
+    });
+    let request = Request::Write { number: Parameter::Mode.number(), words: [0; WORDS] };
+    test_client.sends(&Message::Configure { to: Node::Cell(third), tag: 9, request });
+    test_client.waits_for("its answer", |message| matches!(message, Message::Configured { tag: 9, .. }));
+
+    let ended = place.bench(1.5, "--no-spawn").end().well();
+    let said = "cells that measure, the scenario does not press them (`gateway frame configure --node N --write \
+                mode 1` puts one into test mode): 3 on vcan0\n";
+    assert!(ended.stderr.contains(said), "{ended:#?}");
+    assert!(ended.stdout.contains("cells that measure"), "{}", ended.stdout);
+    let summary = place.summary();
+    summary.adds_up().all_were_due(7, &ended.stderr);
+    for (at, cell) in summary.cells().iter().enumerate() {
+        let measures = at == 2;
+        assert_eq!(cell["node"], at + 1);
+        assert_eq!(cell["mode"], if measures { "measure" } else { "test" }, "{cell:#}");
+        let compared = cell["error"]["count"].as_u64().unwrap();
+        assert_eq!((cell["due"] == 0, compared == 0), (measures, measures), "{cell:#}");
+    }
+    drop((bench, test_client));
+    until("the server's end", || place.processes().is_empty().then_some(()));
 }
 
 #[test]

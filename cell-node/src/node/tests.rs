@@ -326,6 +326,25 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
 
 // STIM-1
 #[test]
+fn a_write_that_is_refused_changes_nothing() {
+    let mut node = settled(Flash::Damaged);
+    let to = Address::Cell(cell());
+    let mut mount = |request| match *tell(&mut node, &Message::Configure { to, tag: 7, request }).as_slice() {
+        [Message::Configured { answer, .. }] => answer,
+        ref other => panic!("{other:?}"),
+    };
+    let number = Parameter::Mount.number();
+    let staged = padded([1, 7]);
+    let value = |written| Answer::Value { number, written, words: staged };
+    assert_eq!(mount(Request::Write { number, words: staged }), value(true), "it is looked at with the rest");
+    for (words, reason) in [([300, 5], 3), ([2, -1], 2), ([300, 300], 2)] {
+        let refused = Answer::Refused { number, reason };
+        assert_eq!(mount(Request::Write { number, words: padded(words) }), refused, "{words:?}");
+        assert_eq!(mount(Request::Read { number }), value(false), "{words:?}");
+    }
+}
+
+#[test]
 fn a_cell_that_measures_refuses_stimuli() {
     let mut node = settled(Flash::Sound(wheel()));
     let to = Address::Everyone;

@@ -9,11 +9,13 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
+pub use self::cells::{CellSummary, RepliesSummary};
 pub use self::outcome::{Halted, Outcome, TickBefore};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Contributions, Event, Replies, Status, SumCounts, Table};
+use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};
 pub use trace::recording::account::{Recording, Written};
 
+mod cells;
 mod outcome;
 
 /// A whole run.
@@ -21,8 +23,8 @@ mod outcome;
 pub struct Summary {
     /// The skin's name.
     pub skin: String,
-    /// Cells in it.
-    pub cells: usize,
+    /// Each cell in it.
+    pub cells: Vec<CellSummary>,
     /// How it ended.
     pub outcome: Outcome,
     /// Why it failed, if it did.
@@ -65,7 +67,7 @@ impl Summary {
     pub fn empty(skin: &Skin) -> Self {
         Self {
             skin: skin.name.clone(),
-            cells: skin.cells.len(),
+            cells: skin.cells.iter().map(|cell| CellSummary::new(skin, cell, None)).collect(),
             first_broadcast_s: f64::NAN,
             ..Self::default()
         }
@@ -206,31 +208,6 @@ impl UplinkSummary {
         self.backlog += explained;
         explained
     }
-}
-
-/// Replies: due = in time + late + missing; missing = too late + skipped + not heard + lost + in doubt + unknown.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct RepliesSummary {
-    /// Epochs that cells had to answer.
-    pub due: u64,
-    /// Answered before the next broadcast.
-    pub in_time: u64,
-    /// Answered after it.
-    pub late: u64,
-    /// Dropped, because they came when their epoch was long over.
-    pub too_late: u64,
-    /// Skipped by the cell, because the joints were older than a period when it got to them.
-    pub skipped: u64,
-    /// Not heard by the cell.
-    pub not_heard: u64,
-    /// Sent by the cell and lost or damaged on the way.
-    pub lost: u64,
-    /// Of cells that were dead or started anew, or whose bus was lost.
-    pub in_doubt: u64,
-    /// Missing, and nobody knows why.
-    pub unknown: u64,
-    /// Torques that nobody waited for: ends of contacts, and cells whose sensors are unknown.
-    pub unasked: u64,
 }
 
 /// Sums along the cells' tree.
@@ -424,28 +401,8 @@ fn sums(table: &Table) -> Option<SumsSummary> {
     Some(SumsSummary { roots, counts, contributions })
 }
 
-/// Finds for each cell's missing replies what is known to have become of them.
 fn replies(table: &Table) -> RepliesSummary {
     let mut summary = RepliesSummary::default();
-    for cell in table.cells() {
-        let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
-        let mut rest = missing.saturating_sub(in_doubt);
-        let mut explain = |count: u64| {
-            let explained = rest.min(count);
-            rest -= explained;
-            explained
-        };
-        let (skipped, not_heard) = cell.unanswered().unwrap_or((0, 0));
-        summary.due += due;
-        summary.in_time += in_time;
-        summary.late += late;
-        summary.too_late += explain(too_late);
-        summary.skipped += explain(skipped);
-        summary.not_heard += explain(not_heard);
-        summary.lost += explain(cell.uplink().lost + cell.uplink().rejected);
-        summary.in_doubt += in_doubt;
-        summary.unknown += rest;
-        summary.unasked += unasked;
-    }
+    table.cells().iter().for_each(|cell| summary.add(cell));
     summary
 }

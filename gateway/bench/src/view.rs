@@ -34,6 +34,8 @@ pub struct CellView {
     pub halted: bool,
     /// Whether it is there for good and has no parameters to compute with.
     pub unconfigured: bool,
+    /// Whether it measures, so that stimuli do not touch it.
+    pub measures: bool,
     /// Whether its configuration is not the skin's.
     pub other: bool,
     /// The joints that it had taken last.
@@ -63,6 +65,7 @@ impl CellView {
             ready,
             halted: ready && !cell.is_ready(),
             unconfigured: settled.is_some() && !ready,
+            measures: ready && cell.measures() == Some(true),
             other: cell.heartbeat().is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
             last_joints: cell.last_joints,
             said: cell.said(),

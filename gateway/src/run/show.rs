@@ -1,19 +1,25 @@
 //! The table at the end of a run.
 
+use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, Halted, Outcome, Processor, Summary};
+use bench::summary::{BusSummary, CellSummary, Halted, Outcome, Processor, Summary};
 use model::table::Errors;
 
-use crate::print::{Rows, count, list, quantiles, words};
+use crate::print::{Rows, count, list, or, quantiles, words};
 
 /// Halts that are told one by one.
 const HALTS: usize = 10;
 
+/// Cells of a bus that are told one by one, because they stand out.
+const CELLS: usize = 5;
+/// A mean error in Nm that rounding does not explain: four steps of a torque's word.
+const OFF_NM: f64 = 4.0 / 4096.0;
+
 /// The whole run.
 pub(super) fn rows(summary: &Summary) -> Rows {
-    let cells = format!("{} cells, {:.1} s", summary.cells, summary.duration_s);
+    let cells = format!("{}, {:.1} s", count(summary.cells.len(), "cell"), summary.duration_s);
     let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
         Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
         None => (format!("{cells}, {}", summary.outcome), String::new()),
@@ -25,6 +31,7 @@ pub(super) fn rows(summary: &Summary) -> Rows {
     for bus in &summary.buses {
         replies(&mut rows, bus);
         frames(&mut rows, bus);
+        noteworthy(&mut rows, bus, &summary.cells);
     }
     costs(&mut rows, summary);
     rows
@@ -138,13 +145,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     rows.row("replies due", replies.due, complete);
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
-    let reasons = [
-        (replies.too_late, "too late"),
-        (replies.skipped, "skipped by cells"),
-        (replies.not_heard, "not heard"),
-        (replies.lost, "lost"),
-        (replies.in_doubt, "in doubt"),
-    ];
+    let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, why.replace('_', " ")));
     rows.row("  missing", missing, explained(&reasons, replies.unknown));
     rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
 }
@@ -155,9 +156,37 @@ fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String
 }
 
 /// The reasons that there were, and always how many nobody knows.
-fn explained(reasons: &[(u64, &str)], unknown: u64) -> String {
+fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
-    list(known.chain([&(unknown, "unknown")]).map(|(count, why)| format!("{count} {why}")))
+    let known = known.map(|(count, why)| format!("{count} {why}"));
+    list(known.chain([format!("{unknown} unknown")]))
+}
+
+/// The cells of a bus that measure, and the worst of those that stand out.
+fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
+    let all = || all.iter().filter(|cell| cell.bus == bus.name);
+    let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
+    if !measuring.is_empty() {
+        rows.row("cells that measure", words(measuring), "not pressed, their torques not compared");
+    }
+    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > OFF_NM);
+    let rank =
+        |cell: &CellSummary| (is_off(cell), cell.missing.values().sum::<u64>(), cell.late, cell.restarts);
+    let mut worst: Vec<_> = all().filter(|cell| rank(cell) > (false, 0, 0, 0)).collect();
+    worst.sort_by_key(|cell| Reverse(rank(cell)));
+    for cell in worst.iter().take(CELLS) {
+        let CellSummary { due, in_time, late, restarts, .. } = **cell;
+        let late = (late > 0).then(|| format!("{late} late"));
+        let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", why.replace('_', " ")));
+        let restarts = (restarts > 0).then(|| count(restarts, "restart"));
+        let error =
+            cell.error.mean().filter(|_| is_off(cell)).map(|mean| format!("mean error {mean:.1e} Nm"));
+        let why = late.into_iter().chain(missing).chain(restarts).chain(error);
+        let in_time = (due > 0).then(|| format!("{in_time} of {due} replies in time"));
+        rows.row(format!("cell {}", cell.node), or(in_time, ""), list(why));
+    }
+    let more = worst.len().saturating_sub(CELLS);
+    rows.any("further cells that stand out", more as u64, "--summary has each cell");
 }
 
 fn frames(rows: &mut Rows, bus: &BusSummary) {

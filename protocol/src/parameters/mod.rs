@@ -286,13 +286,14 @@ impl Parameters {
     /// Takes the words of one parameter as they are; [`Parameters::check`] looks at the whole.
     ///
     /// # Errors
-    /// When the parameter is not one that is stored, or a count does not fit its byte.
+    /// When the parameter is not one that is stored, or a count does not fit its byte; then nothing is changed.
     pub fn set(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), ParameterError> {
         let [w0, w1, w2, w3, w4, w5, ..] = words;
         match parameter {
             Parameter::Mount => {
-                self.joints = u8::try_from(w1).map_err(|_| ParameterError::Joints { got: w1 })?;
-                self.joint = u8::try_from(w0).map_err(|_| ParameterError::Joint { got: w0, joints: w1 })?;
+                let joints = u8::try_from(w1).map_err(|_| ParameterError::Joints { got: w1 })?;
+                let joint = u8::try_from(w0).map_err(|_| ParameterError::Joint { got: w0, joints: w1 })?;
+                (self.joint, self.joints) = (joint, joints);
             }
             Parameter::Pose => {
                 self.pose = Pose {

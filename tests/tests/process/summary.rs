@@ -52,6 +52,11 @@ impl Summary {
         cells.iter().map(|cell| cell.as_u64().unwrap()).collect()
     }
 
+    /// Each cell's figures.
+    pub(crate) fn cells(&self) -> &[Value] {
+        self.0["cells"].as_array().unwrap()
+    }
+
     /// Sees that everything that was due, sent and written is accounted for on every bus.
     pub(crate) fn adds_up(&self) -> &Self {
         let buses = self.0["buses"].as_array().unwrap().len();
@@ -61,6 +66,14 @@ impl Summary {
                 ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
             let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
             assert_eq!(replies, of("/replies/due"), "{:#}", self.0);
+            let cells = || self.cells().iter().filter(|cell| cell["bus"] == self.0["buses"][bus]["name"]);
+            for what in ["due", "in_time", "late"] {
+                let each = cells().map(|cell| cell[what].as_u64().unwrap());
+                assert_eq!(each.sum::<u64>(), of(&format!("/replies/{what}")), "{what}: {:#}", self.0);
+            }
+            let missing = cells().flat_map(|cell| cell["missing"].as_object().unwrap().values());
+            let missing: u64 = missing.map(|count| count.as_u64().unwrap()).sum();
+            assert_eq!(missing, replies - of("/replies/in_time") - of("/replies/late"), "{:#}", self.0);
             let arrived = of("/uplink/delivered") + of("/uplink/rejected") + of("/uplink/unheard");
             let reasons = ["dropped", "backlog", "outage", "unknown"];
             let lost: u64 = reasons.map(|reason| of(&format!("/uplink/{reason}"))).iter().sum();

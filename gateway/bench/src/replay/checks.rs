@@ -106,7 +106,7 @@ impl Checks {
 
     /// The cells have to be there, with the configuration that they had.
     pub(super) fn hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
-        if !self.options.expect {
+        if self.options.expect.is_none() {
             return Ok(());
         }
         let (mut absent, mut other) = (Vec::new(), Vec::new());

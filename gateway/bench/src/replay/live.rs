@@ -113,7 +113,9 @@ impl Stage for Live {
 
     fn wait_for_answers(&mut self, bus_link: usize, open: &Open) {
         self.wait_until_done(bus_link);
-        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect) else { return };
+        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
+            return;
+        };
         // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
         // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
         // comes later, because on such a machine it is the heartbeats of some that keep others waiting.

@@ -48,7 +48,7 @@ impl Session {
         let comparator = shared_state.comparator();
         let nobody =
             (0..self.buses.bus_links.len()).all(|bus_link| comparator.settled(bus_link).next().is_none());
-        if nobody && (options.expect || options.lockstep || skin_override.is_some()) {
+        if nobody && (options.expect.is_some() || options.lockstep || skin_override.is_some()) {
             let names: Vec<_> = checks.bus_links().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
         }
@@ -67,7 +67,7 @@ impl Session {
             return Ok(());
         }
         let error = ReplayError::Measuring(names(&all, ""));
-        if options.expect {
+        if options.expect.is_some() {
             return Err(error);
         }
         self.progress.note(&error.to_string());

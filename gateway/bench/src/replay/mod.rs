@@ -98,8 +98,8 @@ pub struct Options {
     pub spin: Duration,
     /// Whether joints wait until all cells have answered the ones before.
     pub lockstep: bool,
-    /// Whether replies are compared with recorded ones.
-    pub expect: bool,
+    /// Whether replies are compared with recorded ones, and by how many steps torques may differ.
+    pub expect: Option<u16>,
     /// Cells to start.
     pub spawn: Option<Spawn>,
     /// The embedded bus' program, when it is not beside this one.

@@ -78,6 +78,8 @@ pub struct Lockstep {
 /// How replies compare with recorded ones.
 #[derive(Clone, Debug, Serialize)]
 pub struct Expect {
+    /// By how many steps torques may differ.
+    pub tolerance: u16,
     /// The counts.
     #[serde(flatten)]
     pub tally: Tally,
@@ -138,7 +140,13 @@ impl Summary {
             ]);
             let counts: Vec<_> = counts.iter().map(|(what, count)| format!("{count} {what}")).collect();
             if !counts.is_empty() {
-                wrong.push(format!("replies are not as they were recorded: {}", counts.join(", ")));
+                let by = expect.tally.torque_words.max;
+                let by = if by > expect.tolerance.into() {
+                    format!(", torque words by up to {by} steps (--tolerance {})", expect.tolerance)
+                } else {
+                    String::new()
+                };
+                wrong.push(format!("replies are not as they were recorded: {}{by}", counts.join(", ")));
             }
             if expect.tally.lacks_the_tree() {
                 wrong.push(

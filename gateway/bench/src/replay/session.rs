@@ -211,12 +211,12 @@ impl Session {
             fifo: granted.fifo,
             memory_locked: granted.locked,
             lockstep: options.lockstep.then_some(lockstep),
-            expect: options.expect.then(|| self.expectation()),
+            expect: options.expect.map(|tolerance| self.expectation(tolerance)),
             failure: played.failure.map(|failure| failure.to_string()),
         }
     }
 
-    fn expectation(&self) -> Expect {
+    fn expectation(&self, tolerance: u16) -> Expect {
         let (comparator, checks) = (self.shared_state.comparator(), &self.shared_state.checks);
         let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present(bus_link));
         let late = present.filter_map(|(_, cell)| {
@@ -224,6 +224,7 @@ impl Session {
             Some(u64::from(last.joints_late.wrapping_sub(first.joints_late)))
         });
         Expect {
+            tolerance,
             tally: *comparator.tally(),
             joints_skipped: late.sum(),
             recording_dropped: checks.survey.dropped,

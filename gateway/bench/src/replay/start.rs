@@ -275,6 +275,6 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
 impl Options {
     /// Whether cells are listened to.
     pub(super) fn hears(&self) -> bool {
-        self.expect || self.lockstep || self.only == Only::Inputs
+        self.expect.is_some() || self.lockstep || self.only == Only::Inputs
     }
 }

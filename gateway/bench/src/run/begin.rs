@@ -145,9 +145,18 @@ impl Bench<'_> {
         if !cells.is_empty() {
             return Err(RunError::OtherSkin { skin: self.options.skin_file.clone(), cells });
         }
-        for (what, who) in [("do not answer", silent), ("have no parameters", unconfigured)] {
+        let measuring = self.names(|cell| cell.measures);
+        for (what, who) in [
+            ("do not answer, the run goes on without them", silent),
+            ("have no parameters, the run goes on without them", unconfigured),
+            (
+                "measure, the scenario does not press them (`gateway frame configure --node N --write mode 1` puts one \
+                 into test mode)",
+                measuring,
+            ),
+        ] {
             if !who.is_empty() && !self.options.quiet {
-                say(&format!("cells that {what}, the run goes on without them: {who}"));
+                say(&format!("cells that {what}: {who}"));
             }
         }
         Ok(())

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
 use protocol::message::Message;
+use protocol::skin::Cell;
 use protocol::time::Micros;
 
 use super::RunError;
@@ -17,7 +18,7 @@ use super::receiver::ReceiverResult;
 use super::watch::LOOK;
 use crate::record::feed::Unrecorded;
 use crate::record::{Recorder, backlog};
-use crate::summary::{BusSummary, Loop, NetworkSummary, OutagesSummary, Summary};
+use crate::summary::{BusSummary, CellSummary, Loop, NetworkSummary, OutagesSummary, Summary};
 use crate::view::View;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Said};
@@ -131,6 +132,7 @@ impl Bench<'_> {
             backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
         let all = received.iter().flatten().map(|received| received.table.accuracy());
         Summary {
+            cells: self.cell_summaries(received),
             halted: measured.halts.why().map(str::to_owned),
             halts: measured.halts.all(),
             further_halts: measured.halts.further,
@@ -161,6 +163,15 @@ impl Bench<'_> {
             unsent: count(&self.shared.unsent),
             ..summary
         }
+    }
+
+    fn cell_summaries(&self, received: &[Option<ReceiverResult>]) -> Vec<CellSummary> {
+        let skin = &self.options.skin;
+        let known = |described: &Cell| {
+            let ReceiverResult { table, .. } = received.get(described.bus)?.as_ref()?;
+            table.cells().iter().find(|cell| cell.node == described.node)
+        };
+        skin.cells.iter().map(|described| CellSummary::new(skin, described, known(described))).collect()
     }
 
     fn bus_summaries(

@@ -290,6 +290,7 @@ mod tests {
             ready: tree.is_some(),
             halted: false,
             unconfigured: false,
+            measures: false,
             other: false,
             last_joints: Epoch(0),
             said: Said::default(),

@@ -86,12 +86,14 @@ pub struct Accuracy {
 }
 
 impl Accuracy {
-    /// Compares one cell's torque; returns distributed less central, zero where saturated.
+    /// Compares one cell's torque, also in the cell's own account; returns distributed less central, zero where
+    /// saturated.
     pub(super) fn compare(
         &mut self,
         joint: usize,
         words: &[i32; WORDS],
         expected: &Expected,
+        of_cell: &mut Errors,
     ) -> [f64; WORDS] {
         let mut errors = [0.0; WORDS];
         let both = expected.quantised.iter().zip(&expected.unquantised);
@@ -104,6 +106,7 @@ impl Accuracy {
             }
             *error = word_to_nm(word) - quantised;
             self.single.add(*error);
+            of_cell.add(*error);
             of_joint.add(*error);
             self.unquantised.add(word_to_nm(word) - unquantised);
         }

@@ -7,6 +7,7 @@ use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
+use super::accuracy::Errors;
 use super::held::{Change, Held};
 use super::replies::{Owed, Replies};
 use super::root_totals::RootSums;
@@ -151,6 +152,18 @@ impl Cell {
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         self.tracked.pages()
+    }
+
+    /// How far its torques were from the central ones, in the joints that move it.
+    #[must_use]
+    pub const fn errors(&self) -> Errors {
+        self.owed.errors
+    }
+
+    /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
+    #[must_use]
+    pub fn measures(&self) -> Option<bool> {
+        self.heartbeat().map(|heartbeat| !heartbeat.state.has(State::TEST_MODE))
     }
 
     /// Packets sent and arrived.

@@ -144,7 +144,7 @@ impl Table {
             broadcast.in_time += u32::from(was_due);
         }
         if let Some(expected) = cell.owed.expected(number) {
-            let error = self.accuracy.compare(cell.joint, &words, expected);
+            let error = self.accuracy.compare(cell.joint, &words, &expected, &mut cell.owed.errors);
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;

@@ -3,6 +3,7 @@
 use derive_more::{Add, Sum};
 use protocol::packet::WORDS;
 
+use super::accuracy::Errors;
 use crate::tracker::LATEST;
 
 /// Replies of one cell: due = in time + late + missing.
@@ -53,6 +54,8 @@ pub(super) struct Owed {
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
     due: u8,
     expected: [Option<Expected>; LATEST + 1],
+    /// How far its answers were from that.
+    pub(super) errors: Errors,
 }
 
 impl Owed {
@@ -97,7 +100,7 @@ impl Owed {
     }
 
     /// What the answer to a broadcast should be.
-    pub(super) fn expected(&self, number: u64) -> Option<&Expected> {
-        self.expected.iter().flatten().find(|expected| expected.number == number)
+    pub(super) fn expected(&self, number: u64) -> Option<Expected> {
+        self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }
 }

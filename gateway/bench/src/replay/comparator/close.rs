@@ -6,33 +6,33 @@ use protocol::id::CellId;
 use protocol::packet::WORDS;
 
 use super::bus_comparator::{Both, KnownCell, LinkId, Round, explain_extra};
-use super::sums::{Outcome, Side, Why, compare};
+use super::sums::{Outcome, ROUNDING, Side, Why, compare};
 use super::{Comparator, First, Tally};
 use crate::replay::difference::{How, Said, What};
 
 impl Comparator {
     pub(super) fn close_round(&mut self, index: usize) {
-        let Self { bus_comparators, tally, first, .. } = self;
+        let Self { bus_comparators, tolerance, tally, first, .. } = self;
         let Some(bus_comparator) = bus_comparators.get_mut(index) else { return };
         let Some(round) = bus_comparator.rounds.pop_front() else { return };
         let number = bus_comparator.base;
         bus_comparator.base += 1;
-        if !self.expects || round.announced == 0 {
-            return;
-        }
+        let Some(tolerance) = tolerance.filter(|_| round.announced > 0) else { return };
         if round.is_first {
             bus_comparator.known.values_mut().for_each(|known_cell| known_cell.speaks = None);
         }
         let at = Some((number, round.epoch, round.nanos));
         for (&(cell, what), &pair) in &round.replies {
-            if let Some(how) = bus_comparator.compare_reply(number, &round, (cell, what), pair, tally) {
+            if let Some(how) =
+                bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
+            {
                 tally.count(how, round.is_unsent);
                 let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
                 first.note(how, &bus_comparator.name, cell, at, said);
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
-            bus_comparator.close_sums(number, &round, tally, first);
+            bus_comparator.close_sums(number, &round, (tally, tolerance), first);
         }
         bus_comparator.trees.recorded.forget_before(number);
         bus_comparator.trees.now.forget_before(number);
@@ -47,7 +47,7 @@ impl LinkId {
         round: &Round,
         (cell, what): (CellId, What),
         Both { recorded, now }: Both<Option<[i16; WORDS]>>,
-        tally: &mut Tally,
+        (tally, tolerance): (&mut Tally, u16),
     ) -> Option<How> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
         let is_torque = what == What::Torque;
@@ -62,8 +62,12 @@ impl LinkId {
                 if let Some(known_cell) = known_cell.filter(|_| is_torque) {
                     known_cell.ended_earlier = false;
                 }
-                tally.equal += u64::from(recorded == now);
-                (recorded != now).then_some(How::Different)
+                let is_equal = match what {
+                    What::Torque => tally.compare_torque(&recorded, &now, tolerance),
+                    What::Skin | What::Acceleration => recorded == now,
+                };
+                tally.equal += u64::from(is_equal);
+                (!is_equal).then_some(How::Different)
             }
             (Some(_), None) if !is_torque && self.senses => {
                 tally.lacking.sensed_otherwise += 1;
@@ -94,7 +98,13 @@ impl LinkId {
     }
 
     /// Compares what each cell itself put into its sums of a round.
-    fn close_sums(&mut self, number: u64, round: &Round, tally: &mut Tally, first: &mut First) {
+    fn close_sums(
+        &mut self,
+        number: u64,
+        round: &Round,
+        (tally, tolerance): (&mut Tally, u16),
+        first: &mut First,
+    ) {
         let then = Side::new(&round.sums.recorded, &self.trees.recorded, number);
         let now = Side::new(&round.sums.now, &self.trees.now, number);
         let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
@@ -106,7 +116,7 @@ impl LinkId {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
-            let mut outcome = compare(&then, &now, cell);
+            let mut outcome = compare(&then, &now, cell, tolerance);
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
                 then.is_doubtful(cell, is_touched, false)
@@ -114,6 +124,11 @@ impl LinkId {
             };
             if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
                 outcome = Outcome::Omitted(Why::NotTaken);
+            }
+            let owns = [then.own(cell), now.own(cell)];
+            if let ([Some(then), Some(now)], Outcome::Equal | Outcome::Different) = (&owns, outcome) {
+                let max = tally.sum_words.count(then.differences(now));
+                tally.tolerated += u64::from(outcome == Outcome::Equal && max > ROUNDING);
             }
             let how = match outcome {
                 Outcome::Nothing => continue,
@@ -145,7 +160,7 @@ impl LinkId {
                 Outcome::Extra => How::Extra,
             };
             tally.count(how, round.is_unsent);
-            let said = [then.own(cell), now.own(cell)].map(|own| own.map(Said::Sum));
+            let said = owns.map(|own| own.map(Said::Sum));
             first.note(how, &self.name, cell, Some((number, round.epoch, round.nanos)), said);
         }
         for (cell, count) in round.sums.recorded.counts() {

@@ -26,7 +26,7 @@ pub use bus_comparator::Present;
 use bus_comparator::{Announced, Both, LinkId, take_first_joints};
 pub use sums::Own;
 use sums::{Side, Sum};
-pub use tally::{Lacking, Tally};
+pub use tally::{Lacking, Steps, Tally};
 
 use super::difference::{Difference, How, Said, What, When};
 use super::survey::Cell as Surveyed;
@@ -67,7 +67,8 @@ impl First {
 #[derive(Debug)]
 pub struct Comparator {
     bus_comparators: Vec<LinkId>,
-    expects: bool,
+    /// By how many steps a torque's words may differ from the recorded ones; none when replies are not compared.
+    tolerance: Option<u16>,
     /// While a state is restored, replies are not those of the capture.
     is_muted: bool,
     tally: Tally,
@@ -76,18 +77,18 @@ pub struct Comparator {
 }
 
 impl Comparator {
-    /// For some buses, by what they are called now and their cells in the capture. Replies are compared if `expects`
-    /// says so, once it is no longer muted.
+    /// For some buses, by what they are called now and their cells in the capture. Replies are compared if there is
+    /// a tolerance, in steps of torques, once it is no longer muted.
     #[must_use]
     pub fn new(
         buses: impl IntoIterator<Item = (String, BTreeMap<CellId, Surveyed>)>,
         first_nanos: u64,
-        expects: bool,
+        tolerance: Option<u16>,
     ) -> Self {
         let bus_comparators = buses.into_iter().map(|(name, cells)| LinkId::new(name, cells)).collect();
         Self {
             bus_comparators,
-            expects,
+            tolerance,
             is_muted: true,
             tally: Tally::default(),
             first: First { nanos: first_nanos, difference: None },
@@ -109,7 +110,7 @@ impl Comparator {
 
     /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
     pub fn record(&mut self, bus_comparator: usize, message: &Message, is_in_part: bool) {
-        let expects = self.expects;
+        let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
             (self.bus_comparators.get_mut(bus_comparator).filter(|_| expects), &mut self.tally)
         else {
@@ -227,7 +228,7 @@ impl Comparator {
         } else if let Message::Joints { .. } | Message::Network { .. } = message {
             self.other_gateway.get_or_insert(index);
         }
-        if !self.expects || self.is_muted {
+        if self.tolerance.is_none() || self.is_muted {
             return;
         }
         if let Message::Configured { from, tag, answer } = *message

@@ -122,6 +122,11 @@ impl Sums {
     }
 }
 
+/// Two cells that feel the same may differ by so many steps in a sum's word: rounding carries what it took away.
+pub(super) const ROUNDING: u32 = 1;
+/// Steps of a torque's word (Q3.12) in one of a sum's (Q7.8).
+const FINER: u16 = 16;
+
 /// What one cell put into its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Own {
@@ -141,6 +146,12 @@ impl Own {
     /// Whether no word is left.
     fn is_nothing(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
+    }
+
+    /// By how many steps its words differ from another one's, where neither is saturated.
+    pub(super) fn differences(&self, other: &Self) -> impl Iterator<Item = u32> {
+        let both = self.steps.iter().zip(&other.steps);
+        both.filter_map(|(own, it)| Some(own.as_ref()?.abs_diff(*it.as_ref()?)))
     }
 }
 
@@ -243,14 +254,14 @@ impl<'a> Side<'a> {
     /// Whether what a cell said has more in it than on the other side, and that is the sum of a cell which is or was its
     /// child, but by its page is not in this epoch: pages come after the change that they tell of. It may be in no other
     /// sum then.
-    fn holds_a_mover(&self, cell: CellId, other: &Self) -> bool {
+    fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
         let adds = |sum: &Sum| {
             let words = own.steps.iter().zip(&its.steps).zip(sum.torque);
             let mut words =
                 words.filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - exact(word)?));
-            own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.abs() <= 1)
+            own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.unsigned_abs() <= allowed)
         };
         let is_elsewhere = |mover: &CellId| {
             let parent = self.children.iter().find(|(_, children)| children.contains(mover));
@@ -281,8 +292,9 @@ fn exact(word: Q7_8) -> Option<i32> {
     (!Q::is_saturated(word)).then(|| i32::from(word.to_bits()))
 }
 
-/// Compares what a cell put into its sums.
-pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outcome {
+/// Compares what a cell put into its sums, where a torque may be so many of its steps off: that may take the rounded
+/// one over one more bound. Children's differences are not in it, so however many cells are in the sum, this is enough.
+pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId, tolerance: u16) -> Outcome {
     if recorded.affected.contains(&cell) || now.affected.contains(&cell) {
         return Outcome::Omitted(Why::Changing);
     }
@@ -299,15 +311,19 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId) -> Outc
             let alike = |then: Q7_8, today: Q7_8| {
                 then.is_saturated() == today.is_saturated() || recorded.below(cell) != now.below(cell)
             };
+            // Who only passes on what others feel has no torque that could be off.
+            let tolerance = if then.cells > 0 { tolerance.div_ceil(FINER) } else { 0 };
+            let allowed = ROUNDING + u32::from(tolerance);
             let mut words = then.steps.iter().zip(&today.steps).zip(then.sum.iter().zip(&today.sum));
             let same = then.cells == today.cells
                 && words.all(|((own, it), (sum, other))| match (own, it) {
-                    (Some(own), Some(it)) => own.abs_diff(*it) <= 1,
+                    (Some(own), Some(it)) => own.abs_diff(*it) <= allowed,
                     (None, _) | (_, None) => alike(*sum, *other),
                 });
             if same {
                 Outcome::Equal
-            } else if now.holds_a_mover(cell, recorded) || recorded.holds_a_mover(cell, now) {
+            } else if now.holds_a_mover(cell, recorded, allowed) || recorded.holds_a_mover(cell, now, allowed)
+            {
                 Outcome::Omitted(Why::NotTaken)
             } else {
                 Outcome::Different

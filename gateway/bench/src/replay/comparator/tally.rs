@@ -1,5 +1,6 @@
 //! How replies and recorded ones compare, in counts.
 
+use protocol::packet::WORDS;
 use serde::Serialize;
 
 use crate::replay::difference::How;
@@ -19,8 +20,40 @@ pub struct Tally {
     pub not_requested: u64,
     /// Among the equal ones, sums less their children.
     pub sums: u64,
+    /// Among the equal ones, torques and sums that are so only because differences are tolerated.
+    pub tolerated: u64,
+    /// Words of torques, in steps of Q3.12.
+    pub torque_words: Steps,
+    /// Words of sums less their children, in steps of Q7.8.
+    pub sum_words: Steps,
     /// What the recording itself lacks.
     pub lacking: Lacking,
+}
+
+/// By how many steps words differ from the recorded ones.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct Steps {
+    /// How many differ by 0, by 1, ...; the last by so many or more.
+    pub by_steps: [u64; 9],
+    /// The largest difference.
+    pub max: u32,
+}
+
+impl Steps {
+    /// Counts the words of one reply; the largest difference among them.
+    pub(super) fn count(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
+        let mut max = 0;
+        for steps in differences {
+            max = max.max(steps);
+            let last = self.by_steps.len() - 1;
+            if let Some(count) = self.by_steps.get_mut(usize::try_from(steps).map_or(last, |it| it.min(last)))
+            {
+                *count += 1;
+            }
+        }
+        self.max = self.max.max(max);
+        max
+    }
 }
 
 /// Replies that were not recorded, or not with their joints, by what the recording says of why.
@@ -69,6 +102,20 @@ impl Tally {
             How::Extra => &mut self.extra,
         };
         *count += 1;
+    }
+
+    /// Compares a torque's words, each within so many steps; whether it is equal.
+    pub(super) fn compare_torque(
+        &mut self,
+        recorded: &[i16; WORDS],
+        now: &[i16; WORDS],
+        tolerance: u16,
+    ) -> bool {
+        let steps = recorded.iter().zip(now).map(|(recorded, now)| recorded.abs_diff(*now).into());
+        let max = self.torque_words.count(steps);
+        let is_equal = max <= u32::from(tolerance);
+        self.tolerated += u64::from(is_equal && max > 0);
+        is_equal
     }
 
     /// Whether there are sums, and not one of them could be compared, because nothing tells whose children they hold.

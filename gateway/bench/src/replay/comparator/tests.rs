@@ -46,8 +46,13 @@ fn joints(epoch: u8) -> Message {
 
 /// A recording, 1 ms from one message to the next, and what is heard now to the same joints.
 fn rated(recording: &[Message], now: &[Message]) -> Comparator {
+    rated_within(0, recording, now)
+}
+
+/// The same where torques may be so many steps off.
+fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Comparator {
     let mut survey = Survey::new(Part::default());
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(tolerance));
     let times = (1_u64..).map(|at| at * MS);
     for (nanos, message) in times.clone().zip(recording) {
         let time = Timestamp { nanos, nine_digits: false };
@@ -271,7 +276,7 @@ fn what_a_cell_contact_before_it_had_taken_any_joints_is_of_none() {
 
 #[test]
 fn joints_that_a_bus_did_not_take_have_no_answer() {
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
     comparator.record_joints(0, 1, Epoch(1), true);
     comparator.record(0, &torque(1, 1, 5), true);
@@ -308,7 +313,7 @@ fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
     }
     let comparator = rated(&all, &all);
     assert_eq!(counts(&comparator), [1_000, 0, 0, 0]);
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     for number in 0..1_000_u64 {
         let epoch = Epoch(number.to_le_bytes()[0]);
         comparator.record_joints(0, number, epoch, true);
@@ -436,7 +441,7 @@ fn without_a_tree_nothing_is_compared_and_that_is_no_success() {
 
 #[test]
 fn joints_that_are_retried_have_the_sums_of_the_last_time() {
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
     for message in &row()[3..6] {
         comparator.record(0, message, true);
@@ -459,7 +464,7 @@ fn joints_that_are_retried_have_the_sums_of_the_last_time() {
 
 #[test]
 fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, true);
+    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     let beat = |number, epoch| heartbeat(number, epoch, 0, Flags::TEST_MODE);
     comparator.hear(0, &beat(1, 0));
     comparator.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
@@ -488,7 +493,7 @@ fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
 #[test]
 fn somebody_else_who_sends_joints_is_a_other_gateway() {
     let mut comparator =
-        Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, false);
+        Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
     comparator.hear(1, &Message::Resume);
     assert_eq!(comparator.other_gateway(), None, "anybody may resume");
     comparator.hear(1, &joints(0));
@@ -496,3 +501,4 @@ fn somebody_else_who_sends_joints_is_a_other_gateway() {
 }
 
 mod claims;
+mod tolerance;

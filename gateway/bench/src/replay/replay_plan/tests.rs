@@ -74,7 +74,7 @@ fn share_of(
     let mut chosen = Selection { only: Only::All, pick: Pick::default(), bus_links, reads: true };
     selection(&mut chosen);
     let names = ["a", "b"].map(|name| (name.to_owned(), BTreeMap::new()));
-    let mut comparator = Comparator::new(names, 0, true);
+    let mut comparator = Comparator::new(names, 0, Some(0));
     let mut replay_plan = ReplayPlan::new(&survey, &chosen);
     let mut steps = Vec::new();
     for _ in 0..passes {

@@ -34,7 +34,7 @@ fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
 
 fn outcomes(then: &(Sums, Trees), today: &(Sums, Trees), cells: usize) -> Vec<Outcome> {
     let (then, today) = (Side::new(&then.0, &then.1, 5), Side::new(&today.0, &today.1, 5));
-    (1..=u8::try_from(cells).unwrap()).map(|number| compare(&then, &today, cell(number))).collect()
+    (1..=u8::try_from(cells).unwrap()).map(|number| compare(&then, &today, cell(number), 0)).collect()
 }
 
 fn words(first: i16) -> Option<[i16; WORDS]> {
