@@ -90,7 +90,7 @@ fn what_may_be_omitted_has_the_default_that_the_text_says() {
     assert_eq!(Skin::parse("skin.toml", &format!("{said}{text}")), Ok(short.clone()));
     let touch = block(SKIN_MD, "# a short scenario.toml");
     let said =
-        format!("version = 1\nduration_s = 10.0\n{touch}at_s = 0.0\nbus = \"vcan0\"\nprofile = \"step\"\n");
+        format!("version = 1\nduration_s = 10.0\n{touch}\nat_s = 0.0\nbus = \"vcan0\"\nprofile = \"step\"\n");
     let pressed = Scenario::parse("scenario.toml", touch, &short).unwrap();
     assert_eq!(Scenario::parse("scenario.toml", &said, &short), Ok(pressed));
     let defaults =

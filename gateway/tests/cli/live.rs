@@ -88,9 +88,8 @@ impl Bench {
                     answers.iter().for_each(|it| send(cell.bus(), it, format).unwrap());
                 }
             });
-            let done = work();
-            over.store(true, Ordering::Relaxed);
-            done
+            let _over = Over(&over);
+            work()
         })
     }
 
@@ -101,10 +100,19 @@ impl Bench {
     }
 }
 
+/// Ends the cell beside a test, also when the test fails.
+struct Over<'a>(&'a AtomicBool);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
 #[test]
 fn what_is_sent_on_an_embedded_bus_is_shown() {
     let bench = Bench::new();
-    let dump = bench.dump("--max 4 --kind stimulus,half,sync,resume");
+    let dump = bench.dump("--max 4 --kind stimulus,command");
     bench.beside(Format::Fd, || bench.send("frame stimulus --node 12 --force 3.0 --bus vcan0"));
     bench.send("frame sync --bus vcan0 --format classic");
     bench.send("ack vcan0");
@@ -138,7 +146,7 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
         bench.beside(format, || {
             let read = says(&format!("frame configure --node 12 --read mount --tag 7 {with}"));
             assert_eq!((read.0, read.2.as_str()), (Some(0), ""));
-            assert!(read.1.starts_with("configured 12 tag 7: mount") && read.1.lines().count() == 1, "{read:?}");
+            assert!(read.1.starts_with("configured 12 tag 7: has mount: joint 2 of 6") && read.1.lines().count() == 1, "{read:?}");
             let all = says(&format!("frame configure --node everyone --read mount {with}"));
             assert_eq!((all.0, all.1.lines().count()), (Some(0), 1), "{all:?}");
             let refused = says(&format!("frame configure --node 12 --write mode 1 {with}"));

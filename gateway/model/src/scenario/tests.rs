@@ -362,9 +362,7 @@ fn a_wire_is_link_down_between_two_cells_that_it_leads_between_and_repaired_in_t
     let sums = described("reply = \"sum\"\nslot_us = 1500", line);
     let fault = |skin: &Skin, text: &str| {
         let text = format!("version = 1\nduration_s = 9.0\n[[fault]]\nat_s = 0.5\n{text}\n");
-        Scenario::parse("s.toml", &text, skin)
-            .map(|scenario| scenario.faults)
-            .map_err(|error| error.to_string())
+        Scenario::parse("s.toml", &text, skin).map(|scenario| scenario.faults).map_err(by_line)
     };
     let wire = |at, link_down, from, to, both_ways| Fault {
         at: Micros(at),
