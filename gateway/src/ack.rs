@@ -11,6 +11,7 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, FORMATS, one_of};
+use super::input::neither;
 use super::output;
 
 /// Leave the halted state: send resume to a bus, or to all buses of a skin
@@ -32,13 +33,13 @@ pub(crate) struct Ack {
 
 impl Ack {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let name = self.whom.display();
+        let name = self.whom.display().to_string();
         let is_skin = self.whom.is_file();
         let target: Vec<_> = if is_skin {
             let skin = Skin::read(&self.whom).map_err(Failure::usage)?;
             skin.buses.into_iter().map(|bus| (bus.name, bus.format)).collect()
         } else {
-            vec![(name.to_string(), self.format)]
+            vec![(name.clone(), self.format)]
         };
         let kinds = self.kinds.of(target.iter().map(|(bus, _)| bus.as_str()))?;
         // All are opened before anybody is told.
@@ -46,7 +47,7 @@ impl Ack {
         for (bus, format) in &target {
             buses.push(open(bus, kinds.of(bus), *format).map_err(|error| match is_skin {
                 true => Failure::usage(error),
-                false => Failure::usage(format!("there is no file {name}, and as a bus: {error}")),
+                false => neither(&name, &error),
             })?);
         }
         buses.iter().zip(&target).try_for_each(|(bus, (_, format))| send(bus, &Message::Resume, *format))

@@ -30,21 +30,26 @@ pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     })
 }
 
+/// A time in seconds: a number with a unit, or of seconds.
+pub(crate) fn time(text: &str) -> Option<f64> {
+    let units = [("ms", 1e-3), ("min", 60.0), ("h", 3_600.0), ("s", 1.0)];
+    let given = units.iter().find_map(|(unit, each)| Some((text.strip_suffix(unit)?, *each)));
+    let (number, each) = given.unwrap_or((text, 1.0));
+    number.parse::<f64>().ok().map(|number| number * each)
+}
+
 /// Seconds above 0, up to 1e7.
 pub(crate) fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if seconds > 0.0 && seconds <= 1e7 => Ok(seconds),
-        _ => Err("a number of seconds above 0, up to 1e7".to_owned()),
-    }
+    let seconds = time(text).filter(|seconds| *seconds > 0.0 && *seconds <= 1e7);
+    seconds.ok_or_else(|| "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
 /// Seconds from 0 to 1e9, in ns.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
 pub(crate) fn nanos(text: &str) -> Result<u64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.0..=1e9).contains(&seconds) => Ok((seconds * 1e9).round() as u64),
-        _ => Err("a number of seconds from 0 to 1e9".to_owned()),
-    }
+    let seconds = time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
+    let nanos = seconds.map(|seconds| (seconds * 1e9).round() as u64);
+    nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
 /// Of which kind a bus is.

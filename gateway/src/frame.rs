@@ -1,26 +1,36 @@
 //! `gateway frame`: packets by hand.
 
 use std::fmt::Write;
+use std::time::{Duration, Instant};
 
+use bench::listen::Listener;
+use bench::sensing;
 use clap::{Args, Subcommand};
-use model::decode::{parameter, pick};
+use model::decode::{Decoded, parameter, pick};
 use model::scenario::contact_words;
-use protocol::bus::Choice;
+use protocol::bus::{BusError, Choice};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::{Kind, Node};
-use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{
+    Answer, From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+};
 use protocol::packet::{Epoch, WORDS};
 use protocol::schema::packets;
 use protocol::usage::{Failure, print};
 
 use super::ack;
 use super::arguments::{FORMATS, one_of};
+use super::print::list;
+
+/// Cells that are there send a heartbeat within this time, and answers.
+const ANSWER: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
 /// Prints one line for a CAN FD bus, two for a classic one. With --bus it is sent instead, also on an
-/// embedded bus, to which cansend cannot attach.
+/// embedded bus, to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit
+/// code 1 says that no cell for which a stimulus or a configure is meant was heard, or that one refused.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples, which press cell 12 with 3 N from the next joints on:
   cansend vcan0 $(gateway frame configure --node 12 --write mode 1)
@@ -172,10 +182,102 @@ impl Frame {
         let message = self.what.message().map_err(Failure::usage)?;
         match self.bus {
             Some(name) => {
-                let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
-                ack::send(&bus, &message, self.format)
+                let (to, requested) = match message {
+                    Message::Stimulus { to, .. } => (to, None),
+                    Message::Configure { to, tag, .. } => (to, Some(tag)),
+                    _ => {
+                        let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
+                        return ack::send(&bus, &message, self.format);
+                    }
+                };
+                // Who hears nothing cannot know that nobody is there.
+                let bus = sensing::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
+                ack::send(&bus, &message, self.format)?;
+                let mut answers =
+                    Answers { to, requested, heard: false, lines: String::new(), refused: Vec::new() };
+                answers.hear(Listener::new(bus, Some(self.format))).map_err(Failure::run)?;
+                print(&answers.lines)?;
+                answers.verdict(&name, self.format)
             }
             None => print(&text(&message, self.format)),
+        }
+    }
+}
+
+/// What comes back of a packet for cells.
+struct Answers {
+    to: Node,
+    /// The tag of a request, which comes back in its answers; a packet without one is answered by nobody.
+    requested: Option<u8>,
+    /// Whether any cell that it is for is there.
+    heard: bool,
+    lines: String,
+    refused: Vec<String>,
+}
+
+impl Answers {
+    /// Hears until nothing more is to come; how many cells everyone is shows in the time alone.
+    fn hear(&mut self, mut listener: Listener) -> Result<(), BusError> {
+        let began = Instant::now();
+        while began.elapsed() < ANSWER && !self.are_complete() {
+            listener.hear(Duration::from_millis(20))?;
+            for (_, decoded) in listener.decoded() {
+                self.take(decoded);
+            }
+        }
+        Ok(())
+    }
+
+    fn are_complete(&self) -> bool {
+        let answered = !self.lines.is_empty() || !self.refused.is_empty();
+        match (self.to, self.requested) {
+            (_, None) => self.heard,
+            (Node::Cell(_), Some(_)) => answered,
+            (Node::Gateway | Node::Everyone, Some(_)) => false,
+        }
+    }
+
+    fn take(&mut self, decoded: Decoded) {
+        let Decoded::Message(message) = decoded else { return };
+        let Some(from) = message.sender() else { return };
+        if matches!(self.to, Node::Cell(to) if to != from) {
+            return;
+        }
+        let line = decoded.to_string();
+        let line = line.trim_start_matches(decoded.verdict()).trim_start();
+        match message {
+            // It has not got that node id yet.
+            Message::Network { page: NetworkPage::Heartbeat(it), .. } if it.state.has(State::CLAIMING) => {
+                return;
+            }
+            Message::Configured { tag, answer: Answer::Value { .. }, .. } if self.requested == Some(tag) => {
+                self.lines += line;
+                self.lines.push('\n');
+            }
+            Message::Configured { tag, .. } if self.requested == Some(tag) => {
+                self.refused.push(line.to_owned())
+            }
+            _ => {}
+        }
+        self.heard = true;
+    }
+
+    fn verdict(&self, bus: &str, format: Format) -> Result<(), Failure> {
+        let who = match self.to {
+            Node::Cell(cell) => format!("cell {cell}"),
+            Node::Gateway | Node::Everyone => "cell".to_owned(),
+        };
+        let (waited, other) = (ANSWER.as_secs_f64(), format.other().name());
+        match (self.heard, self.requested) {
+            _ if !self.refused.is_empty() => Err(Failure::run(list(&self.refused))),
+            (false, _) => Err(Failure::run(format!(
+                "no {who} was heard on {bus} for {waited} s: `gateway cells {bus}` lists who is there; the bus' format \
+                 may be --format {other}"
+            ))),
+            (true, Some(_)) if self.lines.is_empty() => {
+                Err(Failure::run(format!("{who} is on {bus} and did not answer for {waited} s: ask again")))
+            }
+            (true, _) => Ok(()),
         }
     }
 }

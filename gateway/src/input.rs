@@ -33,6 +33,21 @@ pub(crate) fn is_file(source: &Path) -> bool {
     source.as_os_str() == "-" || source.exists()
 }
 
+/// What is neither a file nor a bus that opens.
+pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
+    let is_path = name.contains('/') || Path::new(name).extension().is_some();
+    let is_absent = matches!(
+        error,
+        BusError::Name(_) | BusError::NotServed { .. } | BusError::NoInterface(_) | BusError::NoSocketCan(_)
+    );
+    if is_path && is_absent {
+        return Failure::usage(format!(
+            "there is no file {name}, and no bus of that name: say where the file is"
+        ));
+    }
+    Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
+}
+
 /// What a capture is written in.
 pub(crate) fn format(reader: &Reader) -> &'static str {
     match reader.format() {
@@ -107,7 +122,7 @@ impl ReceiveEnd {
         options: Options,
     ) -> Result<Self, Failure> {
         let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })
-            .map_err(|error| Failure::usage(format!("there is no file {name}, and as a bus: {error}")))?;
+            .map_err(|error| neither(name, &error))?;
         output::note(format_args!("{} is {}", bus.name(), bus.kind()));
         Ok(Self { listener: Listener::new(bus, format), is_down: false })
     }

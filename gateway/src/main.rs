@@ -25,14 +25,15 @@ mod recover;
 mod replay;
 mod report;
 mod run;
+mod scenario;
 mod sensing;
 mod shadow;
 mod skin;
 
 use std::process::ExitCode;
 
-use clap::error::ErrorKind;
-use clap::{Parser, Subcommand};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{CommandFactory, Parser, Subcommand};
 use protocol::usage::{Failure, end, one_line};
 
 /// Bridges a robot skin's bus to a control loop.
@@ -61,6 +62,7 @@ enum Command {
     Ack(ack::Ack),
     Sensing(sensing::Sensing),
     Skin(skin::Skin),
+    Scenario(scenario::Scenario),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
     Shadow(shadow::ShadowCommand),
@@ -84,6 +86,7 @@ impl Command {
             Self::Ack(command) => command.run(),
             Self::Sensing(command) => command.run(),
             Self::Skin(command) => command.run(),
+            Self::Scenario(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),
             Self::Shadow(command) => command.run(),
@@ -99,7 +102,28 @@ fn main() -> ExitCode {
         // Help and version, which are asked for, are printed as they are.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
+        Err(wrong) => Err(Failure::usage(refusal(&wrong))),
     };
     end("gateway", done)
+}
+
+/// What clap says, in one line; where its guess would mislead, what there is instead.
+fn refusal(wrong: &clap::Error) -> String {
+    let said = one_line(&wrong.render().to_string());
+    let text = |kind| match wrong.get(kind) {
+        Some(ContextValue::String(text)) => Some(text.as_str()),
+        _ => None,
+    };
+    let first = std::env::args_os().nth(1).unwrap_or_default();
+    if let Some(name) = text(ContextKind::InvalidSubcommand).filter(|name| first == *name) {
+        let arguments = Arguments::command();
+        let names = print::list(arguments.get_subcommands().map(clap::Command::get_name));
+        return format!("there is no command {name}; there are {names}");
+    }
+    match text(ContextKind::InvalidArg) {
+        Some(file) if first == "run" && file.ends_with(".toml") => {
+            format!("{file} comes after the skin: a scenario is given by --scenario {file}")
+        }
+        _ => said,
+    }
 }

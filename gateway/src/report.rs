@@ -47,7 +47,10 @@ impl Report {
         let first = self.files.iter().min_by_key(|file| (file.as_os_str().len(), file.as_os_str()));
         let page = first.map(|first| first.with_extension("html")).unwrap_or_default();
         let output = self.output.clone().unwrap_or(page);
-        self.is_free(&output, "-o")?;
+        if let Err(taken) = self.is_free(&output, "-o") {
+            // What is read is looked at before what would be overwritten.
+            return Err(run::check(&self.files).err().map_or(taken, refused));
+        }
         let command: Vec<_> = std::env::args().collect();
         let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
         let report = run::report(&self.files, &options).map_err(refused)?;

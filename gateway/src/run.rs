@@ -12,7 +12,7 @@ use bench::run::launch::in_memory;
 use bench::run::{self, Options};
 use bench::summary::{Outcome, Summary};
 use clap::Args;
-use model::scenario::Scenario;
+use model::scenario::{IDLE, Scenario};
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
 use protocol::skin::Skin;
@@ -20,7 +20,7 @@ use protocol::time::Span;
 use protocol::usage::{Failure, print, quoted};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Programs, bus_names, seconds};
+use super::arguments::{BusKinds, Programs, bus_names, seconds, time};
 use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
@@ -32,14 +32,11 @@ const SCENARIO: &str = include_str!("../examples/demo.toml");
 /// Where the demonstration's frames are recorded.
 const DEMO_LOG: &str = "skinbus-demo.log";
 
-/// How long a run without a scenario takes, unless it is told.
-const IDLE: Span = Span::from_millis(10_000);
-
 /// What both commands can be told.
 #[derive(Args, Debug)]
 struct Common {
-    /// End after so many seconds; else after the scenario's duration
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
+    /// End after this time, 10 or 10s or 2min; else after the scenario's duration
+    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Write the figures of the end as JSON, also when the run fails; docs/reference/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
@@ -77,15 +74,15 @@ fn limit(text: &str) -> Result<Limit, String> {
     let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
     let unit = text.trim_start_matches(|letter: char| letter.is_ascii_digit());
     let number: Option<u64> = text.strip_suffix(unit).and_then(|number| number.parse().ok());
-    let number = number.filter(|number| *number > 0).ok_or(allowed)?;
     let bytes = [("MB", 1_000_000), ("MiB", 1 << 20), ("GB", 1_000_000_000), ("GiB", 1 << 30)];
-    let seconds = [("s", 1), ("min", 60), ("h", 3_600)];
-    let in_units = |units: &[(&str, u64)]| {
-        let (_, each) = units.iter().find(|(name, _)| *name == unit)?;
-        number.checked_mul(*each)
-    };
-    let age = || in_units(&seconds).map(Duration::from_secs).map(Limit::Age);
-    in_units(&bytes).map(Limit::Bytes).or_else(age).ok_or_else(|| allowed.to_owned())
+    let each = bytes.iter().find(|(name, _)| *name == unit).map(|(_, each)| each);
+    if let Some(bytes) = each.and_then(|each| number?.checked_mul(*each)).filter(|bytes| *bytes > 0) {
+        return Ok(Limit::Bytes(bytes));
+    }
+    // A number alone may be meant as either.
+    let age = time(text).filter(|seconds| *seconds >= 1.0 && !unit.is_empty());
+    let age = age.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    age.map(Limit::Age).ok_or_else(|| allowed.to_owned())
 }
 
 impl Recording {

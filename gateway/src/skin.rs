@@ -10,7 +10,7 @@ use protocol::packet::crc16;
 use protocol::skin::{Cell, ControllerKind, Reply, Skin as Description};
 use protocol::usage::{Failure, print};
 
-use super::arguments::{FORMATS, Word, one_of};
+use super::arguments::{FORMATS, Word, bus_names, one_of};
 use super::output::Force;
 use super::print::{count, list, or, words};
 
@@ -70,13 +70,17 @@ struct Generate {
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway skin check gateway/examples/ur5-253.toml
-  gateway skin check skin.toml --cells | grep 'vcan0 12 '")]
+  gateway skin check skin.toml --node 12")]
 struct Check {
     /// The skin's description
     file: PathBuf,
-    /// Also list the cells, one a line, with the configuration hash that their heartbeats carry
+    /// Also list the cells, one a line: where each sits in the frame of its joint, whom its ports lead to, and the
+    /// configuration hash that its heartbeats carry
     #[arg(long)]
     cells: bool,
+    /// List the cells with this node id alone
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=254), conflicts_with = "cells")]
+    node: Option<u8>,
 }
 
 impl Skin {
@@ -103,7 +107,18 @@ impl Generate {
 impl Check {
     fn run(self) -> Result<(), Failure> {
         let skin = Description::read(&self.file).map_err(Failure::usage)?;
-        print(&if self.cells { describe(&skin) + &cells(&skin) } else { describe(&skin) })
+        let Some(node) = self.node else {
+            return print(&if self.cells { describe(&skin) + &cells(&skin, None) } else { describe(&skin) });
+        };
+        match cells(&skin, Some(node)) {
+            lines if lines.is_empty() => {
+                let (file, buses) = (self.file.display(), list(bus_names(&skin)));
+                Err(Failure::usage(format!(
+                    "--node {node}: {file} has no such cell on {buses}; --cells lists all"
+                )))
+            }
+            lines => print(&lines),
+        }
     }
 }
 
@@ -150,13 +165,20 @@ fn describe(skin: &Description) -> String {
     text + &format!("hash: {hash:04X} over the parameters of all cells; --cells lists each cell's\n")
 }
 
-/// One line a cell.
-fn cells(skin: &Description) -> String {
+/// One line for each cell, or for those with one node id.
+fn cells(skin: &Description, node: Option<u8>) -> String {
     let line = |cell: &Cell| {
         let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
-        let Cell { node, joint, serial, .. } = cell;
+        let Cell { bus: _, node, serial, joint, position, normal, neighbors, root, contact: _ } = cell;
+        let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
+        // What comes of a quaternion has more digits than anybody measured.
+        let normal = words(normal.map(|part| (part * 1e4).round() / 1e4 + 0.0));
+        let root = if *root { " root" } else { "" };
         let hash = skin.parameters(cell).hash();
-        format!("{bus} {node} joint {joint} serial {serial} hash {hash:04X}\n")
+        format!(
+            "{bus} {node} joint {joint} at {position} m normal {normal} ports {ports}{root} serial {serial} hash \
+             {hash:04X}\n"
+        )
     };
-    skin.cells.iter().map(line).collect()
+    skin.cells.iter().filter(|cell| node.is_none_or(|node| cell.node.get() == node)).map(line).collect()
 }

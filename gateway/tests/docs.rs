@@ -83,6 +83,17 @@ fn what_may_be_omitted_has_the_default_that_the_text_says() {
     assert_eq!(Skin::parse("skin.toml", &skin_text().replace(safety, "")), Ok(skin.clone()));
     let plain = Scenario::parse("scenario.toml", "version = 1\nduration_s = 6.0\n", &skin).unwrap();
     assert_eq!(plain, Scenario::idle(plain.duration));
+    let short = Skin::parse("skin.toml", block(SKIN_MD, "# a short skin.toml")).unwrap();
+    let said = "version = 1\nname = \"skin\"\n[timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = 62.5\n[[bus]]\n\
+                name = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]\nkind = \"kinesthetic\"\n\
+                inertia = [1.0, 1.0]\ndamping = [4.0, 4.0]\nmax_speed_rad_s = [2.0, 2.0]\n";
+    let text = block(SKIN_MD, "# a short skin.toml").replace("[robot]", "[robot]\nname = \"robot\"");
+    assert_eq!(Skin::parse("skin.toml", &format!("{said}{text}")), Ok(short.clone()));
+    let touch = block(SCENARIO_MD, "# a short scenario.toml");
+    let said =
+        format!("version = 1\nduration_s = 10.0\n{touch}\nat_s = 0.0\nbus = \"vcan0\"\nprofile = \"step\"\n");
+    let pressed = Scenario::parse("scenario.toml", touch, &short).unwrap();
+    assert_eq!(Scenario::parse("scenario.toml", &said, &short), Ok(pressed));
     let defaults =
         [("alpha_c", 1.0), ("alpha_p", 0.0), ("contact_threshold_n", 0.0), ("proximity_threshold", 0.0)];
     for (key, default) in defaults {

@@ -66,6 +66,15 @@ impl Format {
         }
     }
 
+    /// The one that this is not.
+    #[must_use]
+    pub const fn other(self) -> Self {
+        match self {
+            Self::Classic => Self::Fd,
+            Self::Fd => Self::Classic,
+        }
+    }
+
     /// How many data bytes a frame has at most: 8 or 64.
     #[must_use]
     pub const fn max_len(self) -> usize {

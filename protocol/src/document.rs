@@ -1,5 +1,5 @@
 //! Files that people write, in TOML, and what is said when something in them is wrong: one line that
-//! names the file, the line, the key, the value and what is allowed.
+//! names the file, the line and column, the key, the value and what is allowed.
 //!
 //! What the file says is read into a plain struct (`serde`, unknown keys refused); a `check` function
 //! makes of it what it means, or a [`Fault`]. The file is read without positions, which is quick; only
@@ -162,15 +162,36 @@ pub enum DocumentError {
         reason: String,
     },
     /// Something in it is wrong.
-    #[error("{path}:{line}: {what}")]
+    #[error("{path}:{line}:{column}: {what}")]
     Wrong {
         /// The file.
         path: String,
         /// The line, from 1.
         line: usize,
+        /// The column, from 1.
+        column: usize,
         /// The key, the value, and what is allowed.
         what: String,
     },
+    /// It is a file of another kind.
+    #[error("{path}: {what}")]
+    Mistaken {
+        /// The file.
+        path: String,
+        /// What it is, and where it belongs.
+        what: &'static str,
+    },
+}
+
+impl DocumentError {
+    /// What is said instead of a text that has one of the keys `has` and none of `lacks`: it is of another kind.
+    #[must_use]
+    pub fn or_mistaken(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
+        let Self::Wrong { path, .. } = &self else { return self };
+        let Ok(root) = DeTable::parse(text) else { return self };
+        let any = |keys: &[&str]| keys.iter().any(|key| root.get_ref().contains_key(*key));
+        if any(has) && !any(lacks) { Self::Mistaken { path: path.clone(), what } } else { self }
+    }
 }
 
 /// The most bytes of a file that people write; a skin of 253 cells has 60 KB.
@@ -206,22 +227,25 @@ pub fn parse<Raw: DeserializeOwned, T>(
     text: &str,
     check: impl FnOnce(Raw) -> Result<T, Fault>,
 ) -> Result<T, DocumentError> {
-    let wrong = |line, what| DocumentError::Wrong { path: path.to_owned(), line, what };
-    let raw = deserialize(text).map_err(|(line, what)| wrong(line, what))?;
-    check(raw).map_err(|fault| wrong(line_of(text, &fault.path), fault.to_string()))
+    let wrong = |at, what| {
+        let (line, column) = line_and_column(text, at);
+        DocumentError::Wrong { path: path.to_owned(), line, column, what }
+    };
+    let raw = deserialize(text).map_err(|(at, what)| wrong(at, what))?;
+    check(raw).map_err(|fault| wrong(offset_of(text, &fault.path), fault.to_string()))
 }
 
-/// Parses a document; the error is a line and one line of text.
+/// Parses a document; the error is where it stands, in bytes, and one line of text.
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
-        let line = error.span().map_or(1, |span| line_at(text, span.start));
-        (line, error.message().lines().collect::<Vec<_>>().join("; "))
+        let at = error.span().map_or(0, |span| span.start);
+        (at, error.message().lines().collect::<Vec<_>>().join("; "))
     })
 }
 
-/// The line of the value at the end of the path, or of the nearest thing above it that exists.
-fn line_of(text: &str, path: &[Step]) -> usize {
-    let Ok(root) = DeTable::parse(text) else { return 1 };
+/// Where the value at the end of the path stands, or the nearest thing above it that exists.
+fn offset_of(text: &str, path: &[Step]) -> usize {
+    let Ok(root) = DeTable::parse(text) else { return 0 };
     let mut at = root.span().start;
     let mut table = Some(root.get_ref());
     let mut value: Option<&Spanned<DeValue<'_>>> = None;
@@ -235,9 +259,12 @@ fn line_of(text: &str, path: &[Step]) -> usize {
         table = next.get_ref().as_table();
         value = Some(next);
     }
-    line_at(text, at)
+    at
 }
 
-fn line_at(text: &str, at: usize) -> usize {
-    text.get(..at).unwrap_or(text).matches('\n').count() + 1
+/// A place in a text as people and editors count, both from 1.
+fn line_and_column(text: &str, at: usize) -> (usize, usize) {
+    let before = text.get(..at).unwrap_or(text);
+    let line = before.rsplit('\n').next().unwrap_or(before);
+    (before.matches('\n').count() + 1, line.chars().count() + 1)
 }

@@ -150,11 +150,7 @@ impl Answers {
         let (bus, missing) = (bus.to_owned(), self.missing());
         if self.confirmed.is_empty() && self.refused.is_empty() {
             let who = self.only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
-            let other = match format {
-                Format::Fd => Format::Classic,
-                Format::Classic => Format::Fd,
-            };
-            return Err(SensingError::Nobody { who, bus, other: other.name() });
+            return Err(SensingError::Nobody { who, bus, other: format.other().name() });
         }
         if let Some((_, &reason)) = self.refused.iter().next() {
             return Err(SensingError::Refused { cells: names(self.refused.keys()), bus, reason });

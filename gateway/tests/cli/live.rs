@@ -6,11 +6,15 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use bench::listen::{Listener, send};
+use model::decode::Decoded;
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::candump::Line;
-use protocol::message::Message;
+use protocol::id::{CellId, Node};
+use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request};
+use protocol::packet::Epoch;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 use vcan_setup::embedded::Served;
@@ -56,6 +60,39 @@ impl Bench {
         assert_eq!(said, (Some(0), "", "sent on vcan0 (embedded)\n"), "{arguments}");
     }
 
+    /// Does something while cell 12 is on the bus: it sends heartbeats, and answers requests for its mount.
+    fn beside<T>(&self, format: Format, work: impl FnOnce() -> T) -> T {
+        let (mut cell, over) = (Listener::new(self.open(), Some(format)), AtomicBool::new(false));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let from = CellId::new(12).unwrap();
+                while !over.load(Ordering::Relaxed) {
+                    let page = NetworkPage::Heartbeat(Heartbeat::default());
+                    let mut answers =
+                        vec![Message::Network { from: Node::Cell(from), epoch: Epoch(0), page }];
+                    cell.hear(Duration::from_millis(20)).unwrap();
+                    for (_, decoded) in cell.decoded() {
+                        let Decoded::Message(Message::Configure { tag, request, .. }) = decoded else {
+                            continue;
+                        };
+                        let answer = match request {
+                            Request::Read { number: 1 } => {
+                                Answer::Value { number: 1, written: false, words: [2, 6, 0, 0, 0, 0] }
+                            }
+                            Request::Read { number } | Request::Write { number, .. } => {
+                                Answer::Refused { number, reason: 1 }
+                            }
+                        };
+                        answers.push(Message::Configured { from, tag, answer });
+                    }
+                    answers.iter().for_each(|it| send(cell.bus(), it, format).unwrap());
+                }
+            });
+            let _over = Over(&over);
+            work()
+        })
+    }
+
     fn open(&self) -> Bus {
         let (directory, send_timeout) = (Some(self.directory()), Duration::from_secs(10));
         let options = Options { directory, send_timeout, ..Options::default() };
@@ -63,11 +100,20 @@ impl Bench {
     }
 }
 
+/// Ends the cell beside a test, also when the test fails.
+struct Over<'a>(&'a AtomicBool);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
 #[test]
 fn what_is_sent_on_an_embedded_bus_is_shown() {
     let bench = Bench::new();
-    let dump = bench.dump("--max 4");
-    bench.send("frame stimulus --node 12 --force 3.0 --bus vcan0");
+    let dump = bench.dump("--max 4 --kind stimulus,command");
+    bench.beside(Format::Fd, || bench.send("frame stimulus --node 12 --force 3.0 --bus vcan0"));
     bench.send("frame sync --bus vcan0 --format classic");
     bench.send("ack vcan0");
     let Output { status, stdout, stderr } = dump.wait_with_output().unwrap();
@@ -85,6 +131,50 @@ fn what_is_sent_on_an_embedded_bus_is_shown() {
         let Ok(Line::Frame(record)) = candump::parse(raw) else { panic!("{line}") };
         assert!(record.interface == "vcan0" && record.time.nanos > 0, "{line}");
     }
+}
+
+#[test]
+fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
+    let bench = Bench::new();
+    let says = |arguments: &str| {
+        let Output { status, stdout, stderr } = bench.gateway(arguments).output().unwrap();
+        let said = text(&stderr).strip_prefix("sent on vcan0 (embedded)\n").unwrap().to_owned();
+        (status.code(), text(&stdout).to_owned(), said)
+    };
+    for format in [Format::Fd, Format::Classic] {
+        let with = format!("--bus vcan0 --format {}", format.name());
+        bench.beside(format, || {
+            let read = says(&format!("frame configure --node 12 --read mount --tag 7 {with}"));
+            assert_eq!((read.0, read.2.as_str()), (Some(0), ""));
+            assert!(read.1.starts_with("configured 12 tag 7: has mount: joint 2 of 6") && read.1.lines().count() == 1, "{read:?}");
+            let all = says(&format!("frame configure --node everyone --read mount {with}"));
+            assert_eq!((all.0, all.1.lines().count()), (Some(0), 1), "{all:?}");
+            let refused = says(&format!("frame configure --node 12 --write mode 1 {with}"));
+            assert!(refused.0 == Some(1) && refused.2.starts_with("gateway: configured 12 tag 0: "), "{refused:?}");
+            let nobody = says(&format!("frame stimulus --node 250 {with}"));
+            assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
+            let expected = format!(
+                "gateway: no cell 250 was heard on vcan0 for 1 s: `gateway cells vcan0` lists who is there; the bus' \
+                 format may be --format {}\n",
+                format.other().name()
+            );
+            assert_eq!(nobody.2, expected);
+        });
+    }
+}
+
+#[test]
+fn too_few_files_are_refused_before_anything_is_started() {
+    let parent = TempDir::new().unwrap();
+    let skin = parent.path().join("skin.toml");
+    output(gateway(&format!("skin generate --cells 3 -o {}", skin.display())));
+    let mut command = Command::new("sh");
+    command.args(["-c", "ulimit -n 12; exec \"$0\" run \"$1\" --duration 1 --bus-kind embedded"]);
+    command.arg(env!("CARGO_BIN_EXE_gateway")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
+    let Output { status, stderr, .. } = command.output().unwrap();
+    let said =
+        "gateway: 12 files may be open at once, and this bench needs 31: say `ulimit -n 31` before it\n";
+    assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 
 #[test]

@@ -245,7 +245,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("frame configure --node 12 --write mode 2", "mode = 2: 0 measures, 1 obeys stimuli"),
         (
             "dump run.log --from -1",
-            "invalid value '-1' for '--from <S>': a number of seconds from 0 to 1e9; try '--help'",
+            "invalid value '-1' for '--from <S>': a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h); try '--help'",
         ),
         ("dump / ", "/ is a directory: name a candump log or a bus"),
         (
@@ -253,7 +253,13 @@ fn wrong_use_is_one_line_and_exit_code_2() {
             "255 cells do not fit on one bus: a bus has numbers for 254; say --buses 2",
         ),
         ("skin check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
-        ("xyzzy", "unrecognized subcommand 'xyzzy'; try '--help'"),
+        (
+            "run skin.toml scenario.toml",
+            "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
+        ),
+        ("skin chek", "unrecognized subcommand 'chek'; a similar subcommand exists: 'check'; try '--help'"),
+        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of that name: say where the file is"),
+        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: say where the file is"),
     ] {
         assert_eq!(refusal(arguments, 2), format!("gateway: {expected}"), "{arguments}");
     }
@@ -262,11 +268,9 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         let expected = "gateway: there is no file nosuch, and as a bus: no embedded bus nosuch is served in ";
         assert!(said.starts_with(expected), "{said}");
     }
-    let said = refusal("dump a/b.log", 2);
-    assert!(
-        said.starts_with("gateway: there is no file a/b.log, and as a bus: \"a/b.log\" is no bus name"),
-        "{said}"
-    );
+    let said = refusal("list", 2);
+    assert!(said.starts_with("gateway: there is no command list; there are demo, run, "), "{said}");
+    assert!(said.contains(", cells, "), "{said}");
     let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
     let said = refusal(&format!("dump {skin}"), 1);
     assert!(said.contains("there is no frame in "), "{said}");
@@ -306,7 +310,83 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     let skin = protocol::skin::Skin::read(&file).unwrap();
     let shown = output(gateway(&format!("skin check --cells {}", file.display())));
     let hash = skin.parameters(&skin.cells[2]).hash();
-    assert_eq!(shown.lines().last().unwrap(), format!("vcan1 1 joint 3 serial 200001 hash {hash:04X}"));
+    let ([x, y, z], line) = (skin.cells[2].position, shown.lines().last().unwrap());
+    assert!(line.starts_with(&format!("vcan1 1 joint 3 at {x} {y} {z} m normal ")), "{line}");
+    assert!(line.ends_with(&format!(" ports - - - - root serial 200001 hash {hash:04X}")), "{line}");
+    assert_eq!(output(gateway(&format!("skin check --node 2 {}", file.display()))).lines().count(), 1);
+    let said = refusal(&format!("skin check --node 9 {}", file.display()), 2);
+    assert!(said.ends_with("has no such cell on vcan0, vcan1; --cells lists all"), "{said}");
+}
+
+/// A scenario's file beside a skin of three cells, and what is said of it.
+fn checked(scenario: &str, options: &str) -> Output {
+    let directory = TempDir::new().unwrap();
+    let [skin, file] = ["skin.toml", "s.toml"].map(|name| directory.path().join(name));
+    output(gateway(&format!("skin generate --cells 3 -o {}", skin.display())));
+    std::fs::write(&file, scenario).unwrap();
+    let line = format!("scenario check s.toml --skin skin.toml {options}");
+    gateway(&line).current_dir(directory.path()).output().unwrap()
+}
+
+#[test]
+fn a_scenario_is_shown_in_the_order_of_time() {
+    let scenario = "[[fault]]\nat_s = 3.0\nkind = \"kill\"\ncells = [2]\n\
+                    [[touch]]\nat_s = 1.0\nfor_s = 0.5\nall = true\nforce_n = 2.0\nprofile = \"ramp\"\n\
+                    [[touch]]\ncells = [1, 3]\nforce_n = 3.0\n";
+    let Output { status, stdout, stderr } = checked(scenario, "--json");
+    assert_eq!((status.code(), text(&stderr)), (Some(0), ""));
+    let plan: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
+    assert_eq!((&plan["duration_s"], &plan["motion"]["kind"]), (&10.0.into(), &"kinesthetic".into()));
+    let events: Vec<_> =
+        plan["events"].as_array().unwrap().iter().map(|it| (&it["what"], &it["cells"])).collect();
+    let cells = |nodes: &[u8]| serde_json::json!(nodes);
+    let expected = [("touch", cells(&[1, 3])), ("touch", cells(&[1, 2, 3])), ("kill", cells(&[2]))];
+    let expected = expected.map(|(what, cells)| (serde_json::json!(what), cells));
+    assert_eq!(events, expected.each_ref().map(|(what, cells)| (what, cells)));
+    assert_eq!((&plan["events"][1]["force_n"], &plan["events"][1]["for_s"]), (&2.0.into(), &0.5.into()));
+    let Output { stdout, .. } = checked(scenario, "");
+    let shown = text(&stdout);
+    let rows: Vec<_> = shown.lines().filter(|line| line.contains("vcan0")).collect();
+    assert!(
+        rows.len() == 3 && rows[1].contains("1-3") && rows[1].contains("force_n 2.0, profile ramp"),
+        "{shown}"
+    );
+}
+
+#[test]
+fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
+    let said = |scenario: &str| {
+        let Output { status, stderr, .. } = checked(scenario, "");
+        assert_eq!(status.code(), Some(2));
+        text(&stderr).trim_end().to_owned()
+    };
+    let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
+    assert_eq!(wrong, "gateway: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
+    let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
+    assert!(said(drop).starts_with("gateway: the scenario has a fault of a bus"), "a run would refuse it");
+}
+
+#[test]
+fn times_are_taken_with_and_without_a_unit() {
+    let shown = |from: &str| output(gateway(&format!("dump {} --from {from}", golden("session.log"))));
+    assert_eq!(shown("0.002"), shown("2ms"));
+    assert_ne!(shown("2ms"), shown("2s"));
+    for wrong in ["10x", "s", "0s", "-1min"] {
+        let said = refusal(&format!("run skin.toml --duration={wrong}"), 2);
+        assert!(said.contains("a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)"), "{said}");
+    }
+    let said = refusal("run nosuch.toml --duration 10s --record-split 1.5min --record x.mcap", 2);
+    assert!(said.contains("nosuch.toml: No such file"), "both are taken: {said}");
+}
+
+#[test]
+fn a_report_says_that_it_is_no_recording_before_that_the_page_is_there() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("x.json");
+    std::fs::write(&file, "{}").unwrap();
+    std::fs::write(file.with_extension("html"), "").unwrap();
+    let said = refusal(&format!("report {}", file.display()), 2);
+    assert!(said.contains("x.json is no MCAP recording"), "{said}");
 }
 
 fn names(directory: &Path) -> Vec<String> {
@@ -329,6 +409,7 @@ fn every_command_has_help_with_an_example() {
         "ack",
         "skin generate",
         "skin check",
+        "scenario check",
     ] {
         let help = output(gateway(&format!("{command} --help")));
         assert!(

@@ -94,7 +94,10 @@ pub enum BusError {
         theirs: u8,
     },
     /// The embedded bus does not answer.
-    #[error("the embedded bus {name} did not answer within {} ms: is its server stopped?", waited.as_millis())]
+    #[error(
+        "the embedded bus {name} did not answer within {} ms: is its server stopped, or out of files (`ulimit -n`)?",
+        waited.as_millis()
+    )]
     NoAnswer {
         /// The bus.
         name: String,

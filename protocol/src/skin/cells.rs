@@ -22,7 +22,8 @@ pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Conta
         let at = Place::named("cell").nth(index);
         let cell = cell(&at, raw, robot, buses, base)?;
         if let Some(first) = taken.insert((cell.bus, cell.node), index) {
-            let why = format!("cell[{first}] has this node on {:?} already", raw.bus);
+            let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
+            let why = format!("cell[{first}] has this node on {bus:?} already");
             return Err(at.key("node").fault(raw.node, why));
         }
         if let Some(first) = serials.insert(cell.serial, index) {
@@ -72,10 +73,7 @@ fn contradictions(cells: &[Cell]) -> Checked<()> {
 }
 
 fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Cell> {
-    let bus = buses.iter().position(|bus| bus.name == raw.bus).ok_or_else(|| {
-        let names = buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
-        at.key("bus").fault(format_args!("{:?}", raw.bus), format_args!("no such bus; there is {names}"))
-    })?;
+    let bus = bus(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
     let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
@@ -95,13 +93,6 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact
         );
         return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
     }
-    let length = raw.orientation.iter().map(|part| part * part).sum::<f64>().sqrt();
-    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
-        let [x, y, z, w] = raw.orientation;
-        let why = format!("this quaternion has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
-        return Err(at.key("orientation").fault(format_args!("[{x}, {y}, {z}, {w}]"), why));
-    }
-    let orientation = raw.orientation.map(|part| part / length);
     let mut neighbors = [None; 4];
     for (port, (neighbor, &got)) in neighbors.iter_mut().zip(&raw.neighbors).enumerate() {
         if got != 0 {
@@ -116,8 +107,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact
         serial: at.key("serial").within(serial, 0..=u32::MAX, "")?,
         joint,
         position: raw.position,
-        orientation,
-        normal: normal(orientation),
+        normal: normal(at, raw)?,
         neighbors,
         root: raw.root,
         contact: contact(at, raw.contact(), base)?,
@@ -141,9 +131,44 @@ fn default_serial(bus: usize, node: CellId) -> i64 {
     i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
 }
 
-/// The z axis of an orientation.
-fn normal([x, y, z, w]: [f64; 4]) -> [f64; 3] {
-    [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
+/// The bus that a cell names; it need not name the only one.
+fn bus(at: &Place, raw: &raw::Cell, buses: &[Bus]) -> Checked<usize> {
+    let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
+    let at = at.key("bus");
+    match &raw.bus {
+        Some(name) => buses.iter().position(|bus| bus.name == *name).ok_or_else(|| {
+            at.fault(format_args!("{name:?}"), format_args!("no such bus; there is {}", names()))
+        }),
+        None if buses.len() == 1 => Ok(0),
+        None => Err(at.fault("", format_args!("which bus? there is {}", names()))),
+    }
+}
+
+/// The outward normal, as it is given or as the z axis of an orientation.
+fn normal(at: &Place, raw: &raw::Cell) -> Checked<[f64; 3]> {
+    match (raw.orientation, raw.normal) {
+        (Some(orientation), None) => {
+            let [x, y, z, w] = unit(&at.key("orientation"), "quaternion", orientation)?;
+            Ok([2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)])
+        }
+        (None, Some(normal)) => unit(&at.key("normal"), "vector", normal),
+        (Some(_), Some(_)) => Err(at.key("normal").fault("", "either a normal or an orientation, not both")),
+        (None, None) => {
+            let why = "where does the cell face? give the x, y, z of its outward normal, or its orientation";
+            Err(at.key("normal").fault("", why))
+        }
+    }
+}
+
+/// Parts of length one, exactly.
+fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
+    let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
+    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
+        let got = parts.map(|part| part.to_string()).join(", ");
+        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
+        return Err(at.fault(format_args!("[{got}]"), why));
+    }
+    Ok(parts.map(|part| part / length))
 }
 
 /// The farthest that a cell can come from the origin of any frame below it (of the base: from its

@@ -143,17 +143,16 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         }
         Ok(values)
     };
-    let needed = |key, values: Option<Vec<f64>>| {
-        let why = "needed with kind = \"kinesthetic\"";
-        each_positive(key, values.ok_or_else(|| at.key(key).fault("", why))?)
+    let each_or = |key, values: Option<Vec<f64>>, usual| {
+        values.map_or_else(|| Ok(vec![usual; joints]), |values| each_positive(key, values))
     };
     let kind = if at.key("kind").word(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
         if raw.socket.is_some() {
             return Err(at.key("socket").fault("", "only with kind = \"external\""));
         }
         ControllerKind::Kinesthetic {
-            inertia: needed("inertia", raw.inertia)?,
-            damping: needed("damping", raw.damping)?,
+            inertia: each_or("inertia", raw.inertia, 1.0)?,
+            damping: each_or("damping", raw.damping, 4.0)?,
         }
     } else {
         if raw.inertia.is_some() || raw.damping.is_some() {
@@ -163,7 +162,7 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         let why = "the path of a Unix socket is needed with kind = \"external\"";
         ControllerKind::External { socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))? }
     };
-    Ok(Controller { kind, max_speed_rad_s: each_positive("max_speed_rad_s", raw.max_speed_rad_s)? })
+    Ok(Controller { kind, max_speed_rad_s: each_or("max_speed_rad_s", raw.max_speed_rad_s, 2.0)? })
 }
 
 fn safety(raw: &raw::Safety) -> Checked<Safety> {

@@ -22,6 +22,11 @@ use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
 
 pub use wires::Wires;
 
+/// The keys by which a skin is known from a scenario, and the other way round.
+pub const KEYS: &[&str] = &["robot", "cell"];
+/// See [`KEYS`].
+const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault"];
+
 /// A checked description.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Skin {
@@ -54,9 +59,9 @@ pub struct Robot {
     pub limits_rad: Vec<[f64; 2]>,
 }
 
-/// One row of the robot's table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`.
-#[derive(Clone, Copy, Debug, Deserialize, PartialEq)]
-#[serde(deny_unknown_fields)]
+/// One row of the robot's table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`; what is not said is 0.
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
+#[serde(deny_unknown_fields, default)]
 pub struct DenavitHartenberg {
     /// Length of the link in m.
     pub a: f64,
@@ -197,8 +202,6 @@ pub struct Cell {
     pub joint: u8,
     /// Position in the frame of joint k, in m.
     pub position: [f64; 3],
-    /// Orientation in the frame of joint k: a unit quaternion x, y, z, w.
-    pub orientation: [f64; 4],
     /// Outward normal in the frame of joint k: the cell's z axis.
     pub normal: [f64; 3],
     /// What is wired to its ports.
@@ -223,7 +226,9 @@ impl Skin {
     /// # Errors
     /// The first thing that is wrong with it.
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
+        let what = "this is a scenario, not a skin: `gateway run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
+            .map_err(|error: DocumentError| error.or_mistaken(text, SCENARIO_KEYS, KEYS, what))
     }
 
     /// The words that a cell computes with.

@@ -3,38 +3,68 @@
 use serde::Deserialize;
 
 use super::{DenavitHartenberg, LostBus};
+use crate::can::Format;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Skin {
+    #[serde(default = "version")]
     pub(super) version: i64,
+    #[serde(default = "name")]
     pub(super) name: String,
     pub(super) robot: Robot,
+    #[serde(default)]
     pub(super) timing: Timing,
     #[serde(default)]
     pub(super) contact: Contact,
     #[serde(default)]
     pub(super) events: Events,
+    #[serde(default = "one_bus")]
     pub(super) bus: Vec<Bus>,
+    #[serde(default)]
     pub(super) controller: Controller,
     #[serde(default)]
     pub(super) safety: Safety,
     pub(super) cell: Vec<Cell>,
 }
 
+const fn version() -> i64 {
+    1
+}
+
+fn name() -> String {
+    "skin".to_owned()
+}
+
+fn one_bus() -> Vec<Bus> {
+    vec![Bus::default()]
+}
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Robot {
+    #[serde(default = "robot")]
     pub(super) name: String,
     pub(super) joints: Vec<DenavitHartenberg>,
     pub(super) limits_rad: Option<Vec<[f64; 2]>>,
 }
 
+fn robot() -> String {
+    "robot".to_owned()
+}
+
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub(super) struct Timing {
     pub(super) control_hz: f64,
     pub(super) joint_broadcast_hz: f64,
+}
+
+impl Default for Timing {
+    /// The paper's.
+    fn default() -> Self {
+        Self { control_hz: 500.0, joint_broadcast_hz: 62.5 }
+    }
 }
 
 /// Gains and thresholds; in a cell, those that differ from the skin's.
@@ -49,7 +79,7 @@ pub(super) struct Contact {
 }
 
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub(super) struct Bus {
     pub(super) name: String,
     pub(super) reply: String,
@@ -60,6 +90,22 @@ pub(super) struct Bus {
     pub(super) data_bitrate: Option<i64>,
     pub(super) sensing: Option<String>,
     pub(super) sensing_hz: Option<f64>,
+}
+
+impl Default for Bus {
+    fn default() -> Self {
+        Self {
+            name: "vcan0".to_owned(),
+            reply: "torque".to_owned(),
+            format: Format::Fd.name().to_owned(),
+            slot_us: None,
+            carry: None,
+            bitrate: None,
+            data_bitrate: None,
+            sensing: None,
+            sensing_hz: None,
+        }
+    }
 }
 
 /// Which changes of what cells measure are events.
@@ -74,13 +120,20 @@ pub(super) struct Events {
 }
 
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub(super) struct Controller {
     pub(super) kind: String,
     pub(super) inertia: Option<Vec<f64>>,
     pub(super) damping: Option<Vec<f64>>,
-    pub(super) max_speed_rad_s: Vec<f64>,
+    pub(super) max_speed_rad_s: Option<Vec<f64>>,
     pub(super) socket: Option<String>,
+}
+
+impl Default for Controller {
+    fn default() -> Self {
+        let kind = "kinesthetic".to_owned();
+        Self { kind, inertia: None, damping: None, max_speed_rad_s: None, socket: None }
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -102,12 +155,13 @@ impl Default for Safety {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Cell {
-    pub(super) bus: String,
+    pub(super) bus: Option<String>,
     pub(super) node: i64,
     pub(super) serial: Option<i64>,
     pub(super) joint: i64,
     pub(super) position: [f64; 3],
-    pub(super) orientation: [f64; 4],
+    pub(super) orientation: Option<[f64; 4]>,
+    pub(super) normal: Option<[f64; 3]>,
     #[serde(default)]
     pub(super) neighbors: [i64; 4],
     #[serde(default)]

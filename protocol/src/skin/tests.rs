@@ -66,9 +66,17 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
     text
 }
 
+/// What is wrong, by its line; columns have a test of their own.
+fn by_line(error: DocumentError) -> String {
+    match error {
+        DocumentError::Wrong { path, line, what, .. } => format!("{path}:{line}: {what}"),
+        other => other.to_string(),
+    }
+}
+
 fn says(from: &str, to: &str) -> String {
     assert!(GOOD.contains(from), "{from}");
-    Skin::parse("skin.toml", &GOOD.replacen(from, to, 1)).unwrap_err().to_string()
+    by_line(Skin::parse("skin.toml", &GOOD.replacen(from, to, 1)).unwrap_err())
 }
 
 #[test]
@@ -139,10 +147,6 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("inertia = [1.0, 1.0]", "inertia = [1.0]"),
         "skin.toml:26: controller.inertia = 1 values: one for each of the robot's 2 joints is needed"
     );
-    assert_eq!(
-        says("inertia = [1.0, 1.0]\n", ""),
-        "skin.toml:24: controller.inertia: needed with kind = \"kinesthetic\""
-    );
     assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: its word holds [-2, 2)");
     assert_eq!(
         says("alpha_c = 0.5", "alpha_c = 8.5"),
@@ -184,7 +188,7 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
         [([2, 0, 0, 0], true), ([1, 3, 0, 0], false), ([2, 4, 0, 0], false), ([3, 0, 0, 0], false)];
     let parse = |reply: &str, cells: &[_]| Skin::parse("skin.toml", &wired_text(reply, cells));
     let bus = |reply: &str| parse(reply, &CHAIN).unwrap().buses[0].reply;
-    let fault = |reply: &str, cells: &[_]| parse(reply, cells).unwrap_err().to_string();
+    let fault = |reply: &str, cells: &[_]| by_line(parse(reply, cells).unwrap_err());
     assert_eq!(bus("reply = \"sum\"\nslot_us = 4000"), Reply::Sum { slot_us: 4_000, carry: true });
     let without = "reply = \"sum\"\nslot_us = 1\ncarry = false";
     assert_eq!(bus(without), Reply::Sum { slot_us: 1, carry: false });
@@ -240,7 +244,7 @@ fn bit_rates_are_optional_and_checked() {
     assert_eq!(rates(fastest), (Some(1_000_000), Some(8_000_000)));
     assert_eq!(rates("bitrate = 500000\ndata_bitrate = 500000"), (Some(500_000), Some(500_000)));
 
-    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     let range = "10000 to 1000000 bit/s are possible";
     assert_eq!(fault("bitrate = 9999"), format!("skin.toml:23: bus[0].bitrate = 9999: {range}"));
     assert_eq!(fault("bitrate = 1000001"), format!("skin.toml:23: bus[0].bitrate = 1000001: {range}"));
@@ -255,7 +259,7 @@ fn bit_rates_are_optional_and_checked() {
     );
     let classic = with("bitrate = 500000\ndata_bitrate = 500000").replace(format, "format = \"classic\"");
     assert_eq!(
-        Skin::parse("skin.toml", &classic).unwrap_err().to_string(),
+        by_line(Skin::parse("skin.toml", &classic).unwrap_err()),
         "skin.toml:24: bus[0].data_bitrate = 500000: only with format = \"fd\""
     );
 }
@@ -266,8 +270,11 @@ fn a_broken_file_says_where_in_one_line() {
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
     let error = says("joint = 2", "joint = \"two\"");
     assert_eq!(error, "skin.toml:33: invalid type: string \"two\", expected i64");
-    let error = says("name = \"elbow\"\n", "");
-    assert_eq!(error, "skin.toml:4: missing field `name`");
+    let error = Skin::parse("skin.toml", "name = \"nobody\"\n").unwrap_err().to_string();
+    assert_eq!(error, "skin.toml:1:1: missing field `robot`");
+    let error =
+        Skin::parse("skin.toml", &GOOD.replacen("[1.0, 1.0]", "[1.0, 0.0]", 1)).unwrap_err().to_string();
+    assert_eq!(error, "skin.toml:26:17: controller.inertia[1] = 0: must be above 0");
     assert!(
         Skin::read(Path::new("/nonexistent/skin.toml"))
             .unwrap_err()
@@ -287,7 +294,7 @@ fn sensing_is_off_unless_said_and_its_keys_are_checked() {
     let at = |period_ms| Sensing::Continuous { period_ms };
     assert_eq!(sensing("sensing = \"continuous\"\nsensing_hz = 62.5"), at(16));
 
-    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     assert_eq!(
         fault("sensing = \"always\""),
         "skin.toml:23: bus[0].sensing = \"always\": \"off\", \"continuous\" or \"event\""
@@ -316,7 +323,7 @@ fn thresholds_of_events_have_defaults_and_fit_their_words() {
     assert_eq!(events("hysteresis = 1.0").hysteresis.to_bits(), 1 << 14);
     assert_eq!(events("temperature_c = 0.0").temperature.to_bits(), 0, "every change");
 
-    let fault = |lines: &str| Skin::parse("skin.toml", &with(lines)).unwrap_err().to_string();
+    let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     assert_eq!(fault("contact_n = -1.0"), "skin.toml:25: events.contact_n = -1: must not be negative");
     assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: its word holds [0, 32)");
     assert_eq!(
@@ -340,6 +347,69 @@ fn a_skin_has_at_most_64_buses() {
         Skin::parse("skin.toml", &format!("{head}{more}[controller]{cells}"))
     };
     assert_eq!(with(64).unwrap().buses.len(), 64);
-    let error = with(65).unwrap_err().to_string();
+    let error = by_line(with(65).unwrap_err());
     assert!(error.contains("65 buses") && error.contains("a skin has at most 64 buses"), "{error}");
+}
+
+#[test]
+fn only_what_is_not_plain_has_to_be_said() {
+    const SHORT: &str = "[robot]
+joints = [{ d = 0.1, alpha = 1.5707963267948966 }, { a = 0.5 }]
+[[cell]]
+node = 1
+joint = 2
+position = [0.1, 0.0, 0.06]
+normal = [0.0, 0.6, 0.8]
+";
+    let long = SHORT
+        .replace("[[cell]]", "[[cell]]\nbus = \"vcan0\"\nroot = false\nneighbors = [0, 0, 0, 0]")
+        .replace("joints = [{ ", "name = \"robot\"\njoints = [{ a = 0.0, theta_offset = 0.0, ")
+        .replace("{ a = 0.5 }", "{ a = 0.5, d = 0.0, alpha = 0.0, theta_offset = 0.0 }")
+        .replace(
+            "normal = [0.0, 0.6, 0.8]",
+            "orientation = [-0.31622776601683794, 0.0, 0.0, 0.9486832980505138]",
+        );
+    let head = "version = 1\nname = \"skin\"\n[timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = 62.5\n\
+                [[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n\
+                [controller]\nkind = \"kinesthetic\"\ninertia = [1.0, 1.0]\ndamping = [4.0, 4.0]\n\
+                max_speed_rad_s = [2.0, 2.0]\n";
+    let short = Skin::parse("skin.toml", SHORT).unwrap();
+    let mut long = Skin::parse("skin.toml", &format!("{head}{long}")).unwrap();
+    let (given, same) = (short.cells[0].normal, long.cells[0].normal);
+    assert!(given.iter().zip(same).all(|(given, same)| (given - same).abs() < 1e-12), "{same:?}");
+    long.cells[0].normal = given;
+    assert_eq!(short, long);
+
+    let fault =
+        |from: &str, to: &str| by_line(Skin::parse("skin.toml", &SHORT.replace(from, to)).unwrap_err());
+    assert_eq!(
+        fault("0.8]", "0.8]\norientation = [0.0, 0.0, 0.0, 1.0]"),
+        "skin.toml:7: cell[0].normal: either a normal or an orientation, not both"
+    );
+    assert_eq!(
+        fault("normal = [0.0, 0.6, 0.8]", ""),
+        "skin.toml:3: cell[0].normal: where does the cell face? give the x, y, z of its outward normal, or its \
+         orientation"
+    );
+    assert_eq!(
+        fault("0.8]", "1.0]"),
+        "skin.toml:7: cell[0].normal = [0, 0.6, 1]: this vector has length 1.166190; it must be 1 within 0.001"
+    );
+    assert_eq!(
+        fault("[[cell]]", "[[bus]]\n[[bus]]\nname = \"vcan1\"\n[[cell]]"),
+        "skin.toml:6: cell[0].bus: which bus? there is \"vcan0\", \"vcan1\""
+    );
+}
+
+#[test]
+fn a_scenario_is_known_for_what_it_is() {
+    let said = Skin::parse("s.toml", "duration_s = 2.0\n[[touch]]\nall = true\nforce_n = 1.0\n")
+        .unwrap_err()
+        .to_string();
+    assert_eq!(
+        said,
+        "s.toml: this is a scenario, not a skin: `gateway run SKIN --scenario SCENARIO` takes both"
+    );
+    let said = says("[controller]", "[motion]\n[controller]");
+    assert!(said.contains("unknown field `motion`"), "a skin with a key too many: {said}");
 }

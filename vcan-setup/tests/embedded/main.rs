@@ -404,7 +404,8 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
     let directory = Some(parent.path().join("skinbus"));
     let error = Bus::open(BUS, Choice::Only(BusKind::Embedded), &Options { directory, ..Options::default() });
     let error = error.unwrap_err().to_string();
-    assert_eq!(error, "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped?");
+    let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of files (`ulimit -n`)?";
+    assert_eq!(error, expected);
     drop(server);
 }
 

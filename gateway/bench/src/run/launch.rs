@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
 use protocol::skin::Skin;
 use rustix::fs::{MemfdFlags, memfd_create};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
 
 use super::RunError;
@@ -25,6 +25,10 @@ use model::scenario::ProcessAction;
 pub const LISTEN: Duration = Duration::from_millis(500);
 /// Cells that were started and make no progress for so long are given up.
 pub const STARTING: Duration = Duration::from_secs(15);
+/// Files that a gateway or a server of a bus has open beside buses and clients.
+const OTHER_FILES: usize = 24;
+/// Files of a gateway for one bus.
+const FILES_OF_A_BUS: usize = 4;
 /// How long processes may take to end when asked to.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -53,6 +57,16 @@ pub enum LaunchError {
     /// The ends of processes cannot be noticed.
     #[error("cannot catch SIGCHLD: {0}")]
     Signal(std::io::Error),
+    /// Fewer files may be open than buses and cells need.
+    #[error(
+        "{limit} files may be open at once, and this bench needs {needed}: say `ulimit -n {needed}` before it"
+    )]
+    Files {
+        /// The limit.
+        limit: u64,
+        /// What is needed.
+        needed: u64,
+    },
     /// An embedded bus is not served.
     #[error("{path} does not serve {bus}; see its own message above")]
     Serve {
@@ -61,6 +75,19 @@ pub enum LaunchError {
         /// The bus.
         bus: String,
     },
+}
+
+/// Sees that as many files may be open as the gateway needs for so many buses and as who serves one of them needs for
+/// so many clients; raises the limit as far as that is allowed, for all that are started from here on.
+///
+/// # Errors
+/// When it is not allowed.
+pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
+    let needed = (OTHER_FILES + FILES_OF_A_BUS * buses + clients) as u64;
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let Some(limit) = current.filter(|limit| *limit < needed) else { return Ok(()) };
+    setrlimit(Resource::Nofile, Rlimit { current: Some(needed), maximum })
+        .map_err(|_| LaunchError::Files { limit, needed })
 }
 
 /// Where a program of this project is: named by the user, or beside this one.
@@ -344,7 +371,8 @@ fn apart(command: &mut Command, directory: Option<&Path>) {
 }
 
 /// Runs of consecutive numbers, at most `size` long.
-fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
+#[must_use]
+pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
     let mut groups: Vec<(u8, u8)> = Vec::new();
     for &node in nodes {
         match groups.last_mut() {

@@ -13,7 +13,7 @@ use protocol::skin::{self, Reply};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::bench::{Bench, LinkId};
-use super::launch::{Processes, ServedBus, open_or_serve, program};
+use super::launch::{Processes, ServedBus, allow_files, open_or_serve, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
 use super::progress::say;
@@ -111,7 +111,10 @@ fn refuse(options: &Options) -> Result<(), RunError> {
     if options.scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
         return Err(RunError::BusFault);
     }
-    Ok(())
+    let buses = options.skin.buses.len();
+    let clients =
+        (0..buses).map(|bus| options.skin.cells_of(bus).count().div_ceil(options.cells_per_process));
+    Ok(allow_files(buses, clients.max().unwrap_or(0))?)
 }
 
 /// Opens a bus; an embedded one that nobody serves is served.

@@ -19,8 +19,8 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
         return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
-    let end = EndS(raw.duration_s);
-    let duration = length(&Place::named("duration_s"), raw.duration_s)?;
+    let end = EndS(raw.duration_s());
+    let duration = length(&Place::named("duration_s"), end.0)?;
     let negative = |_| Place::named("seed").fault(raw.seed, "must not be negative");
     let seed = u64::try_from(raw.seed).map_err(negative)?;
     let motion = motion(&raw.motion, skin)?;
@@ -46,9 +46,12 @@ impl EndS {
     }
 }
 
-/// A length of time; the longest is a year.
+/// A year.
+pub(super) const LONGEST_S: f64 = 3.2e7;
+
+/// A length of time.
 pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
-    if (1e-6..=3.2e7).contains(&seconds) {
+    if (1e-6..=LONGEST_S).contains(&seconds) {
         return Ok(Span(micros(seconds)));
     }
     Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
@@ -154,11 +157,18 @@ fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<
         Some([first, second]) => Some([degrees(first)?, degrees(second)?]),
         None => None,
     };
-    let profiles = [("half-sine", Profile::HalfSine), ("step", Profile::Step), ("ramp", Profile::Ramp)];
+    let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
     let profile = at.key("profile").word(&raw.profile, &profiles)?;
+    let length = match (raw.for_s, profile) {
+        (Some(seconds), _) => length(&at.key("for_s"), seconds)?,
+        (None, Profile::Step) => Span(u64::MAX),
+        (None, Profile::HalfSine | Profile::Ramp) => {
+            return Err(at.key("for_s").fault("", format_args!("needed with profile = {:?}", raw.profile)));
+        }
+    };
     Ok(Touch {
         at: end.moment(&at.key("at_s"), raw.at_s)?,
-        length: length(&at.key("for_s"), raw.for_s)?,
+        length,
         cells: names.cells(at, raw.bus.as_deref(), raw.cells.as_deref(), raw.all)?,
         force_n: raw.force_n,
         profile,

@@ -14,10 +14,13 @@ use std::path::Path;
 use protocol::document::{self, DocumentError};
 use protocol::fixed::{Q1_14, Q9_6};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
+use protocol::skin::{KEYS, Skin};
 use protocol::time::{Micros, Span};
 
 pub use touches::{Stimulus, Touches, contact_words};
+
+/// How long a run takes in which nothing happens, unless it is told.
+pub const IDLE: Span = Span::from_millis(10_000);
 
 /// A checked description.
 #[derive(Clone, Debug, PartialEq)]
@@ -85,7 +88,7 @@ pub enum Mode {
 pub struct Touch {
     /// When it begins.
     pub at: Micros,
-    /// How long it lasts.
+    /// How long it lasts; the longest there is when it does not end.
     pub length: Span,
     /// What it touches, in the skin's order.
     pub cells: Vec<usize>,
@@ -108,6 +111,18 @@ pub enum Profile {
     Step,
     /// `ramp`: it grows evenly to all of it, and then is gone.
     Ramp,
+}
+
+impl Profile {
+    /// The word in the file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::HalfSine => "half-sine",
+            Self::Step => "step",
+            Self::Ramp => "ramp",
+        }
+    }
 }
 
 /// Something breaks, or is mended.
@@ -240,7 +255,9 @@ impl Scenario {
     /// # Errors
     /// The first thing that is wrong with it.
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
+        let what = "this is a skin, not a scenario: `gateway run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))
+            .map_err(|error: DocumentError| error.or_mistaken(text, KEYS, &[], what))
     }
 
     /// Nobody touches the skin, nothing breaks, and the skin's controller moves the robot from zero.

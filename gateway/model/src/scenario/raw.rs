@@ -2,11 +2,15 @@
 
 use serde::Deserialize;
 
+use super::check::LONGEST_S;
+use super::{IDLE, Profile};
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Scenario {
+    #[serde(default = "one")]
     pub(super) version: i64,
-    pub(super) duration_s: f64,
+    pub(super) duration_s: Option<f64>,
     #[serde(default = "one")]
     pub(super) seed: i64,
     #[serde(default)]
@@ -23,8 +27,25 @@ const fn one() -> i64 {
     1
 }
 
+fn step() -> String {
+    Profile::Step.name().to_owned()
+}
+
+impl Scenario {
+    /// What is said of the duration, or else [`IDLE`], or a second after the last thing that begins or ends if that is
+    /// later.
+    pub(super) fn duration_s(&self) -> f64 {
+        let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
+        let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s));
+        let faults = self.fault.iter().map(|fault| end(fault.at_s, fault.for_s));
+        let ends = touches.chain(faults).chain(self.mode.iter().map(|mode| mode.at_s));
+        let last = || ends.fold(0.0, f64::max) + 1.0;
+        self.duration_s.unwrap_or_else(|| last().clamp(IDLE.seconds(), LONGEST_S))
+    }
+}
+
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub(super) struct Motion {
     pub(super) kind: String,
     pub(super) start_rad: Option<Vec<f64>>,
@@ -48,13 +69,15 @@ pub(super) struct Mode {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Touch {
+    #[serde(default)]
     pub(super) at_s: f64,
-    pub(super) for_s: f64,
+    pub(super) for_s: Option<f64>,
     pub(super) bus: Option<String>,
     pub(super) cells: Option<Vec<i64>>,
     #[serde(default)]
     pub(super) all: bool,
     pub(super) force_n: f64,
+    #[serde(default = "step")]
     pub(super) profile: String,
     #[serde(default)]
     pub(super) proximity: f64,

@@ -62,9 +62,17 @@ fn good() -> Scenario {
     Scenario::parse("scenario.toml", GOOD, &three()).unwrap()
 }
 
+/// What is wrong, by its line; columns have a test of their own.
+fn by_line(error: DocumentError) -> String {
+    match error {
+        DocumentError::Wrong { path, line, what, .. } => format!("{path}:{line}: {what}"),
+        other => other.to_string(),
+    }
+}
+
 fn says(from: &str, to: &str) -> String {
     assert!(GOOD.contains(from), "{from}");
-    Scenario::parse("s.toml", &GOOD.replacen(from, to, 1), &three()).unwrap_err().to_string()
+    by_line(Scenario::parse("s.toml", &GOOD.replacen(from, to, 1), &three()).unwrap_err())
 }
 
 #[test]
@@ -89,6 +97,29 @@ fn little_needs_to_be_said() {
     let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &skin()).unwrap();
     assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
     assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
+    let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
+    assert_eq!(parse(""), Scenario::idle(IDLE));
+    // The shortest that does something: a constant force on one cell, until the end.
+    let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
+    let touch = &short.touches[0];
+    assert_eq!((short.duration, touch.at, touch.length), (IDLE, Micros(0), Span(u64::MAX)));
+    assert_eq!((touch.profile, touch.cells.as_slice()), (Profile::Step, [0].as_slice()));
+    let pressed = Touches::new(&short, &skin()).sensors(0, 1_000_000);
+    assert_eq!(pressed.contact, contact_words(3.0), "also when the run is longer");
+    let later = "[[touch]]\nat_s = 12.5\nfor_s = 1.0\nall = true\nforce_n = 3.0\nprofile = \"ramp\"\n";
+    assert_eq!(parse(later).duration, Span(14_500_000), "a second after the last touch");
+    let fault = "[[fault]]\nat_s = 20.0\nkind = \"kill\"\ncells = [1]\n";
+    assert_eq!(parse(&format!("{later}{fault}")).duration, Span(21_000_000));
+    assert_eq!(parse("[motion]\n").motion.kind, MotionKind::Kinesthetic);
+}
+
+#[test]
+fn what_comes_and_goes_needs_a_length_and_a_skin_is_no_scenario() {
+    let said = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap_err().to_string();
+    let endless = "[[touch]]\nall = true\nforce_n = 3.0\nprofile = \"half-sine\"\n";
+    assert_eq!(said(endless), "s.toml:1:1: touch[0].for_s: needed with profile = \"half-sine\"");
+    let taken = "this is a skin, not a scenario: `gateway run SKIN --scenario SCENARIO` takes both";
+    assert_eq!(said(SKIN), format!("s.toml: {taken}"));
 }
 
 #[test]
@@ -190,12 +221,12 @@ fn with_several_buses_the_bus_must_be_named() {
     let skin = Skin::parse("skin.toml", &more).unwrap();
     let text = "version = 1\nduration_s = 1.0\n[[fault]]\nat_s = 0.5\nkind = \"kill\"\ncells = [1]\n";
     assert_eq!(
-        Scenario::parse("s.toml", text, &skin).unwrap_err().to_string(),
+        by_line(Scenario::parse("s.toml", text, &skin).unwrap_err()),
         "s.toml:3: fault[0].bus: which bus? there is \"vcan0\", \"vcan1\""
     );
     let text = format!("{text}bus = \"vcan1\"\n");
     assert_eq!(
-        Scenario::parse("s.toml", &text, &skin).unwrap_err().to_string(),
+        by_line(Scenario::parse("s.toml", &text, &skin).unwrap_err()),
         "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has this node"
     );
 }
@@ -331,9 +362,7 @@ fn a_wire_is_link_down_between_two_cells_that_it_leads_between_and_repaired_in_t
     let sums = described("reply = \"sum\"\nslot_us = 1500", line);
     let fault = |skin: &Skin, text: &str| {
         let text = format!("version = 1\nduration_s = 9.0\n[[fault]]\nat_s = 0.5\n{text}\n");
-        Scenario::parse("s.toml", &text, skin)
-            .map(|scenario| scenario.faults)
-            .map_err(|error| error.to_string())
+        Scenario::parse("s.toml", &text, skin).map(|scenario| scenario.faults).map_err(by_line)
     };
     let wire = |at, link_down, from, to, both_ways| Fault {
         at: Micros(at),

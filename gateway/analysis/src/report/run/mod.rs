@@ -108,9 +108,17 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
     Ok(Report { page, missing, name: run.name })
 }
 
-/// Reads it all; also why it has no proper end, if it has none.
-fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
-    let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
+/// Sees that these are recordings, without reading them.
+///
+/// # Errors
+/// When they are not, or cannot be opened.
+pub fn check(paths: &[PathBuf]) -> Result<(), ReportError> {
+    open(paths).map(drop)
+}
+
+/// Opens a recording; also how long its files are, if that is known.
+fn open(paths: &[PathBuf]) -> Result<(Reader, Option<u64>), ReportError> {
+    let items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
@@ -123,6 +131,13 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), R
             ReportError::Log { name }
         });
     }
+    Ok((items, bytes))
+}
+
+/// Reads it all; also why it has no proper end, if it has none.
+fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
+    let (mut items, bytes) = open(paths)?;
+    let name = items.name().to_owned();
     // What stands before the first message is known when it is open.
     let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
     let damaged = loop {

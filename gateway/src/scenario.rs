@@ -1,0 +1,280 @@
+//! `gateway scenario check`.
+
+use std::path::PathBuf;
+
+use bench::run::RunError;
+use bench::run::launch::groups;
+use clap::{Args, Subcommand};
+use model::scenario::{
+    BusFault, FaultKind, Mode, MotionKind, ProcessAction, Scenario as Description, SensorFault,
+};
+use protocol::skin::Skin;
+use protocol::time::{Micros, Span};
+use protocol::usage::{Failure, print};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+
+use super::print::{count, decimals, json as pretty, list, or, table, words};
+
+/// Check the descriptions of runs
+#[derive(Args, Debug)]
+pub(crate) struct Scenario {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Check(Check),
+}
+
+/// Check a scenario's description for a skin, and say what it will do
+///
+/// Lists in the order of time who is touched with what force, what breaks, and what the gateway computes. Exit code 2,
+/// and one line with the line and column, the key, the value and what is allowed, when something is wrong.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway scenario check gateway/examples/demo.toml --skin gateway/examples/ur5-253.toml
+  gateway scenario check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'")]
+struct Check {
+    /// The scenario's description
+    file: PathBuf,
+    /// The description of the skin that it is for
+    #[arg(long, value_name = "FILE")]
+    skin: PathBuf,
+    /// One JSON object; numbers have the names of the file's keys
+    #[arg(long)]
+    json: bool,
+}
+
+impl Scenario {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let Command::Check(command) = self.command;
+        command.run()
+    }
+}
+
+impl Check {
+    fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
+        let scenario = Description::read(&self.file, &skin).map_err(Failure::usage)?;
+        let plan = Plan::of(&scenario, &skin);
+        print(&if self.json { pretty(&plan)? } else { plan.text(&self.file.display().to_string()) })?;
+        if scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
+            return Err(Failure::usage(RunError::BusFault));
+        }
+        Ok(())
+    }
+}
+
+/// What a scenario does.
+#[derive(Serialize)]
+struct Plan {
+    skin: String,
+    duration_s: f64,
+    seed: u64,
+    motion: Motion,
+    events: Vec<Event>,
+}
+
+#[derive(Serialize)]
+struct Motion {
+    kind: &'static str,
+    start_rad: Vec<f64>,
+    #[serde(flatten)]
+    how: Map<String, Value>,
+}
+
+#[derive(Serialize)]
+struct Event {
+    at_s: f64,
+    /// Null of what is done in a moment, and of what stays.
+    for_s: Option<f64>,
+    what: &'static str,
+    bus: Option<String>,
+    /// The node ids; none of a whole bus.
+    cells: Vec<u8>,
+    #[serde(flatten)]
+    how: Map<String, Value>,
+}
+
+impl Plan {
+    fn of(scenario: &Description, skin: &Skin) -> Self {
+        let joints = skin.robot.joints.len();
+        let each = |values: &[f64]| values.iter().take(joints).copied().collect::<Vec<_>>();
+        let (kind, how) = match scenario.motion.kind {
+            MotionKind::Hold => ("hold", Map::new()),
+            MotionKind::Kinesthetic => ("kinesthetic", Map::new()),
+            MotionKind::Sine { amplitude_rad, period_s } => {
+                let amplitude_rad = each(&amplitude_rad);
+                ("sine", map([("amplitude_rad", json!(amplitude_rad)), ("period_s", json!(period_s))]))
+            }
+        };
+        let mut events = Vec::new();
+        for change in &scenario.modes {
+            let what = match change.mode {
+                Mode::Compare => "compare",
+                Mode::Distributed => "distributed",
+            };
+            events.push(Event {
+                at_s: seconds(change.at),
+                for_s: None,
+                what,
+                bus: None,
+                cells: vec![],
+                how: Map::new(),
+            });
+        }
+        for touch in &scenario.touches {
+            let mut how = map([("force_n", json!(touch.force_n)), ("profile", json!(touch.profile.name()))]);
+            let proximity = touch.proximity.to_f64();
+            if proximity > 0.0 {
+                how.extend(map([("proximity", json!((proximity * 1e4).round() / 1e4))]));
+            }
+            let temperature =
+                touch.temperature.map(|both| both.map(|one| (one.to_f64() * 1e2).round() / 1e2));
+            how.extend(temperature.map(|both| ("temperature_c".to_owned(), json!(both))));
+            events.extend(on_cells(skin, touch.at, length(touch.length), "touch", &touch.cells, &how));
+        }
+        for fault in &scenario.faults {
+            events.extend(broken(skin, fault.at, &fault.kind));
+        }
+        events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
+        let motion = Motion { kind, start_rad: each(&scenario.motion.start_rad), how };
+        let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
+        Self { skin: skin.name.clone(), duration_s, seed, motion, events }
+    }
+
+    fn text(&self, file: &str) -> String {
+        let Self { skin, duration_s, seed, motion, events } = self;
+        let moves = match motion.kind {
+            "hold" => "the robot stays at",
+            "sine" => "every joint swings about",
+            _ => "the skin's controller moves the robot from",
+        };
+        let how =
+            if motion.how.is_empty() { String::new() } else { format!(" ({})", described(&motion.how)) };
+        let start = words(&motion.start_rad);
+        let head = format!(
+            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start} rad{how}\n",
+            count(events.len(), "event")
+        );
+        if events.is_empty() {
+            return head + "nobody touches the skin, and nothing breaks\n";
+        }
+        let rows = events.iter().map(Event::row);
+        head + &format!(
+            "{}\n",
+            table(["at s", "for s", "what", "bus", "cells", "how"], rows, |column| column < 2)
+        )
+    }
+}
+
+impl Event {
+    fn row(&self) -> Vec<String> {
+        let mut nodes = self.cells.clone();
+        nodes.sort_unstable();
+        let runs = groups(&nodes, nodes.len()).into_iter().map(|(first, last)| match first == last {
+            true => first.to_string(),
+            false => format!("{first}-{last}"),
+        });
+        vec![
+            decimals(Some(self.at_s), 3, ""),
+            decimals(self.for_s, 3, ""),
+            self.what.to_owned(),
+            or(self.bus.as_ref(), ""),
+            words(runs),
+            described(&self.how),
+        ]
+    }
+}
+
+/// What is done to cells, one event for each bus on which there are some.
+fn on_cells(
+    skin: &Skin,
+    at: Micros,
+    for_s: Option<f64>,
+    what: &'static str,
+    cells: &[usize],
+    how: &Map<String, Value>,
+) -> Vec<Event> {
+    let of_bus = |(index, bus): (usize, &protocol::skin::Bus)| {
+        let cells = cells.iter().filter_map(|&cell| skin.cells.get(cell)).filter(|cell| cell.bus == index);
+        let cells: Vec<u8> = cells.map(|cell| cell.node.get()).collect();
+        let bus = Some(bus.name.clone());
+        (!cells.is_empty()).then(|| Event { at_s: seconds(at), for_s, what, bus, cells, how: how.clone() })
+    };
+    skin.buses.iter().enumerate().filter_map(of_bus).collect()
+}
+
+/// What a fault does.
+fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
+    match kind {
+        FaultKind::Process { action, cells } => {
+            let what = match action {
+                ProcessAction::Kill => "kill",
+                ProcessAction::Stop => "stop",
+                ProcessAction::Continue => "continue",
+                ProcessAction::Restart => "restart",
+            };
+            on_cells(skin, at, None, what, cells, &Map::new())
+        }
+        FaultKind::Sensor { fault, length: span, cells } => {
+            let (what, how) = match fault {
+                SensorFault::Stuck => ("stuck", Map::new()),
+                SensorFault::Drift { n_per_s } => ("drift", map([("n_per_s", json!(n_per_s))])),
+            };
+            on_cells(skin, at, length(*span), what, cells, &how)
+        }
+        FaultKind::Wire { link_down, from, to, both_ways } => {
+            let what = if *link_down { "link_down" } else { "link_up" };
+            on_cells(skin, at, None, what, &[*from, *to], &map([("one_way", json!(!both_ways))]))
+        }
+        FaultKind::Bus { fault, length: span, bus, cells } => {
+            let (what, how) = bus_fault(fault);
+            let nodes = cells.iter().filter_map(|&cell| skin.cells.get(cell));
+            let cells = nodes.map(|cell| cell.node.get()).collect();
+            let bus = skin.buses.get(*bus).map(|bus| bus.name.clone());
+            vec![Event { at_s: seconds(at), for_s: length(*span), what, bus, cells, how }]
+        }
+    }
+}
+
+fn bus_fault(fault: &BusFault) -> (&'static str, Map<String, Value>) {
+    let hit = |probability: f64| map([("probability", json!(probability))]);
+    match *fault {
+        BusFault::Drop { probability } => ("drop", hit(probability)),
+        BusFault::Delay { probability, delay } => {
+            ("delay", map([("probability", json!(probability)), ("delay_us", json!(delay.0))]))
+        }
+        BusFault::Duplicate { probability } => ("duplicate", hit(probability)),
+        BusFault::Corrupt { probability } => ("corrupt", hit(probability)),
+        BusFault::Reorder { probability } => ("reorder", hit(probability)),
+        BusFault::Babble { frames_per_s, id } => {
+            ("babble", map([("frames_per_s", json!(frames_per_s)), ("id", json!(id))]))
+        }
+    }
+}
+
+/// The file's keys and their values in words.
+fn described(how: &Map<String, Value>) -> String {
+    let value = |value: &Value| match value {
+        Value::String(text) => text.clone(),
+        Value::Array(values) => words(values),
+        other => other.to_string(),
+    };
+    list(how.iter().map(|(key, it)| format!("{key} {}", value(it))))
+}
+
+fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {
+    pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+/// How long something lasts that ends.
+fn length(span: Span) -> Option<f64> {
+    (span != Span(u64::MAX)).then(|| span.seconds())
+}
+
+fn seconds(at: Micros) -> f64 {
+    Span(at.0).seconds()
+}
