@@ -56,7 +56,7 @@ pub fn touch() -> SkinSensors {
 }
 
 /// What each cell of a skin feels when the first `active` of them in the order of `spread` are touched.
-fn reference_torque(cells: usize, active: usize) -> Vec<SkinSensors> {
+fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
     (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
 }
 
@@ -76,7 +76,7 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
         // Some torque: what it is costs the same.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
     }
-    Snapshot { sums: table.snapshot().sums, reference_torque: reference_torque(cells.len(), active) }
+    Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
 }
 
 /// Holds the arm, and computes all that the kinesthetic controller computes: a robot that moved to its limits would make

@@ -98,7 +98,7 @@ fn filters_pick_by_kind_node_and_time() {
     assert_eq!(dump("--from 0.002 --to 0.005"), dump("")[2..5]);
     let classic = output(gateway(&format!("dump {} --from 0.0005 --max 2", golden("classic.log"))));
     let pair =
-        ["half    joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
+        ["segment joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
     assert_eq!(decoded(&classic), pair);
     let only_fd = output(gateway(&format!("dump {} --format fd --max 1", golden("classic.log"))));
     assert_eq!(decoded(&only_fd), ["foreign no packet: 8 data bytes, not 16"]);
@@ -245,7 +245,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("dump / ", "/ is a directory: name a candump log or a bus"),
         (
             "skin generate --cells 255",
-            "255 cells do not fit on one bus: a bus has numbers for 254; say --buses 2",
+            "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2",
         ),
         ("skin check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
         ("xyzzy", "unrecognized subcommand 'xyzzy'; try '--help'"),
