@@ -1,5 +1,5 @@
-//! `protocol/vectors.json`, for people who write cells elsewhere: frames and what they say, frames that are refused, a
-//! cell's life in frames, and rows of configuration, joints, what is felt, and torque.
+//! `protocol/vectors.json`, for people who write cells elsewhere: frames and their meaning, frames that are refused, a
+//! session in frames, and rows of configuration, joints, sensors, and torque.
 //!
 //! The frames are those of `protocol/tests/golden`, which another program wrote from the document. The torques are the
 //! cell's own, compared here with Eq. 8 in double precision. With `SKINBUS_TAKE_OVER=yes` this test writes the file
@@ -71,7 +71,7 @@ fn torques() -> Vec<Value> {
             "pose": case.parameters.words(Parameter::Pose),
             "contact": case.parameters.words(Parameter::Contact),
             "q": case.q.map(|word| word.to_bits()),
-            "felt": case.contact_state(),
+            "sensors": case.sensors(),
             "jacobian": jacobian.map(|word| word.to_bits()),
             "torque": torque.map(|word| word.to_bits()),
         })
@@ -109,7 +109,7 @@ fn the_vectors_are_what_the_code_says() {
         std::fs::write(PATH, &file).unwrap();
     }
     let _: Value = serde_json::from_str(&file).unwrap();
-    assert!(std::fs::read_to_string(PATH).unwrap() == file, "SKINBUS_TAKE_OVER=yes writes the vectors anew");
+    assert!(std::fs::read_to_string(PATH).unwrap() == file, "SKINBUS_TAKE_OVER=yes writes the vectors again");
 }
 
 #[test]
