@@ -95,7 +95,7 @@ impl Decoded {
     pub const fn verdict(&self) -> &'static str {
         match self {
             Self::Message(_) | Self::Wire(..) => "ok",
-            Self::Segment { .. } => "half",
+            Self::Segment { .. } => "segment",
             Self::Foreign(_) => "foreign",
             Self::Damaged { fault, .. } => fault.name(),
             Self::Meaningless { .. } => "meaning",
