@@ -129,10 +129,14 @@ fn unknown_causes_are_named_and_not_guessed() {
     assert!(cell(zero).force.is_none() && cell(zero).rows.iter().all(|row| row.verdict == Verdict::Open));
     assert!(matches!(cell(one).force.unwrap().origin, Origin::Stimulus { from_epoch: None, .. }));
     let said = explanation.missing.join("\n");
-    let unknown =
-        format!("vcan0 {zero}: what it felt is not in the capture: no stimulus, start or sensors page of it");
+    let unknown = format!(
+        "vcan0 {zero}: its contact state is not in the capture: no stimulus, start or sensors page of it"
+    );
     assert!(said.contains(&unknown), "{said}");
-    assert!(said.contains("vcan0: 2 cells said nothing, and what they felt is not in the capture"), "{said}");
+    assert!(
+        said.contains("vcan0: 2 cells sent nothing, and their contact state is not in the capture"),
+        "{said}"
+    );
 
     // Without the torque, the sum is without it.
     let node = u32::from(one);
@@ -164,7 +168,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     // Its stimulus was sent again, and it answers nothing during its address claim.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch in time: it had just started and claimed its number; the words are without it",
+        "vcan0 {}: no torque of this epoch in time: it had just started and was claiming its node id; the words are without it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

