@@ -47,7 +47,7 @@ impl Case {
         }
     }
 
-    fn reference_torque(self) -> SkinSensors {
+    fn sensors(self) -> SkinSensors {
         match self {
             Self::CentralNoneActive => SkinSensors::default(),
             Self::Distributed | Self::CentralAllActive => SkinSensors {
@@ -95,8 +95,8 @@ impl Bench {
     fn new(skin: &Skin, case: Case) -> Self {
         let (mut lines, mut buses) = (Vec::new(), Vec::new());
         for (index, bus) in skin.buses.iter().enumerate() {
-            let reference_torque = skin.cells_of(index).map(|_| case.reference_torque()).collect::<Vec<_>>();
-            let snapshot = Snapshot { sums: Sums::default(), reference_torque };
+            let sensors = skin.cells_of(index).map(|_| case.sensors()).collect::<Vec<_>>();
+            let snapshot = Snapshot { sums: Sums::default(), sensors };
             let (snapshots, snapshot) = triple_buffer::triple_buffer(&snapshot);
             let (producer, positions) = rtrb::RingBuffer::new(64);
             lines.push(Line { format: bus.format, snapshot, positions: producer, state: Arc::default() });
@@ -118,7 +118,7 @@ impl Bench {
         for Receiver { snapshots, .. } in &mut self.buses {
             let next = snapshots.input_buffer_mut();
             next.sums.read_back = last;
-            next.sums.contributing = u32::try_from(next.reference_torque.len()).unwrap_or(u32::MAX);
+            next.sums.contributing = u32::try_from(next.sensors.len()).unwrap_or(u32::MAX);
             next.sums.torque = [0.01, -0.02, 0.03, 0.01, -0.01, 0.0];
             snapshots.publish();
         }

@@ -24,7 +24,7 @@ pub(crate) struct Ack {
     /// A bus, or a skin's description
     #[arg(value_name = "BUS|SKIN")]
     whom: PathBuf,
-    /// What a packet travels in on the bus; a skin says it itself
+    /// The frame format of packets on the bus; for a skin its own
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
     #[command(flatten)]
@@ -42,7 +42,7 @@ impl Ack {
             vec![(name.clone(), self.format)]
         };
         let kinds = self.kinds.of(target.iter().map(|(bus, _)| bus.as_str()))?;
-        // All are opened before anybody is told.
+        // All are opened before anything is sent.
         let mut buses = Vec::new();
         for (bus, format) in &target {
             buses.push(open(bus, kinds.of(bus), *format).map_err(|error| match is_skin {
@@ -59,7 +59,7 @@ pub(crate) fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusE
     listen::open(name, kind, Some(format), Options { filters: Vec::new(), ..Options::default() })
 }
 
-/// Sends one packet, and says on which kind of bus.
+/// Sends one packet, and prints on which kind of bus.
 pub(crate) fn send(bus: &Bus, message: &Message, format: Format) -> Result<(), Failure> {
     listen::send(bus, message, format).map_err(Failure::run)?;
     output::note(format_args!("sent on {} ({})", bus.name(), bus.kind()));

@@ -12,7 +12,7 @@ use protocol::usage::Failure;
 /// A word that may be given, what it means where that is not plain, and its value.
 pub(crate) type Word<T> = (&'static str, &'static str, T);
 
-/// What a packet travels in.
+/// The frame format of a packet.
 pub(crate) const FORMATS: &[Word<Format>] =
     &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two classic frames", Format::Classic)];
 

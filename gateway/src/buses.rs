@@ -1,4 +1,4 @@
-//! A directory of embedded buses that nobody else's bench meets.
+//! A private directory for embedded buses.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;

@@ -17,17 +17,17 @@ use super::arguments::{BusKind, bus_of, seconds};
 use super::input;
 use super::print::{json, json_line};
 
-/// How long is listened, unless it is told.
+/// How long it listens by default.
 const LISTEN_S: f64 = 1.0;
-/// How often it is drawn anew.
+/// Time between two drawings.
 const DRAW: Duration = Duration::from_millis(500);
 
-/// List the cells on a bus: what each says of itself
+/// List the cells on a bus: what each reports of itself
 ///
 /// Asks all cells for their counters and their place in the network, and listens for a second. What a cell has not
-/// said is `-`; a column in which nobody has said anything is left out, and so are the counters where a terminal is
-/// too narrow. Ports: the number of the cell at the other end, `?` after it when that one hears nothing from here,
-/// `!` when it speaks another version, `.` where nothing is heard.
+/// reported is `-`; empty columns are left out, and so are the counters where a terminal is too narrow. Ports: the
+/// node id of the neighbour, `?` after it when that one receives nothing from here, `!` when it has another protocol
+/// version, `.` where nothing is received.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway cells vcan0
@@ -39,13 +39,13 @@ pub(crate) struct Cells {
     /// Compare with this description: which cells have its configuration, and which are missing
     #[arg(long, value_name = "FILE")]
     skin: Option<PathBuf>,
-    /// Go on, and draw it anew, until Ctrl-C
+    /// Update the list until Ctrl-C
     #[arg(long)]
     watch: bool,
     /// One JSON object; with --watch, one a line
     #[arg(long)]
     json: bool,
-    /// Listen for so many seconds; 1 unless told, without end with --watch
+    /// Listen for so many seconds [default: 1; without end with --watch]
     #[arg(long = "for", value_name = "S", value_parser = seconds, allow_negative_numbers = true)]
     seconds: Option<f64>,
     #[command(flatten)]
@@ -86,16 +86,16 @@ impl Cells {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
             let others = match watch.others() {
                 0 => String::new(),
-                others => format!(" ({others} frames are none of a cell; `gateway dump` shows them)"),
+                others => format!(" ({others} frames are of no cell; `gateway dump` shows them)"),
             };
             return Err(Failure::run(format!(
-                "no cell was heard on {name} for {seconds:.1} s{others}: start them, or switch them on"
+                "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"
             )));
         }
         print(&show(&watch)?)
     }
 
-    /// What the description says of this bus.
+    /// This bus in the description.
     fn known(&self) -> Result<Option<Known>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
         let skin = Skin::read(path).map_err(Failure::usage)?;

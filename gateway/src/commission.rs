@@ -20,19 +20,19 @@ use super::output::Force;
 use super::print::{list, some};
 use super::{input, output};
 
-/// Write what a skin's description says into its cells, and read it back
+/// Write a skin's description into its cells, and read it back
 ///
 /// Finds every cell by its serial number, writes the robot's table, pose, gains and thresholds into its flash,
 /// reads all of it back and compares. A cell takes its new parameters as a whole, so this may be interrupted at any
 /// moment, and be run again: cells that have the right configuration are left as they are. Cells that the
-/// description does not have are named and left alone. Exit code 0: all cells have the skin's configuration; 1: some
-/// have not, and the table says why; 2: wrong use or configuration.
+/// description does not have are listed and left alone. Exit code 0: all cells have the skin's configuration; 1: some
+/// have not, and the table gives the reason; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway commission skin.toml
   gateway commission skin.toml --dry-run
   gateway commission skin.toml --verify --json | jq '.buses[0].failed'
-  gateway commission skin.toml --numbers as-wired.toml && gateway run as-wired.toml --no-spawn")]
+  gateway commission skin.toml --node-ids as-wired.toml && gateway run as-wired.toml --no-spawn")]
 pub(crate) struct Commission {
     /// The skin's description
     skin: PathBuf,
@@ -41,13 +41,13 @@ pub(crate) struct Commission {
     bus: Option<String>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Write nothing: say which cells are there and which would be written
+    /// Write nothing: list which cells are there and which would be written
     #[arg(long)]
     dry_run: bool,
     /// Read back and compare also the cells that have the right hash already
     #[arg(long)]
     verify: bool,
-    /// Write a copy of the description with the numbers that the cells have on their buses
+    /// Write a copy of the description with the node ids that the cells have on their buses
     #[arg(long, value_name = "FILE")]
     node_ids: Option<PathBuf>,
     #[command(flatten)]
@@ -69,12 +69,12 @@ impl Commission {
             Some(name) => vec![bus_of(&skin, &file, name)?],
             None => (0..skin.buses.len()).collect(),
         };
-        // Before cells are written: nobody wants to hear afterwards that there is nowhere to write their numbers.
-        let begun = self.node_ids.as_ref().map(|path| self.force.create("--numbers", path)).transpose()?;
+        // Before cells are written, so that a file that cannot be written is reported first.
+        let begun = self.node_ids.as_ref().map(|path| self.force.create("--node-ids", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = self.kinds.of(bus_names(&skin))?;
-        // All are opened before anybody is told.
+        // All are opened before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
@@ -82,7 +82,7 @@ impl Commission {
         let done = commission(benches, &skin, wish, &stopped, |far| line.show(|| how_far(far)));
         line.clear();
         let interrupted = stopped.load(Ordering::Relaxed);
-        nobody(&file, &done, interrupted)?;
+        check_begun(&file, &done, interrupted)?;
         let whole = show::Whole {
             skin: &skin.name,
             file: &file,
@@ -96,15 +96,12 @@ impl Commission {
         }
         print(&if self.json { super::print::json(&whole)? } else { whole.table() })?;
         if let Some((file, out)) = begun {
-            let node_ids: NodeIds = done
-                .iter()
-                .flat_map(|done| &done.report.cells)
-                .map(|cell| (cell.serial, cell.number))
-                .collect();
+            let node_ids: NodeIds =
+                done.iter().flat_map(|done| &done.report.cells).map(|it| (it.serial, it.number)).collect();
             let copy = renumbered(&skin, &text, &node_ids);
             let copy =
-                copy.map_err(|error| Failure::run(format!("--numbers {}: {error}", file.path().display())))?;
-            output::finish("--numbers", file, out, &copy)?;
+                copy.map_err(|error| Failure::run(format!("--node-ids {}: {error}", file.path().display())))?;
+            output::finish("--node-ids", file, out, &copy)?;
         }
         whole.end()
     }
@@ -115,14 +112,14 @@ fn how_far(all: &[Progress]) -> String {
     let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
     let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
     let [done, failed] = [sum(|it| it.done), sum(|it| it.failed)];
-    // The one that is least far says what is being done.
+    // The bus that is behind the others determines what is being done.
     let doing = all.iter().filter(|it| it.doing != "done").map(|it| it.doing).next().unwrap_or("done");
     let failed = if failed == 0 { String::new() } else { format!(", {failed} failed") };
     format!("{doing}: {found} of {cells} cells found, {done} done{failed}")
 }
 
-/// Where nothing was begun, one line says why.
-fn nobody(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
+/// An error where nothing was begun: one line with the reason.
+fn check_begun(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
     let begun = done.iter().any(|done| {
         let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));
         done.report.requests > 0 || done.report.cells.iter().any(|cell| is_well(cell.outcome))
@@ -136,7 +133,7 @@ fn nobody(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
     if interrupted {
         return Err(Failure::run("interrupted; nothing was written yet"));
     }
-    let found = done.iter().flat_map(|done| &done.report.cells).any(|cell| cell.number.is_some());
+    let found = done.iter().flat_map(|done| &done.report.cells).any(|it| it.number.is_some());
     if found {
         return Ok(());
     }

@@ -21,17 +21,17 @@ use super::input::{captures, no_frame, place};
 use super::output::{Force, apart, note, refused};
 use super::print::list;
 
-/// Lines that cannot be read and are named; further ones are counted.
+/// Lines that cannot be read and are reported; further ones are counted.
 const NAMED: u64 = 100;
 /// Bytes that are written at once.
 const PIECE: usize = 1 << 18;
 
 /// Convert a capture: a candump log to an MCAP recording, or back
 ///
-/// What IN is, is told by its first bytes; OUT by the end of its name: .mcap is a recording, .log or .txt a candump
-/// log, - a log on standard output. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
+/// The format of IN is detected from its first bytes, that of OUT from the end of its name: .mcap is a recording, .log
+/// or .txt a candump log, - a log on standard output. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
 /// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
-/// place for is named. OUT appears when it is whole. Exit code 0: done, 1: it cannot be done, 2: wrong use.
+/// place for is reported. OUT appears when it is complete. Exit code 0: done, 1: it cannot be done, 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway convert run.mcap run.log
@@ -183,7 +183,7 @@ fn size(from: &[PathBuf]) -> Option<u64> {
     from.iter().map(of).sum()
 }
 
-/// What becomes of an error of the output: who read it may have left, as `head` does.
+/// An error of the output; a closed pipe is none: its reader may have ended, as `head` does.
 fn written(to: &Path, error: io::Error) -> Result<(), Failure> {
     if is_standard(to) {
         return protocol::usage::written(Err(error));
@@ -222,7 +222,7 @@ fn others(reader: &Reader) -> String {
     list(topics.chain(attached).chain(facts))
 }
 
-/// What somebody may want to know of a conversion, a line each.
+/// Notes on a conversion, a line each.
 fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
     let mut lines = Vec::new();
     if let Some((times, first)) = done.backwards {
@@ -236,7 +236,7 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
     for (count, what) in [
         (done.unreadable, "begin like a frame and are none: not read"),
         (done.can_xl, "are CAN XL frames: not read"),
-        (done.dropped, "frames are missing: whoever took the capture lost them"),
+        (done.dropped, "frames are missing: the recorder lost them"),
         (done.shortened, shortened),
         (done.omitted, "notes are left out"),
     ] {

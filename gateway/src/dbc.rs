@@ -53,7 +53,7 @@ impl Dbc {
             (None, buses) => {
                 let many = buses.len();
                 return Err(Failure::usage(format!(
-                    "{file} has {many} buses, and a DBC describes one: say --bus and one of {}",
+                    "{file} has {many} buses, and a DBC describes one: add --bus with one of {}",
                     names()
                 )));
             }

@@ -27,13 +27,13 @@ use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame,
 use super::output;
 use super::print::{json, list};
 
-/// Show what is on a bus or in a capture, in words beside the raw frames
+/// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
-/// One line a frame: the frame as `candump -L` prints it, a tab, a verdict, and what the frame says. The verdict is
-/// ok; half, the first frame of two on a classic bus; foreign, no packet of this protocol; length, CRC or incomplete,
-/// damaged: no packet, under an identifier that carries packets; or meaning, a packet that says nothing known. So
-/// `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; what cannot be read of it is named on
-/// standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with
+/// One line a frame: the frame as `candump -L` prints it, a tab, a verdict, and the decoded frame. The verdict is ok;
+/// segment, the first of two frames of a packet on a classic bus; foreign, no packet of this protocol; length, CRC or
+/// incomplete, a damaged packet under an identifier that carries packets; or meaning, a packet of unknown meaning. So
+/// `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; lines that cannot be read are reported
+/// on standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with
 /// --stats there are tables at the end instead.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -52,10 +52,10 @@ pub(crate) struct Dump {
     /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Selector>,
-    /// Only packets from or to these: a cell's number, gateway, everyone
+    /// Only packets from or to these: a node id, gateway, everyone
     #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node)]
     node: Vec<Node>,
-    /// Only what tells of a touch: torques and sums that are not all zero, stimuli and sensors with a contact force
+    /// Only traffic of touches: torques and sums that are not all zero, stimuli and sensors with a contact force
     /// or a proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
@@ -68,7 +68,7 @@ pub(crate) struct Dump {
     /// End after N frames that are shown or counted
     #[arg(long, value_name = "N")]
     max: Option<u64>,
-    /// Without the raw frames: the time since the first frame, the bus, and what the frame says
+    /// Without the raw frames: the time since the first frame, the bus, and the decoded frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// One JSON object a line; with --stats, one in all
@@ -77,25 +77,25 @@ pub(crate) struct Dump {
     /// At the end, instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for each cell and
     /// for each foreign identifier
     ///
-    /// A live bus is counted until --to, --max or Ctrl-C. Frames that the filters leave out are not counted, and
-    /// what needs them (what is missed, what is lost) would be wrong; so only --from, --to and --max go with it.
+    /// A live bus is counted until --to, --max or Ctrl-C. Frames that the filters leave out would not be
+    /// counted, which makes losses and unanswered joints wrong; so only --from, --to and --max go with it.
     #[arg(long, conflicts_with_all = ["kind", "node", "contact"])]
     stats: bool,
     /// End at the first line of a log that cannot be read
     #[arg(long)]
     strict: bool,
-    /// What packets travel in; auto takes each frame for what it is
+    /// The frame format of packets; auto accepts both
     #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
     format: Packets,
     #[command(flatten)]
     on: BusKind,
 }
 
-/// What packets travel in, or nothing that is known before.
+/// The frame format of packets, or none in advance.
 type Packets = Option<Format>;
 
 const ANY_FORMAT: &[Word<Packets>] = &[
-    ("auto", "Each frame as it is", None),
+    ("auto", "Both", None),
     ("fd", "One CAN FD frame", Some(Format::Fd)),
     ("classic", "Two classic frames", Some(Format::Classic)),
 ];
@@ -123,7 +123,7 @@ impl Dump {
             let done = captured(&mut reader, &mut show, self.strict);
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
-            // Signals are caught before it says that it listens.
+            // Signals are caught before it reports that it listens.
             let stopped = stopped()?;
             let mut receive_end =
                 ReceiveEnd::open(&title, self.on.bus_kind, self.format, Options::default())?;
@@ -133,7 +133,7 @@ impl Dump {
         let report = show.report();
         drop(show);
         if let Some(report) = report {
-            // What was counted is shown whatever ended it.
+            // The counts are shown whatever ended it.
             print(&match self.json {
                 true => as_json(&title, what, &report, extras.as_ref())?,
                 false => table::text(&title, what, &report, extras.as_ref()),
@@ -142,7 +142,7 @@ impl Dump {
         done
     }
 
-    /// Whether a capture is meant, and not a bus.
+    /// Whether the argument is a capture, and not a bus.
     fn is_capture(&self) -> Result<bool, Failure> {
         let sources = &self.sources;
         let other = sources.iter().find(|source| !is_file(source));
@@ -228,7 +228,7 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
     Ok(())
 }
 
-/// How often it is looked whether a classic frame waits in vain for its other half.
+/// How often waiting first segments are checked for their timeout.
 const SETTLE: Duration = Duration::from_millis(20);
 
 /// The time, on the clock of received frames.
@@ -237,7 +237,7 @@ fn now() -> Micros {
     Micros(u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
 }
 
-/// Shows a bus until somebody says stop, or it is closed.
+/// Shows a bus until a signal, or until it is closed.
 fn live(
     receive_end: &mut ReceiveEnd,
     show: &mut Show<impl Write>,
@@ -252,7 +252,7 @@ fn live(
         let shown = match receive_end.hear(if show.is_waiting() { SETTLE } else { LOOK }) {
             Ok(false) => show.handle_time(now()),
             Ok(true) => {
-                // When nothing more comes, the end comes all the same.
+                // The end also comes when no more frames do.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
                 receive_end.frames().try_for_each(|received| {
                     if show.has_enough() {
@@ -263,7 +263,7 @@ fn live(
                     show.frame(&Record { time, interface, frame: received.frame, direction: None })
                 })
             }
-            // What was missed until then is said all the same.
+            // Frames lost until then are reported all the same.
             Err(error) => break Err(Failure::run(error)),
         };
         if let Err(error) = shown.and_then(|()| show.flush()) {

@@ -29,11 +29,11 @@ use super::print::{Rows, json};
 use benches::Benches;
 use folder::Folder;
 
-/// Do the paper's experiments, and draw and judge what comes out
+/// Do the paper's experiments, and draw and rate the results
 ///
 /// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
-/// its verdict, and the recordings of the benches, all at once when everything is done; what fails or is ended writes
-/// nothing. A folder in which there is something is taken with --force only. `gateway experiment list` tells what there is.
+/// its verdict, and the recordings of the benches, all at once when everything is done; nothing is written when it fails
+/// or is interrupted. A folder that is not empty needs --force. `gateway experiment list` lists the experiments.
 ///
 /// The moving arm's benches are 253 processes on an embedded bus of their own. All of it takes about two minutes.
 /// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
@@ -46,7 +46,7 @@ pub(crate) struct Experiment {
     /// Experiments, or all, or list
     #[arg(value_name = "NAME", required = true)]
     names: Vec<Word>,
-    /// The folder for what comes out; made where there is none
+    /// The folder for the results; made where there is none
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -76,7 +76,7 @@ impl FromStr for Word {
         match word {
             "all" => Ok(Self::All),
             "list" => Ok(Self::List),
-            _ => word.parse().map(Self::One).map_err(|error| format!("{error}; list tells what each does")),
+            _ => word.parse().map(Self::One).map_err(|error| format!("{error}; list describes each")),
         }
     }
 }
@@ -94,7 +94,7 @@ impl Experiment {
         };
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
-        // Before anything is measured: nobody wants to hear after minutes that there is nowhere to write.
+        // Before anything is measured, so that a folder that cannot be written is reported first.
         let folder = Folder::create(output, self.force)?;
         let page = self.perform(&named, &folder, stop)?;
         write(&page, &folder)?;
@@ -123,7 +123,7 @@ impl Experiment {
     fn page(&self, sections: Vec<Section>, idle: Option<String>) -> Page {
         let words: Vec<String> = std::env::args().collect();
         let words = words.iter().enumerate().map(|(place, word)| {
-            // The folder that the program lies in is nobody's business.
+            // Without the folder of the program.
             let name = Path::new(word).file_name().filter(|_| place == 0);
             quoted(&name.map_or_else(|| word.clone(), |name| name.to_string_lossy().into_owned()))
                 .into_owned()
@@ -143,7 +143,7 @@ impl Experiment {
         Page {
             title: "The paper's experiments".to_owned(),
             intro: "Efficient Distributed Torque Computation for Large Scale Robot Skin, done again on a simulated skin: \
-                    each figure measured anew, each number beside the paper's."
+                    each figure measured again, each number beside the paper's."
                 .to_owned(),
             facts,
             sections,
@@ -173,7 +173,7 @@ impl Lab for Here {
         let run = run?;
         let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
         self.idle.get_or_insert_with(|| {
-            format!("median {:.0}, 99 % {:.0}, greatest {:.0} µs", late("p50"), late("p99"), late("max"))
+            format!("median {:.0}, 99 % {:.0}, max {:.0} µs", late("p50"), late("p99"), late("max"))
         });
         Ok(run)
     }
@@ -237,7 +237,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     let worse = if worse == 0 {
         String::new()
     } else {
-        format!("worse than the paper's or than their bar: {worse}\n")
+        format!("worse than the paper's or than required: {worse}\n")
     };
     print(&format!("{}{worse}{}\n", rows.text(), report.display()))
 }

@@ -17,11 +17,11 @@ use super::arguments::{bus_names, nanos};
 use super::output;
 use super::print::{json, list};
 
-/// Say why the torque of one epoch is what it is
+/// Explain the torque of one epoch
 ///
-/// Reads a capture up to the joints of that epoch and shows what each cell felt then, the force that it makes of it,
-/// the Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent;
-/// and what all of them add up to, beside the central computation. What the capture does not tell is named.
+/// Reads a capture up to the joints of that epoch and shows each cell's contact state, the force that it computes from
+/// it, the Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent;
+/// and what all of them add up to, beside the central computation. What the capture does not contain is listed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
@@ -41,7 +41,7 @@ pub(crate) struct Explain {
     /// Which joints of this epoch, when there are several
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
-    /// One cell in every step: its number, or BUS:NUMBER
+    /// One cell in every step: its node id, or BUS:NODE
     #[arg(long, value_name = "CELL", value_parser = cell)]
     cell: Option<Named>,
     /// One joint, cell by cell
@@ -55,7 +55,7 @@ pub(crate) struct Explain {
     json: bool,
 }
 
-/// A cell as it is named: on a bus, or on whichever has it.
+/// A cell as given: on a bus, or on the only bus that has it.
 #[derive(Clone, Debug)]
 struct Named {
     bus: Option<String>,
@@ -69,7 +69,7 @@ fn cell(text: &str) -> Result<Named, String> {
     };
     match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
         Some(node) => Ok(Named { bus, node }),
-        None => Err(format!("{number:?} is no cell: a number, 1 to 254, is")),
+        None => Err(format!("{number:?} is no node id: 1 to 254 are")),
     }
 }
 
@@ -94,7 +94,7 @@ impl Explain {
         let requested = Requested { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
         let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
-            (found.dropped, "frames are missing before this point; what was felt may be older"),
+            (found.dropped, "frames are missing before this point; contact states may be out of date"),
             (found.unreadable, "lines before this point could not be read"),
         ] {
             if count > 0 {
@@ -157,7 +157,7 @@ impl Explain {
             ))),
             buses => {
                 let choices = list(buses.iter().map(|bus| format!("{}:{node}", bus.name)));
-                Err(Failure::usage(format!("--cell {node} is on several buses: say one of {choices}")))
+                Err(Failure::usage(format!("--cell {node} is on several buses: choose one of {choices}")))
             }
         }
     }
@@ -166,13 +166,13 @@ impl Explain {
 /// The skin that a recording has with it.
 fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| file.as_os_str() == "-") {
-        return Err(Failure::usage("standard input is read once: say which skin with --skin"));
+        return Err(Failure::usage("standard input is read once: name the skin with --skin"));
     }
     if let Some(pipe) =
         files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
     {
         return Err(Failure::usage(format!(
-            "{} is no regular file and is read once: say which skin with --skin",
+            "{} is no regular file and is read once: name the skin with --skin",
             pipe.display()
         )));
     }
@@ -185,6 +185,6 @@ fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
     let name = reader.name();
     match reader.extras().skin() {
         Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
-        None => Err(Failure::usage(format!("{name} has no skin in it: say which with --skin"))),
+        None => Err(Failure::usage(format!("{name} has no skin in it: name one with --skin"))),
     }
 }

@@ -14,11 +14,12 @@ use protocol::wire_time::{BitRates, bit_rate};
 use super::arguments::{FORMATS, one_of};
 use super::print::json;
 
-/// Say whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
+/// Compute whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
 ///
-/// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as free
-/// of errors. Heartbeats count; commands and what only a bench sends do not. What a run asked for says `gateway shadow`. Without rates: those of the description where it has
-/// them for every bus, else a table over common ones. docs/reference/bus-timing.md says how it is computed.
+/// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as
+/// free of errors. Heartbeats count; commands and what only a bench sends do not. For the load of a run see `gateway
+/// shadow`. Default rates: those of the description where it has them for every bus, else a table over common ones.
+/// docs/reference/bus-timing.md describes the computation.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway fit gateway/examples/ur5-253.toml
@@ -34,10 +35,10 @@ pub(crate) struct Fit {
     /// Bits in a second of the data of CAN FD frames
     #[arg(long, value_name = "RATE", value_parser = bit_rate, requires = "nominal")]
     data: Option<u32>,
-    /// A table over common bit rates, whatever the description says
+    /// A table over common bit rates, whatever the description has
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
-    /// What packets travel in on all buses, whatever the description says
+    /// The frame format of packets on all buses, whatever the description has
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
     /// The longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
@@ -78,7 +79,7 @@ impl Fit {
         };
         if self.data.is_some() && !formats.contains(&Format::Fd) {
             return Err(Failure::usage(
-                "--data is for CAN FD, and here all buses are classic: leave it out, or say --format fd",
+                "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
             ));
         }
         let rates = |format| match (format, self.data) {
@@ -87,7 +88,7 @@ impl Fit {
             (Format::Fd, None) => {
                 BitRates::classic(nominal).map_err(Failure::usage)?;
                 Err(Failure::usage(format!(
-                    "CAN FD needs a data bit rate: say --data, {nominal} to {}, or --format classic",
+                    "CAN FD needs a data bit rate: add --data, {nominal} to {}, or --format classic",
                     BitRates::MAX_DATA
                 )))
             }
@@ -96,7 +97,7 @@ impl Fit {
     }
 }
 
-/// What a bus' description says.
+/// The rates of a bus in its description.
 fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;

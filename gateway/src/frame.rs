@@ -39,7 +39,7 @@ const ANSWER: Duration = Duration::from_secs(1);
 pub(crate) struct Frame {
     #[command(subcommand)]
     what: What,
-    /// What the packet travels in
+    /// The frame format of the packet
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd", global = true)]
     format: Format,
     /// Send it on this bus instead of printing it
@@ -75,7 +75,7 @@ enum What {
   gateway frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
   gateway frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
 struct Positions {
-    /// The number of this broadcast, 0 to 255; cells drop the one that they have just had
+    /// The number of this broadcast, 0 to 255; cells drop a repetition of the last one
     #[arg(long, value_name = "E")]
     epoch: u8,
     #[command(flatten)]
@@ -93,17 +93,17 @@ struct Angles {
     words: Option<Vec<String>>,
 }
 
-/// What a cell in test mode shall feel
+/// A stimulus: the contact state of a cell in test mode
 ///
-/// Puts nothing into test mode: `gateway frame configure --node N --write mode 1` does. A stimulus takes
-/// effect when joints come, and holds until another one replaces it; without --force nothing touches.
+/// The cell must be in test mode: `gateway frame configure --node N --write mode 1`. A stimulus takes effect with
+/// the next joints, and holds until another one replaces it; without --force the force is 0.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway frame stimulus --node 12 --force 3.0
   gateway frame stimulus --node everyone --epoch 7 --force 0.5 --proximity 0.9
   gateway frame stimulus --node 12 --acceleration 0 0 1")]
 struct Stimulus {
-    /// Who feels it: a cell's number, or everyone
+    /// The cell: a node id, or everyone
     #[arg(long, value_name = "NODE")]
     node: String,
     /// The touch's force in N, shared by the three contact words
@@ -156,12 +156,12 @@ struct Stimulus {
   gateway frame configure --node 12 --write 99 1 -1 0x7FFF"
 )]
 struct Configure {
-    /// Who is asked: a cell's number, or everyone
+    /// The cell: a node id, or everyone
     #[arg(long, value_name = "NODE")]
     node: String,
     #[command(flatten)]
     request: Requested,
-    /// Comes back in the answer
+    /// Copied into the answer
     #[arg(long, value_name = "T", default_value_t = 0)]
     tag: u8,
 }
@@ -169,7 +169,7 @@ struct Configure {
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
 struct Requested {
-    /// Ask for a parameter, by name or number
+    /// Read a parameter, by name or number
     #[arg(long, value_name = "PARAMETER")]
     read: Option<String>,
     /// Write a parameter, by name or number
@@ -286,7 +286,7 @@ impl Answers {
 fn text(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {
-        // cansend needs only to be told of the bit-rate switch: `##1`, as the document has it.
+        // cansend needs only the flag of the bit-rate switch: `##1`, as the document has it.
         let flags = frame.flags() & BIT_RATE_SWITCH;
         let frame = CanFrame::with_data(frame.id(), format, flags, frame.data()).unwrap_or(frame);
         writeln!(text, "{frame}").expect("a string takes whatever is written");
@@ -374,7 +374,7 @@ fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q
     let layouts =
         packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
     let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
-    let field = field.ok_or_else(|| format!("{option}: cells feel no {name}"))?;
+    let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
     let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
     Ok(Q::from_bits(word))
 }
@@ -392,14 +392,14 @@ fn several<const F: u32, const N: usize>(
     Ok(all)
 }
 
-/// The three words of a force that they can say.
+/// The three contact words of a force.
 fn contact(text: &str) -> Result<[Q5_10; 3], String> {
     let force = value("--force", text, parameter::real)?;
     let words = contact_words(force);
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {
         let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
-        return Err(format!("--force {text}: three contact words say {min} to {max:.3} N"));
+        return Err(format!("--force {text}: three contact words hold {min} to {max:.3} N"));
     }
     Ok(words)
 }
@@ -408,7 +408,7 @@ fn addressee(text: &str) -> Result<Node, String> {
     match pick::node(text) {
         Ok(node @ (Node::Cell(_) | Node::Everyone)) => Ok(node),
         Ok(Node::Gateway) | Err(_) => {
-            Err(format!("--node {text}: a cell's number, 1 to 254, or everyone is possible"))
+            Err(format!("--node {text}: a node id, 1 to 254, or everyone is possible"))
         }
     }
 }
@@ -442,7 +442,7 @@ mod tests {
         );
         assert_eq!(
             says("stimulus --node 12 --force 96"),
-            "--force 96: three contact words say -96 to 95.997 N"
+            "--force 96: three contact words hold -96 to 95.997 N"
         );
         assert_eq!(says("stimulus --node 12 --force nan"), "--force nan: it must be a number");
         assert_eq!(says("stimulus --node 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");
@@ -450,7 +450,7 @@ mod tests {
             says("stimulus --node 12 --temperature 20 512"),
             "--temperature 512: it must be in [-512, 512)"
         );
-        let node = "a cell's number, 1 to 254, or everyone is possible";
+        let node = "a node id, 1 to 254, or everyone is possible";
         for wrong in ["0", "255", "gateway", "-1", "x"] {
             assert_eq!(says(&format!("stimulus --node={wrong}")), format!("--node {wrong}: {node}"));
         }

@@ -1,4 +1,4 @@
-//! Where commands read from, when somebody may say stop meanwhile.
+//! Inputs of commands, which a signal may stop.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -61,7 +61,7 @@ pub(crate) fn place(name: &str, line: u64) -> String {
     if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
 }
 
-/// Why a log has nothing for whoever wants frames.
+/// The error for a log without frames.
 pub(crate) fn no_frame(name: &str, lines: u64) -> String {
     format!(
         "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
@@ -74,14 +74,14 @@ pub(crate) fn no_frame(name: &str, lines: u64) -> String {
 pub(crate) struct Missing {
     /// Lines that cannot be read.
     pub(crate) lines: u64,
-    /// Frames that whoever took the capture lost.
+    /// Frames that the recorder lost.
     pub(crate) frames: u64,
     /// CAN XL frames.
     can_xl: u64,
 }
 
 impl Missing {
-    /// Counts what an entry that is no frame says.
+    /// Counts an entry that is no frame.
     pub(crate) fn take(&mut self, note: &Note<'_>) {
         match note.kind {
             NoteKind::Text => {}
@@ -91,12 +91,12 @@ impl Missing {
         }
     }
 
-    /// Says it at the end; also what has become of CAN XL frames.
+    /// Reports it at the end; also what has become of CAN XL frames.
     pub(crate) fn tell(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
         let said = [
             (self.lines, format!("{} of {} lines could not be read", self.lines, reader.lines())),
-            (self.frames, format!("{} frames are missing: whoever took the capture lost them", self.frames)),
+            (self.frames, format!("{} frames are missing: the recorder lost them", self.frames)),
             (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
         ];
         let said = said.iter().filter(|(count, _)| *count > 0).map(|(_, said)| said);
@@ -106,7 +106,7 @@ impl Missing {
     }
 }
 
-/// A live bus. That it is down is said once, until it works again.
+/// A live bus. That it is down is reported once, until it works again.
 #[derive(Debug)]
 pub(crate) struct ReceiveEnd {
     listener: Listener,
@@ -114,7 +114,7 @@ pub(crate) struct ReceiveEnd {
 }
 
 impl ReceiveEnd {
-    /// Opens a bus to hear all of it, and says of which kind it is; with `None` a classic interface too.
+    /// Opens a bus to receive all of it, and reports its kind; with `None` a classic interface too.
     pub(crate) fn open(
         name: &str,
         kind: Choice,
@@ -151,7 +151,7 @@ impl ReceiveEnd {
         self.listener.bus()
     }
 
-    /// Says at the end how many frames are missing, which came faster than something was done with them.
+    /// Reports at the end how many frames are missing because they came faster than they were processed.
     pub(crate) fn missing(&self, done: &str) -> u64 {
         let (name, missing) = (self.bus().name(), self.listener.dropped());
         if missing > 0 {
@@ -163,7 +163,7 @@ impl ReceiveEnd {
     }
 }
 
-/// Opens a capture, standard input or the parts of a recording, so that its reader can be told to stop. Signals are caught
+/// Opens a capture, standard input or the parts of a recording, so that a signal can stop its reader. Signals are caught
 /// from when a file is open: one that ends the program while it waits for a pipe's other end has nothing to put in order.
 pub(crate) fn captures(
     sources: &[PathBuf],
@@ -185,7 +185,7 @@ pub(crate) fn captures(
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 
-/// A file whose reader can be told to stop: then it is at its end.
+/// A file whose reader can be stopped: then it is at its end.
 pub(crate) struct Interruptible {
     pub(crate) file: File,
     pub(crate) stopped: Arc<AtomicBool>,

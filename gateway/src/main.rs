@@ -99,7 +99,7 @@ impl Command {
 fn main() -> ExitCode {
     let done = match Arguments::try_parse() {
         Ok(arguments) => arguments.command.run(),
-        // Help and version, which are asked for, are printed as they are.
+        // Requested help and version are printed as they are.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(refusal(&wrong))),

@@ -86,7 +86,7 @@ fn place(path: &Path) -> PathBuf {
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
 }
 
-/// Says something on standard error; if that is closed, nobody wants to know.
+/// Prints a line on standard error; if that is closed, the line is dropped.
 pub(crate) fn note(text: impl Display) {
     let _ = Stoppable::new(io::stderr()).write_all(format!("{text}\n").as_bytes());
 }

@@ -1,4 +1,4 @@
-//! Values as people and programs read them: words, rows, tables, JSON.
+//! Output of values: words, rows, tables, JSON.
 
 use std::fmt::Display;
 
@@ -64,7 +64,7 @@ pub(crate) fn decimals(value: Option<f64>, decimals: usize, none: &str) -> Strin
     or(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
-/// 50 %, 90 %, 99 % and the greatest.
+/// 50 %, 90 %, 99 % and the maximum.
 pub(crate) fn quantiles(quantiles: &Quantiles) -> String {
     let Quantiles { p50, p90, p99, max, .. } = quantiles;
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")

@@ -12,13 +12,13 @@ use super::output::{Force, apart};
 
 /// Make a recording whole that ends in the middle
 ///
-/// Copies everything that is whole into a new file with its indexes, and says what was not. The recording stays as
+/// Copies everything that is whole into a new file with its indexes, and reports what was not. The recording stays as
 /// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
 /// or nothing was wrong; 1: it cannot be done; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  gateway recover run.mcap.part -o run.mcap")]
 pub(crate) struct Recover {
-    /// The recording: an MCAP file, of whomever
+    /// The recording: an MCAP file of any program
     file: PathBuf,
     /// The new file; else FILE-recovered.mcap
     #[arg(short, long, value_name = "OUT")]

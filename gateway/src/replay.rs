@@ -21,7 +21,7 @@ use super::print::{Rows, json, list, or, quantiles};
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
 
-/// Put a capture back on a bus, and compare what the cells answer with what they answered then
+/// Send a capture on a bus, and compare the answers of the cells with the recorded ones
 ///
 /// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
 /// bus answer; with --expect their answers have to be the recorded ones, bit for bit or within a tolerance.
@@ -77,9 +77,9 @@ pub(crate) struct Replay {
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
-    /// How many milliseconds a full bus is waited for, before frames are refused
+    /// Milliseconds to wait for room on a full bus before a frame is refused
     #[arg(long, value_name = "MS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=60_000))]
-    timeout: u32,
+    send_timeout: u32,
     /// End before anything is sent when a line of a log cannot be read
     #[arg(long)]
     strict: bool,
@@ -105,7 +105,7 @@ struct Frames {
     /// Only the frames of these buses of the capture
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Whose frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
+    /// Which frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
     /// else all are sent
     #[arg(long, value_parser = one_of(ONLY))]
     only: Option<Only>,
@@ -113,10 +113,10 @@ struct Frames {
     /// joints, sync, resume, report alone, wire, and foreign
     #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
     kind: Vec<Selector>,
-    /// Only packets from or to these: a cell's number, gateway, everyone
+    /// Only packets from or to these: a node id, gateway, everyone
     #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
     node: Vec<Node>,
-    /// Begin so many seconds after the first frame; with inputs only, in the state that was in force there
+    /// Begin so many seconds after the first frame; with inputs only, in the state that was latched there
     #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
     from: u64,
     /// End before the frame so many seconds after the first one
@@ -126,7 +126,7 @@ struct Frames {
 
 const ONLY: &[Word<Only>] = &[
     ("inputs", "Commands, configuration, stimuli", Only::Inputs),
-    ("replies", "What cells said", Only::Replies),
+    ("replies", "What cells sent", Only::Replies),
     ("all", "Everything", Only::All),
 ];
 
@@ -149,7 +149,7 @@ impl Replay {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
         apart([("--summary", self.summary.as_deref())], read)?;
-        // Before the replay: nobody wants to hear after an hour that there is nowhere to write.
+        // Before the replay, so that a file that cannot be written is reported first.
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
@@ -198,7 +198,7 @@ impl Replay {
             }),
             vcan_setup: self.programs.vcan_setup.clone(),
             test_mode: self.test_mode,
-            timeout: Duration::from_millis(self.timeout.into()),
+            timeout: Duration::from_millis(self.send_timeout.into()),
             receive_buffer: RECEIVE_BUFFER as usize,
             strict: self.strict,
             quiet: self.quiet,
@@ -206,7 +206,7 @@ impl Replay {
     }
 }
 
-/// The whole replay, for people.
+/// The table of the replay.
 fn table(summary: &Summary) -> String {
     let ended = if summary.interrupted { "interrupted" } else { "done" };
     let mut rows = Rows::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
@@ -219,7 +219,7 @@ fn table(summary: &Summary) -> String {
     }
     rows.any("sent at once", summary.sent_at_once, "older than what was sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
-        rows.section("lateness", "50 % / 90 % / 99 % / greatest, µs", "");
+        rows.section("lateness", "50 % / 90 % / 99 % / max, µs", "");
         rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
     }
     if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {
@@ -231,7 +231,7 @@ fn table(summary: &Summary) -> String {
     if let Some(lockstep) = &summary.lockstep {
         let silent = list(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
-        rows.section("lockstep", silent, format!("{} joints asked again", lockstep.retried));
+        rows.section("lockstep", silent, format!("{} joints retried", lockstep.retried));
     }
     if let Some(expect) = &summary.expect {
         expectation(&mut rows, expect);
@@ -250,16 +250,16 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     off(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        count => format!("cells came too late for joints {count} times"),
+        count => format!("cells took joints too late {count} times"),
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    rows.any("not asked for", tally.not_requested, "a bus did not take the joints");
+    rows.any("not requested", tally.not_requested, "a bus did not take the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }
     rows.any("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
-    rows.any("unknown configurations", expect.unchecked_cells, "not told before they were changed");
+    rows.any("unknown configurations", expect.unchecked_cells, "not recorded before they were changed");
 }
 
 /// The words that differ by more than so many steps, where there are any: by how many steps how many do.

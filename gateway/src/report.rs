@@ -15,7 +15,7 @@ use super::output::{Force, apart, note};
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
 /// The page needs nothing else, no network and no script; it is readable on a phone, on a dark screen and on paper. A
-/// recording that was cut off is reported as far as it goes, and what is missing is said in it and on standard error.
+/// recording that was cut off is reported as far as it goes, and what is missing is named in it and on standard error.
 /// Exit code 0: the report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:

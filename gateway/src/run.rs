@@ -32,7 +32,7 @@ const SCENARIO: &str = include_str!("../examples/demo.toml");
 /// Where the demonstration's frames are recorded.
 const DEMO_LOG: &str = "skinbus-demo.log";
 
-/// What both commands can be told.
+/// Options of both commands.
 #[derive(Args, Debug)]
 struct Common {
     /// End after this time, 10 or 10s or 2min; else after the scenario's duration
@@ -127,7 +127,7 @@ impl Recording {
 /// Show everything at once: 253 cells on an arm, touched here and there
 ///
 /// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
-/// directory, so any number of demonstrations and runs go on side by side. It says which command shows the frames on
+/// directory, so any number of demonstrations and runs go on side by side. It prints the command that shows the frames on
 /// its bus, and where it records them as candump text. Exit codes are those of `gateway run`.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  gateway demo --duration 5")]
@@ -276,9 +276,9 @@ fn bench(
         ("--summary", summary_file),
     ];
     apart(written, read.iter().map(PathBuf::as_path))?;
-    // Before the run: nobody wants to hear after an hour that there is nowhere to write.
+    // Before the run, so that a file that cannot be written is reported first.
     let summary = summary_file.map(|path| force.create("--summary", path)).transpose()?;
-    // What it says of its own end is not lost with the program.
+    // A panic is reported in the summary too.
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
     let (ended, panicked) = match ended {
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),

@@ -11,11 +11,11 @@ use protocol::usage::{Failure, print};
 
 use super::arguments::{BusKind, FORMATS, Word, one_of};
 
-/// Say when the cells of a running bench tell what they feel: never, at a rate, or when it changes
+/// Set when the cells of a running bench send their sensors: never, at a rate, or on changes
 ///
-/// Takes effect at once, waits until every cell that is heard has confirmed it, and names those that do not. A
-/// gateway that runs on the bus keeps it: it switches a cell that starts anew to what the cell was last. Which
-/// changes count is parameter 8, which a skin has under [events]: `gateway frame configure --write events`.
+/// Takes effect at once, waits until every cell on the bus has confirmed it, and lists those that do not. A gateway
+/// that runs on the bus restores it: it switches a restarted cell to its last mode. Which changes count is parameter 8,
+/// which a skin has under [events]: `gateway frame configure --write events`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway sensing vcan0 event
@@ -24,7 +24,7 @@ use super::arguments::{BusKind, FORMATS, Word, one_of};
 pub(crate) struct Sensing {
     /// The bus
     bus: String,
-    /// When cells tell
+    /// When cells send their sensors
     #[arg(value_parser = one_of(MODES))]
     mode: When,
     /// How often, in continuous mode: frames of each cell a second
@@ -33,14 +33,14 @@ pub(crate) struct Sensing {
     /// Only this cell, 1 to 254; else all
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=254))]
     node: Option<u8>,
-    /// What a packet travels in on the bus
+    /// The frame format of packets on the bus
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
     #[command(flatten)]
     kind: BusKind,
 }
 
-/// When cells tell.
+/// When cells send their sensors.
 #[derive(Clone, Copy, Debug)]
 enum When {
     Off,
@@ -49,9 +49,9 @@ enum When {
 }
 
 const MODES: &[Word<When>] = &[
-    ("off", "Only when a report asks", When::Off),
+    ("off", "Only on a report", When::Off),
     ("continuous", "At a rate", When::Continuous),
-    ("event", "When it changes, and with each heartbeat", When::Event),
+    ("event", "On changes, and with each heartbeat", When::Event),
 ];
 
 impl Sensing {
@@ -60,8 +60,8 @@ impl Sensing {
         let bus = open(&self.bus, self.kind.bus_kind, self.format).map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
         let only = self.node.and_then(|node| CellId::new(node.into()).ok());
-        let told = switch(bus, self.format, only, mode).map_err(Failure::run)?;
-        print(&format!("{told} on {on}: {}\n", Words(Parameter::Sensing.number(), mode.words())))
+        let confirmed = switch(bus, self.format, only, mode).map_err(Failure::run)?;
+        print(&format!("{confirmed} on {on}: {}\n", Words(Parameter::Sensing.number(), mode.words())))
     }
 
     fn mode(&self) -> Result<Mode, String> {

@@ -26,13 +26,13 @@ use super::print::list;
 /// Bytes for frames that wait while others are worked on.
 const RECEIVE_BUFFER: usize = 8 << 20;
 
-/// Say what a real bus would have made of some traffic: its load, the delay of each frame, late answers, queues
+/// Compute the timing of some traffic on a real bus: its load, the delay of each frame, late answers, queues
 ///
 /// vcan and the embedded bus have no bit rate: everything fits them. This takes the traffic of a capture (a candump
 /// log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, through a model of a bus with bit rates:
-/// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the moment at
+/// exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp counts as the time at
 /// which it was to be sent. What only a bench sends is left out, start-up stands apart, and where the skin is known (attached
-/// to a recording, or --skin) its worst case stands beside the run. docs/reference/bus-timing.md says what the figures mean and what the model
+/// to a recording, or --skin) its worst case stands beside the run. docs/reference/bus-timing.md explains the figures and what the model
 /// leaves out.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -63,7 +63,7 @@ pub(crate) struct ShadowCommand {
     /// Count what only a bench sends too: stimuli, sync and report with their answers, simulated wires
     #[arg(long)]
     bench_traffic: bool,
-    /// The share of bits that arrive damaged, 0 to 0.01: their frames cost an error frame and come again
+    /// The share of bits that arrive damaged, 0 to 0.01: each costs an error frame, and its frame is sent again
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, allow_negative_numbers = true)]
     ber: f64,
     /// What damaged bits are drawn from: the same seed, the same bits
@@ -95,7 +95,7 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
 struct Taken {
     /// What it was read from.
     what: &'static str,
-    /// Frames that whoever took the capture lost.
+    /// Frames that the recorder lost.
     missing: u64,
     /// Why there is no more, if not because that was all.
     ended: Result<(), Failure>,
@@ -137,7 +137,7 @@ impl ShadowCommand {
         taken.ended
     }
 
-    /// Whether captures are meant, and not buses.
+    /// Whether the arguments are captures, and not buses.
     fn are_captures(&self, name: &str) -> Result<bool, Failure> {
         match self.sources.iter().filter(|source| is_file(source)).count() {
             0 => return Ok(false),
@@ -180,7 +180,7 @@ impl ShadowCommand {
         Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
 
-    /// Listens to buses until somebody says stop.
+    /// Receives from buses until a signal.
     fn live(
         &self,
         shadow: &mut Shadow,
@@ -191,13 +191,13 @@ impl ShadowCommand {
             let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
             ReceiveEnd::open(&source.display().to_string(), self.kind.bus_kind, None, options)
         };
-        let mut receive_filter = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+        let mut receive_ends = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let end = self.duration.map(|nanos| Instant::now() + Duration::from_nanos(nanos));
         let mut ended = Ok(());
         while ended.is_ok() && !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end)
         {
-            wait(&receive_filter)?;
-            for receive_end in &mut receive_filter {
+            wait(&receive_ends)?;
+            for receive_end in &mut receive_ends {
                 if let Err(error) = take(receive_end, shadow) {
                     ended = Err(Failure::run(error));
                 }
@@ -208,7 +208,7 @@ impl ShadowCommand {
             }
         }
         let mut missing = 0;
-        for receive_end in &receive_filter {
+        for receive_end in &receive_ends {
             let lost = receive_end.missing("read");
             shadow.missing(receive_end.bus().name(), lost);
             missing += lost;
@@ -228,10 +228,10 @@ fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusErro
 }
 
 /// Waits until a frame comes, or it is time to look at other things.
-fn wait(receive_filter: &[ReceiveEnd]) -> Result<(), Failure> {
+fn wait(receive_ends: &[ReceiveEnd]) -> Result<(), Failure> {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let mut fds: Vec<_> =
-        receive_filter.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
+        receive_ends.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
     match poll(&mut fds, Timespec::try_from(LOOK).ok().as_ref()) {
         Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
         Err(errno) => Err(Failure::run(io::Error::from(errno))),
@@ -246,7 +246,7 @@ fn attached(reader: &Reader) -> Option<Skin> {
         .ok()
 }
 
-/// Takes in a capture, and says what is missing of it.
+/// Takes in a capture, and reports what is missing of it.
 fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
     let name = reader.name().to_owned();
     let what = input::format(&reader);

@@ -33,7 +33,7 @@ enum Command {
 
 /// Describe a skin of hexagonal cells on a robot's arm
 ///
-/// The same wish makes the same text; its first line is the command that makes it anew.
+/// The same options give the same text; its first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway skin generate -o skin.toml
@@ -54,7 +54,7 @@ struct Generate {
     /// What the cells answer with
     #[arg(long, value_parser = one_of(REPLIES), default_value = "torque")]
     reply: Answers,
-    /// What their packets travel in
+    /// The frame format of their packets
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
     /// The file to write, whole or not at all; else standard output
@@ -64,7 +64,7 @@ struct Generate {
     force: Force,
 }
 
-/// Check a skin's description, and say in a few lines what it describes
+/// Check a skin's description, and summarise it in a few lines
 ///
 /// Exit code 2, and one line with the line, the key, the value and what is allowed, when something is wrong.
 #[derive(Args, Debug)]

@@ -145,7 +145,7 @@ fn of_the_odd_lines_nothing_is_lost() {
     assert_eq!(before, after);
     let same = CORPUS.split(|&byte| byte == b'\n').zip(back.split(|&byte| byte == b'\n'));
     let other: Vec<_> = same.filter(|(before, after)| before != after).collect();
-    // Those that say the same in more or other letters: padding, dots, lower case, zeros in front.
+    // Other spellings of the same: padding, dots, lower case, zeros in front.
     assert_eq!(
         other.len(),
         10,
@@ -205,7 +205,7 @@ fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
     (converted(log.as_bytes(), Format::Mcap).0, frames(log.as_bytes()).0)
 }
 
-/// How a capture ended: what it says of that itself.
+/// How a capture ended, by its own account.
 type End = Result<Option<String>, CaptureError>;
 
 /// The times and data of all frames, and how it ended.
@@ -226,19 +226,19 @@ fn frames(bytes: &[u8]) -> (Vec<(u64, Vec<u8>)>, End) {
 fn a_recording_that_is_truncated_is_read_as_far_as_it_goes() {
     let (mcap, all) = recording();
     let mut most = 0;
-    for link_down in (8..mcap.len()).step_by(3_001).chain([mcap.len() - 1]) {
-        let (found, end) = frames(&mcap[..link_down]);
-        assert!(all.starts_with(&found), "cut at {link_down}");
-        assert!(found.len() >= most, "cut at {link_down}");
+    for length in (8..mcap.len()).step_by(3_001).chain([mcap.len() - 1]) {
+        let (found, end) = frames(&mcap[..length]);
+        assert!(all.starts_with(&found), "cut at {length}");
+        assert!(found.len() >= most, "cut at {length}");
         most = found.len();
-        let why = end.unwrap_or_else(|error| panic!("cut at {link_down}: {error}"));
-        assert!(why.unwrap().contains("it has no end"), "cut at {link_down}");
+        let why = end.unwrap_or_else(|error| panic!("cut at {length}: {error}"));
+        assert!(why.unwrap().contains("it has no end"), "cut at {length}");
     }
     assert_eq!((most, frames(&mcap).1.unwrap()), (all.len(), None));
 }
 
 #[test]
-fn of_a_damaged_recording_nothing_is_believed_from_the_damage_on() {
+fn a_damaged_recording_is_read_up_to_the_damage() {
     let (mcap, all) = recording();
     let (mut tried, mut silent, mut partly) = (0, 0, 0);
     for at in (8..mcap.len()).step_by(2_003).chain(8..40) {

@@ -1,4 +1,4 @@
-//! `gateway convert` as a process: what it says of bad input, and what lies on the disk afterwards.
+//! `gateway convert` as a process: its errors for bad input, and the files on the disk afterwards.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::fs;
@@ -34,7 +34,7 @@ impl Folder {
         command
     }
 
-    /// What a command says that ends with this code.
+    /// The standard error of a command that ends with this code.
     fn says(&self, arguments: &str, code: i32) -> String {
         let Output { status, stdout, stderr } =
             self.gateway(arguments).stdin(Stdio::null()).output().unwrap();

@@ -1,4 +1,4 @@
-//! What the documents say about the files that people write is what the program reads: their examples are
+//! The documents on files that users write match the program: their examples are
 //! read here, and their tables name every key that there is, and no other. What they link to is there.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
@@ -38,7 +38,7 @@ fn documented(page: &str, heading: &str) -> BTreeSet<String> {
     rows.map(|row| row.split('`').next().unwrap().to_owned()).collect()
 }
 
-/// The keys that a table may have, as the program itself names them when it meets another one.
+/// The keys that a table may have, from the error of the program on an unknown one.
 fn allowed(text: &str, read: impl Fn(&str) -> String) -> BTreeSet<String> {
     let said = read(text);
     let (_, keys) = said.split_once("unknown field `zzz`, expected ").unwrap_or_else(|| panic!("{said}"));

@@ -1,4 +1,4 @@
-//! `gateway fit` as a process: what it prints is what the documents show, and what it refuses.
+//! `gateway fit` as a process: its output as in the documents, and its errors.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -21,7 +21,7 @@ fn output(arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// What is said in one line by a command that ends with 2 and prints nothing.
+/// The one-line error of a command that ends with 2 and prints nothing.
 fn refusal(arguments: &str) -> String {
     let Output { status, stdout, stderr } = gateway(arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -45,8 +45,8 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
     let plain = output("skin generate --cells 90 --buses 2");
     let with_rates =
         plain.replace("format = \"fd\"", "format = \"fd\"\nbitrate = 500000\ndata_bitrate = 2000000");
-    let segment = with_rates.replacen("\nbitrate = 500000\ndata_bitrate = 2000000", "", 1);
-    for (name, text) in [("plain", &plain), ("rates", &with_rates), ("half", &segment)] {
+    let mixed = with_rates.replacen("\nbitrate = 500000\ndata_bitrate = 2000000", "", 1);
+    for (name, text) in [("plain", &plain), ("rates", &with_rates), ("mixed", &mixed)] {
         std::fs::write(path(name), text).unwrap();
     }
     let json = |arguments: &str| -> Value { serde_json::from_str(&output(arguments)).unwrap() };
@@ -57,12 +57,12 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
     let described = json(&format!("fit {} --json", path("rates")));
     assert_eq!(names(&described, "buses"), ["500k/2M", "500k/2M"]);
     assert_eq!(described["whole"]["cells"], 90);
-    let told = json(&format!("fit {} --nominal 1M --data 8M --json", path("rates")));
-    assert_eq!(names(&told, "buses"), ["1M/8M", "1M/8M"]);
+    let given = json(&format!("fit {} --nominal 1M --data 8M --json", path("rates")));
+    assert_eq!(names(&given, "buses"), ["1M/8M", "1M/8M"]);
     let classic = json(&format!("fit {} --nominal 1M --format classic --json", path("plain")));
     assert_eq!(names(&classic, "buses"), ["classic 1M", "classic 1M"]);
     let all = ["classic 500k", "classic 1M", "500k/2M", "500k/5M", "1M/2M", "1M/5M", "1M/8M"];
-    for arguments in [path("plain"), path("half"), format!("{} --table", path("rates"))] {
+    for arguments in [path("plain"), path("mixed"), format!("{} --table", path("rates"))] {
         assert_eq!(names(&json(&format!("fit {arguments} --json")), "table"), all);
     }
     let only = json(&format!("fit {} --format classic --json", path("plain")));
@@ -85,10 +85,10 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
             "--nominal 1M --data 9M",
             "data bit rate 9000000 bit/s: CAN FD allows 1000000 (the nominal one) to 8000000 (8M)",
         ),
-        ("--nominal 1M", "CAN FD needs a data bit rate: say --data, 1000000 to 8000000, or --format classic"),
+        ("--nominal 1M", "CAN FD needs a data bit rate: add --data, 1000000 to 8000000, or --format classic"),
         (
             "--nominal 1M --data 5M --format classic",
-            "--data is for CAN FD, and here all buses are classic: leave it out, or say --format fd",
+            "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
         ),
     ] {
         assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("gateway: {said}"));

@@ -85,35 +85,35 @@ fn row<'a>(table: &'a str, name: &str) -> [&'a str; 2] {
     [value.trim(), beside.trim()]
 }
 
-fn cell(number: i64) -> CellId {
-    CellId::new(number).unwrap()
+fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
 }
 
-/// Start-up, in which all cells speak at once; two seconds of joints that fewer than half answer, with stimuli.
+/// Start-up, in which all cells send at once; two seconds of joints that fewer than half answer, with stimuli.
 fn run() -> Vec<(u64, Message)> {
     let mut now = 1_700_000_000_000_000_000;
     let mut said = Vec::new();
-    for number in 1..=CELLS {
+    for node in 1..=CELLS {
         let heartbeat = Heartbeat {
-            serial: u32::try_from(number).unwrap(),
+            serial: u32::try_from(node).unwrap(),
             state: State::CLAIMING,
             ..Heartbeat::default()
         };
         let page = NetworkPage::Heartbeat(heartbeat);
-        said.push((now, Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(0), page }));
+        said.push((now, Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page }));
     }
     now += 400 * MS;
     for epoch in 0..125 {
         let epoch = Epoch(epoch);
-        for number in 1..=ANSWERING {
+        for node in 1..=ANSWERING {
             let page = SensorPage::Skin(SkinSensors::default());
-            said.push((now, Message::Stimulus { to: Node::Cell(cell(number)), from: From::Next, page }));
+            said.push((now, Message::Stimulus { to: Node::Cell(cell(node)), from: From::Next, page }));
         }
         let joints = Joints { positions: [Q1_14::from_bits(0x2345); WORDS], in_use: 6 };
         said.push((now, Message::Joints { epoch, joints }));
-        for number in 1..=ANSWERING {
+        for node in 1..=ANSWERING {
             let torque = [Q3_12::from_bits(0x1234); WORDS];
-            said.push((now + MS, Message::Torque { from: cell(number), epoch, torque }));
+            said.push((now + MS, Message::Torque { from: cell(node), epoch, torque }));
         }
         now += 16 * MS;
     }
@@ -121,7 +121,7 @@ fn run() -> Vec<(u64, Message)> {
 }
 
 #[test]
-fn four_commands_say_of_one_skin_the_same_in_the_same_words() {
+fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
     let files = Files::new("bitrate = 1000000\ndata_bitrate = 5000000");
     let fit = files.gateway("fit skin.toml");
     let worst = row(&fit, "worst case");
@@ -138,7 +138,7 @@ fn four_commands_say_of_one_skin_the_same_in_the_same_words() {
     assert_eq!((row(&of_log, "worst case"), row(&of_log, "this run")), (worst, run));
     let unknown = files.gateway("shadow run.log --nominal 1M --data 5M");
     assert_eq!(row(&unknown, "worst case")[0], "?");
-    assert_eq!(row(&unknown, "this run"), [run[0], "at most 120 of 253 cells heard answered"]);
+    assert_eq!(row(&unknown, "this run"), [run[0], "at most 120 of 253 cells seen answered"]);
 
     let report = files.report("");
     let at = "vcan0 at 1M/5M";
@@ -204,13 +204,13 @@ fn stimuli_and_start_up_are_no_load_of_operation() {
 }
 
 #[test]
-fn rates_that_nobody_chose_are_told_and_not_judged() {
+fn default_rates_are_shown_and_not_rated() {
     let files = Files::new("");
-    let told = files.report("");
+    let text = files.report("");
     assert!(
-        told.contains("vcan0 at 1M/5M, worst case: does not fit: bandwidth (all 253 cells answer) 119 % ")
+        text.contains("vcan0 at 1M/5M, worst case: does not fit: bandwidth (all 253 cells answer) 119 % ")
     );
-    assert!(!told.contains("does not hold"), "{told}");
+    assert!(!text.contains("does not hold"), "{text}");
     let rated = files.report(" --nominal 1M --data 8M");
     assert!(rated.contains("vcan0 at 1M/8M, worst case: in time, but 254 nodes"), "{rated}");
     assert!(rated.contains("within all limits ✗ does not hold"), "{rated}");

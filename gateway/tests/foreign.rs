@@ -138,7 +138,7 @@ fn foreign_identifiers_are_counted_with_rate_length_and_times() {
 fn our_packets_are_found_among_foreign_frames_of_the_same_bus() {
     for format in [Format::Fd, Format::Classic] {
         let own = ours(format, 500);
-        // A car that does not speak under identifiers of ours that are in use here.
+        // A car that does not use the identifiers of ours that are in use here.
         let used: Vec<_> = own.iter().map(|(_, frame)| frame.id()).collect();
         let mut frames = car(7, 8_000);
         frames.extend(others(8, 8_000));
@@ -159,10 +159,10 @@ fn our_packets_are_found_among_foreign_frames_of_the_same_bus() {
 }
 
 #[test]
-fn on_a_bus_that_loses_frames_what_is_left_of_packets_is_damaged_and_not_foreign() {
+fn single_segments_on_a_lossy_bus_are_damaged_and_not_foreign() {
     let mut random = Random(11);
     let all = ours(Format::Classic, 1_000);
-    // Each frame by itself: of a packet one half, the other, or both may be lost.
+    // Each frame by itself: the first segment of a packet, the second, or both may be lost.
     let kept: Vec<_> = all.iter().enumerate().filter(|(at, _)| *at < 100 || random.below(50) > 0).collect();
     let lost = all.len() - kept.len();
     let place: Vec<_> = kept.iter().map(|(at, _)| *at).collect();
@@ -180,14 +180,14 @@ fn on_a_bus_that_loses_frames_what_is_left_of_packets_is_damaged_and_not_foreign
 }
 
 #[test]
-fn a_frame_waits_no_longer_than_its_other_half_may_take() {
+fn a_frame_waits_no_longer_than_the_reassembly_timeout() {
     let mut settler = Settler::new(None);
     let [first, second] = [0, 1].map(|at| ours(Format::Classic, 1)[at].1);
     settler.push(Micros(1_000_000), "can0", &first, 1);
-    assert_eq!(settler.pop(), None, "its other half may come");
+    assert_eq!(settler.pop(), None, "the second segment may come");
     settler.push(Micros(1_000_150), "can0", &second, 2);
-    let told = std::iter::from_fn(|| settler.pop()).map(|(item, it)| (item, it.verdict()));
-    assert_eq!(told.collect::<Vec<_>>(), [(1, "half"), (2, "ok")]);
+    let settled = std::iter::from_fn(|| settler.pop()).map(|(item, it)| (item, it.verdict()));
+    assert_eq!(settled.collect::<Vec<_>>(), [(1, "segment"), (2, "ok")]);
     // A live bus on which nothing more comes.
     settler.push(Micros(2_000_000), "can0", &first, 3);
     settler.handle_time(Micros(2_010_000));
@@ -195,7 +195,7 @@ fn a_frame_waits_no_longer_than_its_other_half_may_take() {
     settler.handle_time(Micros(2_200_000));
     assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((3, "foreign")));
     assert!(!settler.is_waiting());
-    // What was given up is no first half any more.
+    // A segment that has timed out is no first segment any more.
     settler.push(Micros(2_200_100), "can0", &second, 4);
     settler.finish();
     assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((4, "foreign")));
@@ -207,7 +207,7 @@ fn frames_that_wait_are_bounded_where_times_do_not_move_or_run_backwards() {
         let mut settler = Settler::new(None);
         let (mut out, mut most) = (0_u64, 0_u64);
         let frames = 200_000_u32;
-        // Each under an identifier of its own as far as there are some: no later frame tells of an earlier one.
+        // Each under an identifier of its own as far as there are some: no later frame settles an earlier one.
         for number in 0..frames {
             let bus = if number % 2 == 0 { "can0" } else { "can1" };
             let at = Micros(10_000_000_u64.saturating_add_signed(step * i64::from(number)));
@@ -293,7 +293,7 @@ fn dump_shows_a_foreign_log_as_foreign_in_its_order() {
 }
 
 #[test]
-fn a_classic_capture_of_ours_comes_back_in_its_order_with_each_half() {
+fn a_classic_capture_comes_back_in_its_order_with_each_segment() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let frames = ours(Format::Classic, 20);
@@ -302,7 +302,7 @@ fn a_classic_capture_of_ours_comes_back_in_its_order_with_each_half() {
     let shown = gateway(folder, "dump ours.log");
     let verdicts: Vec<_> =
         shown.lines().map(|line| line.split('\t').nth(1).unwrap().split(' ').next().unwrap()).collect();
-    assert_eq!(verdicts, ["half", "ok"].repeat(frames.len() / 2));
+    assert_eq!(verdicts, ["segment", "ok"].repeat(frames.len() / 2));
     assert_eq!(gateway(folder, "dump ours.log --kind foreign"), "");
     let torques = gateway(folder, "dump ours.log --node 3 --max 5");
     assert_eq!(torques.lines().count(), 5, "--max counts what is shown");

@@ -20,7 +20,7 @@ fn output(folder: &Path, arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// What a command says that ends with this code and prints nothing: one line.
+/// The one-line error of a command that ends with this code and prints nothing.
 fn refusal(folder: &Path, arguments: &str, code: i32) -> String {
     let Output { status, stdout, stderr } = gateway(folder, arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -65,7 +65,7 @@ fn of_several_buses_one_is_chosen() {
     let folder = folder.path();
     let said = refusal(folder, "dbc two.toml", 2);
     let expected =
-        "gateway: two.toml has 2 buses, and a DBC describes one: say --bus and one of vcan0, vcan1";
+        "gateway: two.toml has 2 buses, and a DBC describes one: add --bus with one of vcan0, vcan1";
     assert_eq!(said, expected);
     let said = refusal(folder, "dbc two.toml --bus can7", 2);
     assert_eq!(said, "gateway: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
@@ -168,7 +168,7 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     assert_eq!((status.code(), std::str::from_utf8(&stdout).unwrap().lines().count()), (Some(0), 1));
 }
 
-/// The cell of the document's whole configuration, and another one that nobody touches.
+/// The cell of the document's whole configuration, and another one without contact.
 const SKIN: &str = r#"version = 1
 name = "document"
 
@@ -220,7 +220,7 @@ position = [0.1, 0.0, 0.06]
 orientation = [0.0, 0.0, 0.0, 1.0]
 "#;
 
-/// The document's cell is told to obey stimuli, pressed, asked, and answers.
+/// The document's cell gets test mode, a stimulus and joints, and answers.
 const PRESSED: &str = "(1.000000) vcan0 50C##10100000000000000000000000C853231
 (1.100000) vcan0 70C##1000400040004000000000000008047DA
 (1.200000) vcan0 001##500001CCFBE28F5C608C000000706BE4E
@@ -242,15 +242,15 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     let text = output(folder, "explain run.log --skin skin.toml --epoch 7 --cell 12");
     for line in [
         "run.log: joints of epoch 7 on vcan0, 0.200000 s after the first frame",
-        "  felt       1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
+        "  contact    1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
         "  since      stimulus of 0.100000 s, from the next joints on",
         "  F_c        3.0000 N, not below 0.1006 N: counts",
         "  F_p        0.0000, below 0.0500: none",
         "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints",
-        "  vcan0 12: it said nothing of its configuration; taken to be the skin's, 266D",
-        "  vcan0: 1 cells said nothing, and what they felt is not in the capture; they are taken as not in contact",
+        "  vcan0 12: it did not report its configuration; taken to be the skin's, 266D",
+        "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are taken as not in contact",
     ] {
         assert!(text.lines().any(|there| there == line), "{line}\n{text}");
     }
@@ -283,7 +283,7 @@ fn what_cannot_be_explained_is_one_line() {
     let folder = folder.path();
     std::fs::write(folder.join("empty.log"), "# nothing\n").unwrap();
     for (arguments, code, expected) in [
-        ("explain run.log --epoch 7", 2, "run.log has no skin in it: say which with --skin"),
+        ("explain run.log --epoch 7", 2, "run.log has no skin in it: name one with --skin"),
         (
             "explain run.log --skin skin.toml --epoch 8",
             1,
@@ -308,7 +308,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 7 --cell 300",
             2,
-            "invalid value '300' for '--cell <CELL>': \"300\" is no cell: a number, 1 to 254, is; try '--help'",
+            "invalid value '300' for '--cell <CELL>': \"300\" is no node id: 1 to 254 are; try '--help'",
         ),
         (
             "explain empty.log --skin skin.toml --epoch 7",
@@ -336,7 +336,7 @@ fn the_skin_is_the_one_in_the_recording() {
     let folder = folder.path();
     assert_eq!(gateway(folder, "convert run.log run.mcap").status.code(), Some(0));
     let said = refusal(folder, "explain run.mcap --epoch 7", 2);
-    assert_eq!(said, "gateway: run.mcap has no skin in it: say which with --skin");
+    assert_eq!(said, "gateway: run.mcap has no skin in it: name one with --skin");
     let mcap = output(folder, "explain run.mcap --skin skin.toml --epoch 7 --json");
     let log = output(folder, "explain run.log --skin skin.toml --epoch 7 --json");
     assert_eq!(mcap.replace("run.mcap", "run.log"), log);

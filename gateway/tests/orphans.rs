@@ -31,7 +31,7 @@ fn left(folder: &TempDir, name: &str) {
     file.write_all(&bytes[there..]).unwrap();
 }
 
-/// What the next run says when it claims its files.
+/// The messages of the next run when it claims its files.
 fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     let mcap = Mcap {
         path: folder.join(name),

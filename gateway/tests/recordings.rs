@@ -1,4 +1,4 @@
-//! Recordings of earlier builds are dumped and explained as they were then (tests/recordings/README.md).
+//! Recordings of earlier builds are dumped and explained as expected (tests/recordings/README.md).
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::fs;
@@ -20,7 +20,7 @@ fn output(arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// Compares line by line with `expected/NAME`, or takes the text over where that is asked for.
+/// Compares line by line with `expected/NAME`, or takes the text over on request.
 fn is_expected(name: &str, text: &str) {
     let path = recordings().join("expected").join(name);
     if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
@@ -35,26 +35,30 @@ fn is_expected(name: &str, text: &str) {
 }
 
 #[test]
-fn dumps_say_what_they_said() {
+fn dumps_are_unchanged() {
     for name in ["fd", "classic", "sums", "two", "split", "split-1", "split-2"] {
         is_expected(&format!("{name}.dump.txt"), &output(&format!("dump {name}.mcap --brief")));
     }
 }
 
 #[test]
-fn a_log_says_what_the_recording_of_the_same_run_says() {
+fn a_log_gives_the_same_text_as_the_recording_of_the_same_run() {
     // The times of a log have six digits: they are left out.
-    let told = |text: &str| -> Vec<String> {
+    let without_times = |text: &str| -> Vec<String> {
         text.lines().map(|line| line.split_once(' ').unwrap().1.to_owned()).collect()
     };
     for name in ["classic", "sums"] {
         let expected = fs::read_to_string(recordings().join(format!("expected/{name}.dump.txt"))).unwrap();
-        assert_eq!(told(&output(&format!("dump {name}.log --brief"))), told(&expected), "{name}");
+        assert_eq!(
+            without_times(&output(&format!("dump {name}.log --brief"))),
+            without_times(&expected),
+            "{name}"
+        );
     }
 }
 
 #[test]
-fn explanations_are_what_they_were() {
+fn explanations_are_unchanged() {
     for (name, options) in [
         ("fd", "--epoch 60"),
         ("classic", "--epoch 60 --cell 1"),

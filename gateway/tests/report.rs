@@ -1,4 +1,4 @@
-//! `gateway report` as a process: what it says of what is no recording of a run, and what lies on the disk afterwards.
+//! `gateway report` as a process: its errors for files that are no recording of a run, and the files on the disk afterwards.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::fs;

@@ -46,9 +46,9 @@ fn play(scenario: &str) -> Most {
             }
             let joints = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap());
             let frames = central.frames(&joints);
-            let contact_state = central.feel(&frames, &sensors);
-            torque = contact_state.torque;
-            most.active.push(contact_state.active);
+            let total = central.total(&frames, &sensors);
+            torque = total.torque;
+            most.active.push(total.active);
             for (cell, sensors) in sensors.iter().enumerate() {
                 let own = central.torque(cell, &frames, central.force(cell, sensors));
                 most.torque = own.iter().fold(most.torque, |most, torque| most.max(torque.abs()));

@@ -72,7 +72,7 @@ fn end(child: &mut Child, line: &str, signal: Signal) -> ExitStatus {
 }
 
 #[test]
-fn a_pipe_that_nobody_writes_to_holds_no_command_when_it_is_told_to_end() {
+fn a_signal_ends_a_command_that_waits_for_a_pipe() {
     let folder = place();
     let lines = [
         "dump fifo",
@@ -109,7 +109,7 @@ fn a_pipe_that_nobody_writes_to_holds_no_command_when_it_is_told_to_end() {
 }
 
 #[test]
-fn a_reader_that_takes_nothing_holds_no_command_when_it_is_told_to_end() {
+fn a_signal_ends_a_command_whose_reader_takes_nothing() {
     let folder = place();
     for line in ["dump run.log", "dump run.log --json", "convert run.log -", "shadow run.log --json"] {
         for signal in [Signal::INT, Signal::TERM] {

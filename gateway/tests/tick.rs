@@ -101,7 +101,7 @@ fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
 }
 
 #[test]
-fn a_halt_that_a_bus_did_not_take_is_said_before_its_next_joints_and_then_every_8() {
+fn a_halt_that_a_bus_refused_is_resent_before_its_next_joints_and_then_every_8() {
     let (mut turn, mut snapshots, table) = turn(&skin(4), Mode::Distributed);
     let mut taken = Vec::new();
     // Nothing is read back, so that the robot is halted within the first 100 ticks.
@@ -127,7 +127,7 @@ fn a_halt_that_a_bus_did_not_take_is_said_before_its_next_joints_and_then_every_
 }
 
 #[test]
-fn a_bus_that_is_back_is_told_before_its_next_joints_to_be_as_the_robot_is() {
+fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
     let (mut turn, mut snapshots, table, bus) = turn_of(&skin(4), Mode::Distributed);
     let mut said = Vec::new();
     for number in 0..64_u64 {
@@ -165,7 +165,7 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
     let frames = [Frame::classic(0x001, &[0; 8]).unwrap()];
     let first = serve();
     let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
-    let (link, mut ear, mut slot) = Link::new(bus, options);
+    let (link, mut monitor, mut slot) = Link::new(bus, options);
     let mut offer = || {
         let before = ALLOCATIONS.with(Cell::get);
         let taken = slot.read().offer(&frames);
@@ -173,17 +173,17 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
     };
     assert_eq!(offer(), (true, 0));
     first.stop().unwrap();
-    assert!(ear.lose(true) && !ear.lose(true), "news once");
+    assert!(monitor.lose(true) && !monitor.lose(true), "reported once");
     assert_eq!((offer(), link.is_gone(), link.state.is_there()), ((false, 0), true, false));
-    assert!(ear.reopen().is_err() && link.is_gone());
+    assert!(monitor.reopen().is_err() && link.is_gone());
     let second = serve();
-    ear.reopen().unwrap();
+    monitor.reopen().unwrap();
     assert_eq!(
         (link.is_gone(), link.state.is_there()),
         (false, false),
-        "open, and nothing was heard on it yet"
+        "open, and nothing was received on it yet"
     );
-    assert!(ear.regain() && !ear.regain() && link.state.is_there());
+    assert!(monitor.regain() && !monitor.regain() && link.state.is_there());
     assert_eq!(offer(), (true, 0));
     link.send(&frames).unwrap();
     assert_eq!(second.stop().unwrap().frames, 2);

@@ -118,7 +118,7 @@ pub enum PacketError {
         got: u16,
     },
     /// A classic frame that gives no packet with the one before it or the one after it.
-    #[error("no other half")]
+    #[error("no other segment")]
     Incomplete,
 }
 

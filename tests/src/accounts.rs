@@ -1,4 +1,4 @@
-//! What must be true of every run, whatever was broken.
+//! Invariants of every run, with any faults.
 
 use model::table::{Event, Replies, Uplink};
 use protocol::can::Format;
@@ -35,7 +35,7 @@ fn cells(bench: &Bench) {
         assert!(in_doubt <= missing, "replies of cell {node}: {replies:?}");
         let arrived = bench.oracle.arrived(place);
         let tally = bench.oracle.tally;
-        if is_fd(bench) && (tally.flipped, tally.link_down, tally.babbled) == (0, 0, 0) {
+        if is_fd(bench) && (tally.flipped, tally.truncated, tally.babbled) == (0, 0, 0) {
             let elsewhere = uplink.in_doubt + uplink.unsettled;
             assert_eq!(delivered + elsewhere, arrived, "arrivals of cell {node}: {uplink:?}");
         }
@@ -72,23 +72,27 @@ fn frames(bench: &Bench) {
     let foreign = count(Event::Foreign);
     if tally.babbled == 0 {
         assert!(
-            (tally.link_down.saturating_sub(foreign)..=tally.link_down).contains(&count(Event::Length)),
-            "cut frames"
+            (tally.truncated.saturating_sub(foreign)..=tally.truncated).contains(&count(Event::Length)),
+            "truncated frames"
         );
     }
     if is_fd(bench) {
         assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
         if tally.babbled == 0 {
             let harmed = count(Event::Length) + count(Event::Crc) + foreign;
-            assert_eq!(harmed, tally.link_down + tally.flipped, "frames with turned bits, and cut ones");
+            assert_eq!(
+                harmed,
+                tally.truncated + tally.flipped,
+                "frames with flipped bits, and truncated ones"
+            );
         }
         assert_eq!(count(Event::Incomplete), 0);
         return;
     }
-    // Two halves are a packet; an incomplete one is one half, and each identifier may have one waiting.
+    // Two segments are a packet; an incomplete one is one segment, and each identifier may have one waiting.
     let odd = count(Event::Incomplete) + count(Event::Length);
     let segments = 2 * (by_kind - odd) + odd;
     let waiting = tally.frames - elsewhere - segments;
-    assert!(waiting <= 1 << 11, "{waiting} halves wait");
+    assert!(waiting <= 1 << 11, "{waiting} segments wait");
     assert_eq!(count(Event::Crc), 0);
 }

@@ -83,9 +83,9 @@ pub struct Bench {
     pub gateway: Gateway,
     /// The cells: first the skin's, in its order, then those of [`Bench::add`].
     pub cell_slots: Vec<CellSlot>,
-    /// What goes wrong.
+    /// The faults.
     pub faults: Faults,
-    /// What a second, simpler gateway makes of what the first one was handed.
+    /// A second, simpler gateway with the same input.
     pub oracle: Oracle,
     /// All that stood on the wire.
     pub wire: Vec<OnTheWire>,
@@ -94,7 +94,7 @@ pub struct Bench {
     packets: u64,
     free: Micros,
     held: Option<Sent>,
-    /// Which seats hear an identifier.
+    /// The cell slots that receive an identifier.
     hearers: HashMap<u32, Vec<usize>>,
     inlets: Vec<Inlet>,
     gateway_inlet: Inlet,
@@ -165,7 +165,7 @@ impl Bench {
         self.real.as_ref().map_or(&[], |real| &real.attempts)
     }
 
-    /// One more cell, switched off; returns its seat.
+    /// One more cell, switched off; returns its slot.
     pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
         let cell_slot = self.cell_slots.len();
         for id in identity.hears().into_iter().flatten() {
@@ -380,7 +380,7 @@ impl Bench {
         lines.chain([end]).collect()
     }
 
-    /// The torques that stood on the wire whole: epoch and words, in their order, of one cell.
+    /// The complete torques of one cell on the wire: epoch and words, in their order.
     #[must_use]
     pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.oracle.torques(place)

@@ -18,18 +18,18 @@ pub(crate) type Waiting = (Micros, Frame);
 /// A cell, or the place for one.
 #[derive(Debug)]
 pub struct CellSlot {
-    /// Who sits here.
+    /// Its identity.
     pub identity: Identity,
     /// What its flash holds.
     pub flash: Flash,
-    /// From hearing something to answering it.
+    /// From receiving something to answering it.
     pub thinks: Span,
     /// How often it was switched on: packets of an earlier life are not this one's.
     pub lives: u32,
     format: Format,
     /// While it hangs, frames gather in its socket.
     life: Life<Waiting>,
-    /// Another cell has its number; that one's serial number.
+    /// The serial number of another cell with its node id.
     gave_up: Option<u32>,
     /// When it wants to be woken.
     pub(crate) wake: Option<Micros>,

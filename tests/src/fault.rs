@@ -1,4 +1,4 @@
-//! What a bus does wrong: seeded, for everybody or for one receiver, by sender, kind and time.
+//! Faults of a bus: seeded, for all receivers or one, by sender, kind and time.
 
 use std::ops::Range;
 
@@ -13,9 +13,9 @@ use rand_pcg::Pcg64Mcg;
 pub enum Party {
     /// The gateway; it also reads its own frames back.
     Gateway,
-    /// The cell on this seat, see [`crate::bench::Bench`].
+    /// The cell in this slot, see [`crate::bench::Bench`].
     CellSlot(usize),
-    /// Somebody at a shell, another gateway, a babbling idiot: sends and does not listen.
+    /// A test client, another gateway, a babbling idiot: sends and does not receive.
     UnknownNode,
 }
 
@@ -33,7 +33,7 @@ pub enum Harm {
     /// One to three of its bits are turned, in the identifier, the data or the CRC.
     Flip,
     /// Its last bytes are missing.
-    LinkDown,
+    Truncate,
 }
 
 impl Harm {
@@ -44,11 +44,11 @@ impl Harm {
         Self::Duplicate,
         Self::Reorder,
         Self::Flip,
-        Self::LinkDown,
+        Self::Truncate,
     ];
 }
 
-/// Whom a harm hits.
+/// Which receivers a fault affects.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Hits {
     /// The frame as it stands on the wire: everybody gets the same.
@@ -119,9 +119,9 @@ impl Fault {
     }
 }
 
-/// What a frame has become.
+/// The effect of faults on a frame.
 #[derive(Clone, Copy, Debug)]
-pub struct BroadcastStatus {
+pub struct Effect {
     /// The frame that comes.
     pub frame: Frame,
     /// How often it comes.
@@ -158,36 +158,29 @@ impl Faults {
         self.all.clear();
     }
 
-    /// What becomes of a frame on the wire (`to` is `None`), or on its way from there to a receiver.
-    pub fn broadcast_status(
-        &mut self,
-        now: Micros,
-        from: Party,
-        to: Option<Party>,
-        frame: Frame,
-    ) -> BroadcastStatus {
-        let mut broadcast_status =
-            BroadcastStatus { frame, times: 1, delay: Span(0), after_next: false, damage: None };
+    /// The effect on a frame on the wire (`to` is `None`), or on its way from there to a receiver.
+    pub fn effect(&mut self, now: Micros, from: Party, to: Option<Party>, frame: Frame) -> Effect {
+        let mut effect = Effect { frame, times: 1, delay: Span(0), after_next: false, damage: None };
         let kind = Id::from_bits(u16::try_from(frame.id()).unwrap_or(u16::MAX)).kind;
         for fault in &self.all {
             if !fault.may_hit(now, from, to, kind) || !self.dice.random_bool(fault.probability) {
                 continue;
             }
             match fault.harm {
-                Harm::Lose => broadcast_status.times = 0,
-                Harm::Delay(most) => broadcast_status.delay = Span(self.dice.random_range(0..=most.0)),
-                Harm::Duplicate => broadcast_status.times *= 2,
-                Harm::Reorder => broadcast_status.after_next = true,
-                Harm::Flip => broadcast_status.frame = flipped(broadcast_status.frame, &mut self.dice),
-                Harm::LinkDown => broadcast_status.frame = link_down(broadcast_status.frame, &mut self.dice),
+                Harm::Lose => effect.times = 0,
+                Harm::Delay(most) => effect.delay = Span(self.dice.random_range(0..=most.0)),
+                Harm::Duplicate => effect.times *= 2,
+                Harm::Reorder => effect.after_next = true,
+                Harm::Flip => effect.frame = flipped(effect.frame, &mut self.dice),
+                Harm::Truncate => effect.frame = truncated(effect.frame, &mut self.dice),
             }
             match fault.harm {
-                Harm::LinkDown => broadcast_status.damage = Some(Harm::LinkDown),
-                Harm::Flip => broadcast_status.damage = broadcast_status.damage.or(Some(Harm::Flip)),
+                Harm::Truncate => effect.damage = Some(Harm::Truncate),
+                Harm::Flip => effect.damage = effect.damage.or(Some(Harm::Flip)),
                 Harm::Lose | Harm::Delay(_) | Harm::Duplicate | Harm::Reorder => {}
             }
         }
-        broadcast_status
+        effect
     }
 }
 
@@ -211,7 +204,7 @@ fn flipped(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     Frame::with_data(id, frame.format(), frame.flags(), &data).unwrap_or(frame)
 }
 
-fn link_down(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
+fn truncated(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     let keep = dice.random_range(0..frame.data().len().max(1));
     let data = frame.data().get(..keep).unwrap_or_default();
     Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), data).unwrap_or(frame)

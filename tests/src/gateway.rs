@@ -25,11 +25,11 @@ pub struct Gateway {
     pub table: Table,
     /// What every tick was like.
     pub records: Vec<Record>,
-    /// What people were told, and when.
+    /// The notices, and when.
     pub notices: Vec<(Micros, Notice)>,
-    /// Whether the bus works, as the loop is told.
+    /// Whether the bus works, as the loop gets it.
     pub works: bool,
-    /// Whether it tells a cell that started anew what it feels.
+    /// Whether it sends a restarted cell its stimulus again.
     pub reminds: bool,
     /// Broadcasts skipped with their ticks.
     pub broadcasts_skipped: u64,
@@ -38,7 +38,7 @@ pub struct Gateway {
     positions: VecDeque<(Epoch, [f64; WORDS])>,
     touches: Touches,
     script_epoch: u64,
-    /// What each cell was last told to feel from a test.
+    /// The last stimulus of each cell from a test.
     pressed: Vec<SkinSensors>,
     nodes: Vec<CellId>,
     began: Option<Micros>,
@@ -101,7 +101,7 @@ impl Gateway {
         self.skip += ticks;
     }
 
-    /// The stimulus that makes a cell, by its place in the skin, feel this.
+    /// The stimulus with these sensors for a cell, by its place in the skin.
     #[must_use]
     pub fn stimulus(&mut self, place: usize, from: From, sensors: SkinSensors) -> Option<Message> {
         *self.pressed.get_mut(place)? = sensors;

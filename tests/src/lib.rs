@@ -2,16 +2,16 @@
 //! bus that is a variable.
 //!
 //! ```text
-//!                  +-- Bench: one queue of events, one clock that only moves when told to --+
+//!                  +-- Bench: one queue of events, one clock, moved by the test alone ------+
 //!                  |                                                                         |
 //!   cell_node::Node ──> packets ──> [ wire: one total order ] ──> [ each receiver: delay ] ──┼─> Node
-//!   control::Cycle  ──> joints  ──>   Faults hit everybody          Faults hit one of them   ├─> Table
-//!   a stranger      ──> anything                                                             |
-//!                  +--------------------------------------------------- Witness looks on ---+
+//!   control::Cycle  ──> joints  ──>   faults for all receivers      faults for one of them   ├─> Table
+//!   an unknown node ──> anything                                                             |
+//!                  +------------------------------- an oracle compares the table's sums ----+
 //! ```
 //!
 //! Nothing sleeps, nothing reads a clock, and everything random comes from one seed: the same seed is the
-//! same run, byte for byte. [`accounts::check`] holds what must be true of every run, whatever was broken.
+//! same run, byte for byte. [`accounts::check`] has the invariants of every run.
 
 pub mod accounts;
 mod agenda;

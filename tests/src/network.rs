@@ -1,8 +1,8 @@
 //! Cells wired to each other at random, in virtual time: whether they become a tree, stay one, and never count a
 //! cell twice.
 //!
-//! Every cell has a torque of its own, drawn at random, so that a sum tells which cells are in it: what a cell says
-//! must be its own torque and some of the sums that its neighbours said in that epoch, and only one choice fits.
+//! Every cell has a random torque of its own, so that a sum shows which cells are in it: a cell's sum must be its own
+//! torque and some of its neighbours' sums of that epoch, and only one choice fits.
 
 #![expect(
     clippy::indexing_slicing,
@@ -42,9 +42,9 @@ pub use place::Place;
 
 /// From one broadcast to the next.
 pub const PERIOD: Span = Span(16_000);
-/// From saying something to hearing it, at least and at most.
+/// From sending to receiving, at least and at most.
 const LATENCY: (u64, u64) = (10, 60);
-/// From hearing something to answering it.
+/// From receiving something to answering it.
 const THINKS: Span = Span(30);
 /// The joints' positions in quarter turns, the same in every epoch.
 fn positions() -> [Q1_14; WORDS] {
@@ -178,22 +178,22 @@ impl Wiring {
         self.uplinks = Uplinks::new(self.roots.len(), 0, self.agenda.now);
     }
 
-    /// A broken direction of a wire: what `cell` says through `port` is not heard.
-    pub fn link_down(&mut self, cell: usize, port: usize, is_link_down: bool) {
+    /// One direction of a wire goes down, or up: messages of `cell` through `port` do not arrive.
+    pub fn set_link_down(&mut self, cell: usize, port: usize, is_down: bool) {
         if let Some(End::Cell(other, at)) = self.cells[cell].wires[port] {
-            self.cells[other].deaf[at] = is_link_down;
-            self.report_links_down(other);
+            self.cells[other].deaf[at] = is_down;
+            self.send_links_down(other);
         }
     }
 
-    /// As the gateway tells a cell which of its ports are cut.
-    pub fn report_links_down(&mut self, cell: usize) {
+    /// Sends a cell which of its links are down, as the gateway does.
+    pub fn send_links_down(&mut self, cell: usize) {
         let place = &self.cells[cell];
-        let Some(number) = place.number else { return };
+        let Some(node_id) = place.node_id else { return };
         let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
         let request =
             Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
-        let message = Message::Configure { to: protocol::id::Node::Cell(number), tag: 0, request };
+        let message = Message::Configure { to: protocol::id::Node::Cell(node_id), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         self.hand(cell, self.agenda.now, Inlet::Frame(frame));
     }
@@ -207,7 +207,7 @@ impl Wiring {
     /// A cell is switched on, or off and on.
     pub fn start(&mut self, cell: usize) {
         let (now, place) = (self.agenda.now, &mut self.cells[cell]);
-        let identity = Identity { cell: place.number, serial: place.serial };
+        let identity = Identity { cell: place.node_id, serial: place.serial };
         let wired = place.wires.iter().enumerate().filter(|(_, wire)| wire.is_some());
         let wired = wired.map(|(port, _)| 1 << port).sum();
         let node = Node::new(identity, Format::Fd, &Flash::Sound(place.parameters), true, now);
@@ -265,11 +265,11 @@ impl Wiring {
             }
             Event::ToGateway(root, message) => {
                 self.uplinks.handle(self.agenda.now, root, message);
-                self.gateway_says();
+                self.gateway_sends();
             }
             Event::GatewayWake => {
                 self.uplinks.handle_time(self.agenda.now);
-                self.gateway_says();
+                self.gateway_sends();
                 let next = self.uplinks.poll_timeout().max(self.agenda.now + Span(500));
                 self.agenda.enter(next, Event::GatewayWake);
             }
@@ -287,7 +287,7 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// What a cell hears aside is read when something else wakes it, and before that.
+    /// Deferred frames are read when something else wakes the cell, before that.
     fn receive_deferred(&mut self, cell: usize) {
         let now = self.agenda.now;
         loop {
@@ -320,16 +320,16 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// Takes what a cell has to say, and when it wants to be woken.
+    /// Takes the messages of a cell, and its next timeout.
     fn after(&mut self, cell: usize) {
         let place = &mut self.cells[cell];
         let Life::Runs(node) = &mut place.life else { return };
         if let Some(kept) = node.poll_store() {
-            place.number = kept.number;
+            place.node_id = kept.number;
             node.handle_stored(true);
         }
-        assert_eq!(node.taken(), None, "cell {cell} gave up its number {:?}", place.number);
-        // What it hears is asked for each frame that comes.
+        assert_eq!(node.taken(), None, "cell {cell} gave up its node id {:?}", place.node_id);
+        // Its subscriptions are checked for each frame that comes.
         let _ = node.poll_hears();
         let mut messages = Vec::new();
         while let Some(message) = node.poll_port_transmit() {
@@ -371,14 +371,14 @@ impl Wiring {
                     self.cells[cell].ports = Some(ports);
                 }
                 Message::Network { page: NetworkPage::Heartbeat(_), .. } => {
-                    self.uplinks.claimed(self.cells[cell].number.expect("who speaks has a number"));
+                    self.uplinks.claimed(self.cells[cell].node_id.expect("a cell that sends has a node id"));
                 }
                 _ => {}
             }
         }
     }
 
-    /// When something that is said now comes in; what was said before comes in before.
+    /// When something that is sent now arrives; messages keep their order.
     fn arrival(&mut self, at: Option<usize>) -> Micros {
         let arrives = self.agenda.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
@@ -386,7 +386,7 @@ impl Wiring {
         *newest
     }
 
-    fn gateway_says(&mut self) {
+    fn gateway_sends(&mut self) {
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if self.loss > 0.0 && self.dice.random_bool(self.loss) {
                 continue;
@@ -397,7 +397,7 @@ impl Wiring {
         }
     }
 
-    /// The gateway says something to every cell that hears it.
+    /// The gateway sends something to every cell that receives it.
     pub fn say(&mut self, message: &Message) {
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         for cell in 0..self.cells.len() {
@@ -427,7 +427,7 @@ impl Wiring {
         self.ticking = false;
     }
 
-    /// Every cell is told to answer with sums.
+    /// Switches every cell to sums.
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");
@@ -436,12 +436,12 @@ impl Wiring {
         self.say(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
     }
 
-    /// A cell is pressed, or let go, from the next joints on.
+    /// A cell is pressed, or released, from the next joints on.
     pub fn press(&mut self, cell: usize, pressed: bool) {
-        let Some(number) = self.cells[cell].number else { return };
+        let Some(node_id) = self.cells[cell].node_id else { return };
         let word = Q5_10::from_bits(i16::try_from(self.cells[cell].force.steps() >> 6).expect("a word"));
         let contact = if pressed { [word, Q5_10::ZERO, Q5_10::ZERO] } else { [Q5_10::ZERO; 3] };
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(number), from: From::Next, page });
+        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(node_id), from: From::Next, page });
     }
 }

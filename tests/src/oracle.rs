@@ -36,8 +36,8 @@ impl Truth {
     /// The same after more damage; what is cut is cut, whatever else was done to it.
     #[must_use]
     pub(crate) fn and(self, damage: Option<Harm>) -> Self {
-        let link_down = [self.damage, damage].contains(&Some(Harm::LinkDown));
-        Self { damage: if link_down { Some(Harm::LinkDown) } else { self.damage.or(damage) }, ..self }
+        let link_down = [self.damage, damage].contains(&Some(Harm::Truncate));
+        Self { damage: if link_down { Some(Harm::Truncate) } else { self.damage.or(damage) }, ..self }
     }
 
     /// The same, knowing what came: bits that were turned twice are right again.
@@ -62,15 +62,15 @@ pub struct Tally {
     pub stale: u64,
     /// Frames with turned bits.
     pub flipped: u64,
-    /// Frames that were cut.
-    pub link_down: u64,
+    /// Truncated frames.
+    pub truncated: u64,
     /// Frames that somebody babbled.
     pub babbled: u64,
     /// Own broadcasts.
     pub broadcasts: u64,
 }
 
-/// A cell as the witness sees it.
+/// The oracle's state of a cell.
 #[derive(Clone, Debug, Default)]
 struct Mirror {
     /// The broadcast that its newest torque answered.
@@ -80,16 +80,16 @@ struct Mirror {
     value: [i32; WORDS],
     torques: Vec<(u8, [i16; WORDS])>,
     arrived: u64,
-    /// Who has the number, by the last word that was no claim.
+    /// The owner of the node id, by the last heartbeat that was no claim.
     holder: Option<Party>,
 }
 
-/// The witness of one bus.
+/// The oracle of one bus.
 #[derive(Debug)]
 pub struct Oracle {
     /// What came.
     pub tally: Tally,
-    /// Whether the sum is compared; several cells under one number are beyond it.
+    /// Whether the sum is compared; several cells with one node id are not supported.
     pub compares: bool,
     format: Format,
     safety: Safety,
@@ -140,7 +140,7 @@ impl Oracle {
         let truth = &truth.on_arrival(frame);
         self.tally.frames += 1;
         match truth.damage {
-            Some(Harm::LinkDown) => self.tally.link_down += 1,
+            Some(Harm::Truncate) => self.tally.truncated += 1,
             Some(_) => self.tally.flipped += 1,
             None => self.tally.babbled += u64::from(truth.packet.is_none()),
         }
@@ -151,7 +151,7 @@ impl Oracle {
         }
         self.tally.packets += 1;
         if message == Message::Halt {
-            self.mirrors.iter_mut().for_each(Mirror::released);
+            self.mirrors.iter_mut().for_each(Mirror::release);
         }
         let node = match Node::from_byte(packet.id.node) {
             Node::Cell(cell) => cell.get(),
@@ -180,11 +180,11 @@ impl Oracle {
             }
             Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 mirror.arrived += 1;
-                // Who claims a number says nothing of the cell that has it.
+                // An address claim does not change the owner's state.
                 let claims = heartbeat.state.has(State::CLAIMING);
                 let challenges = claims && mirror.holder.is_some_and(|holder| holder != truth.from);
                 if !heartbeat.state.has(State::ACTIVE) && !challenges {
-                    mirror.released();
+                    mirror.release();
                 }
                 if !claims {
                     mirror.holder = Some(truth.from);
@@ -210,19 +210,19 @@ impl Oracle {
             Message::Joints { epoch, .. } if self.broadcasts.last() == Some(&epoch) => {}
             Message::Joints { epoch, .. } => {
                 self.tally.broadcasts += 1;
-                // So many broadcasts did not stand on the bus that the loop has let go of everything meanwhile.
+                // After so many broadcasts that were not on the bus, all torques have decayed in the loop.
                 let recent = self.broadcasts.iter().rev().take(LATEST);
                 let passed = recent.map(|&before| epoch.since(before)).min().unwrap_or(1);
                 if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
-                    self.mirrors.iter_mut().for_each(Mirror::released);
+                    self.mirrors.iter_mut().for_each(Mirror::release);
                 }
                 self.broadcasts.push(epoch);
                 let newest = self.broadcasts.len() - 1;
                 for mirror in &mut self.mirrors {
-                    mirror.grow_old(newest, &self.safety);
+                    mirror.decay(newest, &self.safety);
                 }
             }
-            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::released),
+            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::release),
             Message::Sync
             | Message::Resume
             | Message::Report
@@ -241,7 +241,7 @@ impl Oracle {
         if self.format == Format::Fd {
             return truth.damage.is_none();
         }
-        if truth.damage == Some(Harm::LinkDown) {
+        if truth.damage == Some(Harm::Truncate) {
             return false;
         }
         let Some(last) = self.segments.get_mut(usize::try_from(frame.id()).unwrap_or(usize::MAX)) else {
@@ -251,7 +251,7 @@ impl Oracle {
             *last = None;
             return false;
         }
-        // An equal first half is as good as the packet's own.
+        // An equal first segment is as good as the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
         let in_time =
             |since| truth.packet.is_some_and(|packet| stood.since(since) <= Segment::within(packet.id));
@@ -261,12 +261,12 @@ impl Oracle {
         whole
     }
 
-    /// What people were told: of a cell that fell silent nothing is held.
+    /// Takes a notice: nothing is held of a silent cell.
     pub(crate) fn notice(&mut self, notice: Notice) {
         let (Notice::Dead(cell) | Notice::Restarted(cell)) = notice else { return };
         let place = self.places.get(usize::from(cell.get())).copied().flatten();
         if let Some(mirror) = place.and_then(|place| self.mirrors.get_mut(place)) {
-            mirror.released();
+            mirror.release();
         }
     }
 
@@ -296,22 +296,22 @@ impl Oracle {
 }
 
 impl Mirror {
-    fn released(&mut self) {
+    fn release(&mut self) {
         self.held = None;
         self.value = [0; WORDS];
     }
 
-    /// Held, then let go in equal steps, then nothing.
-    fn grow_old(&mut self, newest: usize, safety: &Safety) {
+    /// Held, then decays to zero in equal steps.
+    fn decay(&mut self, newest: usize, safety: &Safety) {
         let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
         let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);
         // The newest broadcast has had no time to be answered.
-        let nack = (newest - answered).saturating_sub(1);
-        let left = (hold + decay).saturating_sub(nack);
-        self.value = match nack {
-            nack if nack <= hold => held,
-            _ if left == 0 => [0; WORDS],
-            _ => held.map(|word| word * as_i32(left) / as_i32(decay)),
+        let unanswered = (newest - answered).saturating_sub(1);
+        let remaining = (hold + decay).saturating_sub(unanswered);
+        self.value = match unanswered {
+            _ if unanswered <= hold => held,
+            _ if remaining == 0 => [0; WORDS],
+            _ => held.map(|word| word * as_i32(remaining) / as_i32(decay)),
         };
     }
 }

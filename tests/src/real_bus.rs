@@ -1,4 +1,4 @@
-//! The wire of a bench as a real bus has it: with bit rates, arbitration and queues.
+//! The wire of a bench as a real bus: with bit rates, arbitration and queues.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use protocol::can::Frame;
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};
 
-/// A frame that somebody wanted to send, and when.
+/// A frame that was to be sent, and when.
 pub type Requested = (Micros, Frame);
 
 /// A real bus, and what waits to go out on it.
@@ -32,8 +32,8 @@ impl<T> RealBus<T> {
         }
     }
 
-    /// Somebody wants to send a frame now.
-    pub(crate) fn probe(&mut self, now: Micros, frame: &Frame, item: T) {
+    /// A frame is to be sent now.
+    pub(crate) fn request(&mut self, now: Micros, frame: &Frame, item: T) {
         let Some(bits) = Bits::of(frame) else { return };
         let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
         let request = Request { at: now.0 * 1_000, priority: Priority::of(frame), bits, queue: None, tag };

@@ -7,10 +7,10 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 
 /// A UR5 with `cells` cells on one bus, spread over its joints, every one with another pose; thresholds
-/// of 0.1 N, proximity not used; torques held for 2 epochs, let go over 4.
+/// of 0.1 N, proximity not used; torques held for 2 epochs, and decaying over 4.
 ///
 /// # Panics
-/// With more cells than a bus has numbers.
+/// With more cells than a bus has node ids.
 #[must_use]
 pub fn arm(cells: u8, format: Format) -> Skin {
     let format = match format {

@@ -267,14 +267,14 @@ impl Workshop {
         let all = self.pieces.iter().enumerate();
         let hearers: Vec<_> = all.filter(|(_, piece)| hears(piece)).map(|(place, _)| place).collect();
         for place in hearers.into_iter().filter(|place| from != Some(*place)) {
-            for frame in self.broadcast_status(frame) {
+            for frame in self.arriving(frame) {
                 let at = self.arrival(self.pieces.get(place).map(|piece| piece.newest));
                 self.pieces.get_mut(place).into_iter().for_each(|piece| piece.newest = at);
                 self.agenda.enter(at, Event::ToCell(place, frame));
             }
         }
         if from.is_some() {
-            for frame in self.broadcast_status(frame) {
+            for frame in self.arriving(frame) {
                 self.gateway_newest = self.arrival(Some(self.gateway_newest));
                 self.agenda.enter(self.gateway_newest, Event::ToGateway(frame));
             }
@@ -286,8 +286,8 @@ impl Workshop {
         newest.map_or(at, |newest| at.max(newest))
     }
 
-    /// What comes of a frame at one receiver.
-    fn broadcast_status(&mut self, frame: Frame) -> Vec<Frame> {
+    /// The copies of a frame that arrive at one receiver.
+    fn arriving(&mut self, frame: Frame) -> Vec<Frame> {
         if self.dice.random_bool(self.loss) {
             return Vec::new();
         }
@@ -317,11 +317,11 @@ fn damaged(frame: Frame, bit: usize) -> Frame {
     Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), &data).unwrap_or(frame)
 }
 
-/// A cell's number that a test names.
+/// The node id of a number.
 ///
 /// # Panics
 /// When there is none.
 #[must_use]
-pub fn cell(number: u8) -> CellId {
-    CellId::new(number.into()).expect("a cell's number")
+pub fn cell(node: u8) -> CellId {
+    CellId::new(node.into()).expect("a node id")
 }

@@ -1,4 +1,4 @@
-//! Whole benches on which cells fall silent, hang, start anew, or share a number.
+//! Whole benches on which cells fall silent, hang, restart, or share a node id.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -44,7 +44,7 @@ fn magnitude(torque: &[f64; WORDS]) -> f64 {
 }
 
 #[test]
-fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
+fn a_stale_cells_torque_is_held_and_then_decays_to_zero() {
     let mut bench = bench(1);
     bench.press(CELL, 3.0);
     bench.run_epochs(3);
@@ -60,7 +60,7 @@ fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
             (part, snapshot.age, snapshot.stale, snapshot.contributing)
         })
         .collect();
-    // Nobody can tell whether the newest broadcast is missed; then held for 2 epochs, let go over 4.
+    // The newest broadcast may still be answered; then held for 2 epochs, and decaying over 4.
     let expected = [
         (1.0, 0, 0, 1),
         (1.0, 1, 1, 1),
@@ -82,7 +82,7 @@ fn a_stale_cells_torque_is_held_then_decays_then_vanishes_and_stays_unknown() {
 }
 
 #[test]
-fn a_heartbeat_that_says_quiet_clears_a_held_torque() {
+fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
     let mut skin = skins::arm(4, Format::Fd);
     skin.safety.hold_epochs = 10_000;
     let mut bench = Bench::new(&skin, 2).started();
@@ -122,8 +122,8 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
 
         bench.act(Act::Start(CELL));
         bench.run(START);
-        let told: Vec<_> = bench.gateway.notices[1..].iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(told, [Notice::Back(node), Notice::Restarted(node)]);
+        let notices: Vec<_> = bench.gateway.notices[1..].iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(notices, [Notice::Back(node), Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
         assert_eq!(bench.gateway.table.snapshot().sums.dead, 0);
         let before = replies(&bench, CELL);
@@ -153,7 +153,7 @@ fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
 }
 
 #[test]
-fn replies_that_a_cell_owed_when_it_restarted_are_in_doubt() {
+fn outstanding_replies_of_a_restarted_cell_are_in_doubt() {
     let mut bench = bench(12);
     bench.press(CELL, 2.0);
     bench.run_epochs(20);
@@ -168,7 +168,7 @@ fn replies_that_a_cell_owed_when_it_restarted_are_in_doubt() {
 }
 
 #[test]
-fn a_cell_that_restarts_unheard_is_noticed_by_its_count() {
+fn a_restart_without_its_claim_is_detected_by_the_counter() {
     for seed in 0..20 {
         let mut bench = bench(seed);
         bench.press(CELL, 2.0);
@@ -180,8 +180,8 @@ fn a_cell_that_restarts_unheard_is_noticed_by_its_count() {
         bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::CellSlot(CELL)).during(claim));
         bench.run(START);
         let node = bench.cell_slots[CELL].identity.cell.unwrap();
-        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(told, [Notice::Restarted(node)]);
+        let notices: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(notices, [Notice::Restarted(node)]);
         assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
         finish(&mut bench);
         let uplink = bench.gateway.table.cells()[CELL].uplink();
@@ -190,7 +190,7 @@ fn a_cell_that_restarts_unheard_is_noticed_by_its_count() {
 }
 
 #[test]
-fn a_restarted_cell_feels_nothing_until_it_is_told_again() {
+fn a_restarted_cell_is_not_in_contact_until_the_stimulus_is_sent_again() {
     let mut bench = bench(3);
     bench.gateway.reminds = false;
     bench.press(CELL, 2.0);
@@ -233,7 +233,7 @@ fn joints_older_than_a_period_are_skipped_and_explain_what_is_missing() {
 }
 
 #[test]
-fn joints_that_a_cell_never_heard_are_told_apart_from_those_it_skipped() {
+fn lost_joints_and_skipped_joints_are_counted_apart() {
     let mut bench = bench(4);
     bench.press(CELL, 2.0);
     bench.run_epochs(5);
@@ -262,7 +262,7 @@ fn a_long_run_does_not_confuse_the_count_of_joints() {
 }
 
 #[test]
-fn a_cell_that_hung_feels_what_was_said_meanwhile_and_no_stimulus_is_refused() {
+fn a_cell_that_hung_takes_the_stimuli_of_meanwhile_and_refuses_none() {
     let mut bench = bench(6);
     bench.run_epochs(5);
     bench.act(Act::Hang(CELL));
@@ -280,7 +280,7 @@ fn a_cell_that_hung_feels_what_was_said_meanwhile_and_no_stimulus_is_refused() {
 }
 
 #[test]
-fn of_two_cells_with_one_number_exactly_one_stays_whenever_they_start() {
+fn of_two_cells_with_one_node_id_exactly_one_stays_whenever_they_start() {
     for apart in (0..900_000).step_by(17_000) {
         for (serial, seed) in [(1, 1), (900_000, 2)] {
             let skin = skins::arm(2, Format::Fd);
@@ -303,7 +303,7 @@ fn of_two_cells_with_one_number_exactly_one_stays_whenever_they_start() {
 }
 
 #[test]
-fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_it_claims() {
+fn an_address_claim_for_a_settled_cells_node_id_changes_nothing_and_is_noticed() {
     let mut claims = [0, 0];
     for start in 0..12 {
         let serial = [1, 1_023][start % 2];
@@ -328,10 +328,10 @@ fn a_newcomer_under_a_settled_cells_number_changes_nothing_and_is_noticed_when_i
         let claimed = claim.is_some();
         claims[usize::from(claimed)] += 1;
         let node = bench.cell_slots[0].identity.cell.unwrap();
-        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(told, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
-        if let (Some(claim), Some((told, _))) = (claim, bench.gateway.notices.first()) {
-            assert!(told.since(claim) < Span::from_millis(6), "a claim is answered at once");
+        let notices: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(notices, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
+        if let (Some(claim), Some((at, _))) = (claim, bench.gateway.notices.first()) {
+            assert!(at.since(claim) < Span::from_millis(6), "a claim is answered at once");
         }
         assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
         finish(&mut bench);
@@ -361,7 +361,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
 }
 
 #[test]
-fn a_damaged_flash_is_said_and_nothing_is_due() {
+fn a_damaged_flash_is_reported_and_nothing_is_due() {
     let skin = skins::arm(2, Format::Fd);
     let mut bench = Bench::with(&skin, &model::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
     bench.cell_slots[0].flash = Flash::Damaged;

@@ -1,5 +1,5 @@
-//! Whole benches on which much goes wrong, for hundreds of seeds: nothing panics, every account adds up,
-//! and every torque that a tick takes is the one that the witness expects.
+//! Whole benches with many faults, for hundreds of seeds: nothing panics, every account adds up,
+//! and every torque that a tick takes is the one that the oracle expects.
 
 #![allow(
     clippy::unwrap_used,
@@ -25,16 +25,16 @@ use skinbus_tests::skins;
 const SEEDS: u64 = 100;
 const CELLS: u8 = 5;
 
-/// The last of these lines says which run failed.
-fn rank(harm: Option<Harm>, format: Format, seed: u64) {
+/// The last of these lines names the run that failed.
+fn print_run(harm: Option<Harm>, format: Format, seed: u64) {
     println!("{harm:?} {format:?} seed {seed}");
 }
 
-/// A bench of five cells that are pressed and let go for two seconds while `breaks` breaks things.
-fn campaign(skin: &Skin, seed: u64, breaks: impl Fn(&mut Bench, &mut Pcg64Mcg)) -> Bench {
+/// A bench of five cells that are pressed and released for two seconds with the faults of `inject`.
+fn campaign(skin: &Skin, seed: u64, inject: impl Fn(&mut Bench, &mut Pcg64Mcg)) -> Bench {
     let mut dice = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(skin, seed).started();
-    breaks(&mut bench, &mut dice);
+    inject(&mut bench, &mut dice);
     for _ in 0..25 {
         let place = dice.random_range(0..usize::from(CELLS));
         bench.press(place, if dice.random_bool(0.3) { 0.0 } else { dice.random_range(0.2..3.0) });
@@ -88,7 +88,7 @@ fn every_harm_to_every_receiver_by_itself() {
         let skin = skins::arm(CELLS, format);
         for harm in Harm::ALL {
             for seed in 0..SEEDS / 2 {
-                rank(Some(harm), format, seed);
+                print_run(Some(harm), format, seed);
                 campaign(&skin, seed, |bench, _| bench.fault(Fault::new(harm, 0.1)));
             }
         }
@@ -101,7 +101,7 @@ fn every_harm_on_the_wire() {
         let skin = skins::arm(CELLS, format);
         for harm in Harm::ALL {
             for seed in 0..SEEDS / 2 {
-                rank(Some(harm), format, seed);
+                print_run(Some(harm), format, seed);
                 campaign(&skin, seed, |bench, _| bench.fault(Fault::new(harm, 0.1).on_the_wire()));
             }
         }
@@ -121,7 +121,7 @@ fn everything_at_once() {
     for format in [Format::Fd, Format::Classic] {
         let skin = skins::arm(CELLS, format);
         for seed in 0..2 * SEEDS {
-            rank(None, format, seed);
+            print_run(None, format, seed);
             campaign(&skin, seed, |bench, dice| {
                 (0..4).for_each(|_| bench.fault(some_fault(dice)));
                 some_trouble(bench, dice);

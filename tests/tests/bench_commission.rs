@@ -78,7 +78,7 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
 }
 
 #[test]
-fn who_has_it_already_is_left_alone_and_read_back_only_if_wished() {
+fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
     let (skin, old, new) = skin();
     let mut workshop =
         Workshop::of(&skin, 2, |place| Flash::Sound(if place == 3 { old(place) } else { new(place) }));
@@ -104,7 +104,7 @@ fn who_has_it_already_is_left_alone_and_read_back_only_if_wished() {
 }
 
 #[test]
-fn a_dry_run_writes_nothing_and_says_what_would_be() {
+fn a_dry_run_writes_nothing_and_reports_what_would_be_written() {
     let (skin, old, new) = skin();
     let flash = |place| Flash::Sound(if place < 5 { new(place) } else { old(place) });
     let mut workshop = Workshop::of(&skin, 3, flash);
@@ -232,7 +232,7 @@ fn nobody_claims(packet: Packet) -> Packet {
 }
 
 #[test]
-fn a_cell_that_was_switched_off_and_on_and_nobody_heard_it_says_so_at_the_commit() {
+fn an_undetected_restart_is_found_at_the_commit() {
     for seed in 0..SEEDS / 2 {
         let (skin, old, new) = skin();
         let flash = |place| Flash::Sound(old(place));
@@ -251,7 +251,7 @@ fn a_cell_that_was_switched_off_and_on_and_nobody_heard_it_says_so_at_the_commit
 }
 
 #[test]
-fn cells_are_known_by_their_serial_numbers_whatever_their_numbers_are() {
+fn cells_are_identified_by_serial_number_with_any_node_id() {
     let (skin, old, new) = skin();
     let mut workshop = Workshop::new(Format::Fd, 4);
     for (place, described) in skin.cells.iter().enumerate() {
@@ -262,13 +262,13 @@ fn cells_are_known_by_their_serial_numbers_whatever_their_numbers_are() {
     let report = workshop.commission(&skin, WISH, None);
     all(&report, Outcome::Written);
     assert_eq!(workshop.holding(new), usize::from(CELLS));
-    for cell in &report.cells {
-        assert_eq!(cell.number.unwrap().get(), CELLS + 1 - cell.described.get());
+    for found in &report.cells {
+        assert_eq!(found.number.unwrap().get(), CELLS + 1 - found.described.get());
     }
 }
 
 #[test]
-fn who_is_missing_is_named_and_who_is_not_the_skins_is_left_alone() {
+fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let (skin, old, _) = skin();
     let mut workshop = Workshop::of(&skin, 5, |place| Flash::Sound(old(place)));
     workshop.switch_off_in(Span(0), 4);
@@ -291,7 +291,7 @@ fn who_is_missing_is_named_and_who_is_not_the_skins_is_left_alone() {
 }
 
 #[test]
-fn a_cell_that_comes_late_has_its_turn() {
+fn a_late_cell_is_commissioned_too() {
     let (skin, old, new) = skin();
     let mut workshop = Workshop::of(&skin, 6, |place| Flash::Sound(old(place)));
     for place in 0..3 {
@@ -320,7 +320,7 @@ fn two_cells_with_one_serial_number_are_named_and_neither_is_written() {
 }
 
 #[test]
-fn joints_or_another_configuration_on_the_bus_end_it_before_a_word_is_said() {
+fn joints_or_another_configuration_on_the_bus_end_it_before_it_sends() {
     let (skin, old, _) = skin();
     let joints = Joints { in_use: 6, ..Joints::default() };
     let write = Request::Write { number: Parameter::Pose.number(), words: [1; WORDS] };
@@ -420,7 +420,7 @@ fn liar(packet: Packet) -> Packet {
 }
 
 #[test]
-fn what_reads_back_otherwise_is_written_again_and_named_in_the_end() {
+fn wrong_words_are_written_again_and_named_in_the_end() {
     let (skin, old, _) = skin();
     let mut workshop = Workshop::of(&skin, 12, |place| Flash::Sound(old(place)));
     workshop.forgers = Some((|packet| packet, liar));

@@ -33,7 +33,7 @@ fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
     explain(&bench.skin, &watch.moments().unwrap())
 }
 
-/// A bench whose cells are pressed and let go all the time, some so hard that they saturate.
+/// A bench whose cells are pressed and released all the time, some so hard that they saturate.
 fn pressed(seed: u64, format: Format) -> Bench {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(8, format), seed).started();
@@ -111,7 +111,7 @@ fn the_sum_is_the_one_that_the_gateway_has() {
 }
 
 #[test]
-fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
+fn unknown_causes_are_named_and_not_guessed() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 7).started();
     bench.press(0, 2.0);
     bench.run_epochs(4);
@@ -129,10 +129,14 @@ fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
     assert!(cell(zero).force.is_none() && cell(zero).rows.iter().all(|row| row.verdict == Verdict::Open));
     assert!(matches!(cell(one).force.unwrap().origin, Origin::Stimulus { from_epoch: None, .. }));
     let said = explanation.missing.join("\n");
-    let unknown =
-        format!("vcan0 {zero}: what it felt is not in the capture: no stimulus, start or sensors page of it");
+    let unknown = format!(
+        "vcan0 {zero}: its contact state is not in the capture: no stimulus, start or sensors page of it"
+    );
     assert!(said.contains(&unknown), "{said}");
-    assert!(said.contains("vcan0: 2 cells said nothing, and what they felt is not in the capture"), "{said}");
+    assert!(
+        said.contains("vcan0: 2 cells sent nothing, and their contact state is not in the capture"),
+        "{said}"
+    );
 
     // Without the torque, the sum is without it.
     let node = u32::from(one);
@@ -148,7 +152,7 @@ fn what_the_capture_does_not_tell_is_named_and_not_guessed() {
 }
 
 #[test]
-fn a_cell_that_has_just_started_says_nothing_and_one_that_releases_says_zeros() {
+fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
     (0..4).for_each(|place| bench.press(place, 2.0));
     bench.run_epochs(5);
@@ -161,10 +165,10 @@ fn a_cell_that_has_just_started_says_nothing_and_one_that_releases_says_zeros() 
     let explanation = explained(&bench, &bench.wire, epoch);
     let node = |place: usize| bench.skin.cells[place].node.get();
     let cell = |place: usize| explanation.cells.iter().find(|cell| cell.node == node(place));
-    // It was told again what it feels, and answers nothing while it claims its number.
+    // Its stimulus was sent again, and it answers nothing during its address claim.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch in time: it had just started and claimed its number; the words are without it",
+        "vcan0 {}: no torque of this epoch in time: it had just started and was claiming its node id; the words are without it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

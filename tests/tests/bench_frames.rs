@@ -1,4 +1,4 @@
-//! Whole benches on which frames come twice, late, in the wrong order, in halves, or from somebody else.
+//! Whole benches on which frames come twice, late, in the wrong order, in segments, or from other senders.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -149,7 +149,7 @@ fn epochs_may_jump_forward_and_back() {
     let before = replies(&bench);
     for _ in 0..300 {
         bench.run(Span(bench.epoch().0 / 2));
-        // As if it had been started anew, or a recording went round. Not the epoch of the last or next one.
+        // As if it had restarted, or a recording was repeated. Not the epoch of the last or next one.
         let ours = bench.gateway.broadcasts();
         let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
         let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
@@ -178,7 +178,7 @@ fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
 }
 
 #[test]
-fn a_touch_that_a_cell_never_heard_of_shows_as_missing_replies() {
+fn a_lost_stimulus_of_a_touch_shows_as_missing_replies() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
     bench.press(0, 2.0);
@@ -191,7 +191,7 @@ fn a_touch_that_a_cell_never_heard_of_shows_as_missing_replies() {
 }
 
 #[test]
-fn a_release_that_a_cell_never_heard_of_shows_as_torques_that_nobody_requested() {
+fn a_lost_stimulus_of_a_release_shows_as_torques_that_are_not_due() {
     let mut bench = pressed(Format::Fd, 10);
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
     bench.press(0, 0.0);
@@ -215,8 +215,8 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         bench.run(Span(5_000));
         assert_eq!(events(&bench, Event::OtherGateway), 1);
         assert_eq!(bench.gateway.table.snapshot().sums.other_gateways, 1);
-        let told: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(told, [Notice::OtherGateway]);
+        let notices: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
+        assert_eq!(notices, [Notice::OtherGateway]);
         finish(&mut bench);
         // What cells answered to the other one is nothing that this one uses.
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
@@ -224,24 +224,24 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
 }
 
 #[test]
-fn half_a_packet_that_is_lost_costs_that_packet_and_no_other() {
+fn a_lost_segment_loses_its_packet_and_no_other() {
     for seed in 0..20 {
         let mut bench = pressed(Format::Classic, seed);
         bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::Gateway).of(Kind::Torque));
         bench.run_epochs(100);
         finish(&mut bench);
         let Replies { due, missing, late, unasked, .. } = replies(&bench);
-        // Of two halves one is lost in 18 of 100 packets, both in one.
+        // One of two segments is lost in 18 of 100 packets, both in one.
         assert!(missing > 0 && missing < due * 28 / 100, "{:?}", replies(&bench));
         assert_eq!((late, unasked), (0, 0));
         let incomplete = events(&bench, Event::Incomplete);
         assert!(incomplete > 0 && incomplete <= missing, "{incomplete} of {missing}");
-        assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "no two halves of two packets");
+        assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "no segments of two packets are joined");
     }
 }
 
 #[test]
-fn cells_pair_segments_as_the_gateway_does() {
+fn cells_reassemble_segments_as_the_gateway_does() {
     for seed in 0..20 {
         let mut bench = pressed(Format::Classic, seed);
         bench.act(Act::Say(Message::Report));

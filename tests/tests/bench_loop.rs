@@ -45,7 +45,7 @@ fn q(bench: &Bench) -> [u64; WORDS] {
 }
 
 #[test]
-fn a_halt_from_anybody_stops_robot_and_cells_and_a_resume_lets_both_go_on() {
+fn a_halt_from_any_sender_stops_robot_and_cells_and_a_resume_continues_both() {
     let mut bench = pressed(1);
     bench.act(Act::Inject(Message::Halt));
     bench.run(Span(5_000));
@@ -82,7 +82,7 @@ fn bad_cycles_in_a_row_halt_the_robot_until_someone_resumes() {
     bench.run(Span(bench.gateway.period().0));
     bench.gateway.works = false;
     bench.run(Span(bench.gateway.period().0 * (limit - 1)));
-    assert_eq!(halted(&bench), None, "a good one begins the count anew");
+    assert_eq!(halted(&bench), None, "a good one restarts the count");
     assert_eq!(on_the_wire(&bench, Command::Halt, Party::Gateway), []);
     bench.run(Span(bench.gateway.period().0 * 50));
     assert_eq!(halted(&bench), Some(Halt::BadCycles(BadCycle::Torque)));
@@ -105,7 +105,7 @@ fn bad_cycles_in_a_row_halt_the_robot_until_someone_resumes() {
 }
 
 #[test]
-fn a_cell_that_did_not_hear_a_halt_is_found_out_by_its_heartbeat() {
+fn a_cell_that_lost_a_halt_is_found_by_its_heartbeat() {
     let mut bench = pressed(3);
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).from(Party::UnknownNode));
     bench.act(Act::Inject(Message::Halt));
@@ -143,7 +143,7 @@ fn skipped_ticks_skip_whole_broadcasts_and_are_counted() {
 }
 
 #[test]
-fn a_gateway_that_stops_broadcasting_holds_what_it_has_and_nobody_is_stale() {
+fn a_gateway_that_stops_broadcasting_holds_its_torques_and_no_cell_is_stale() {
     let mut bench = pressed(5);
     bench.run(Span(1_000));
     let torque = bench.gateway.table.snapshot().sums.torque;

@@ -1,7 +1,7 @@
-//! Cells wired at random become a tree, number themselves, lose wires and neighbours, and never count one twice.
+//! Cells wired at random become a tree with node ids, lose wires and neighbours, and never count a cell twice.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
-#![allow(clippy::print_stdout, reason = "how soon all are in again is worth a look")]
+#![allow(clippy::print_stdout, reason = "the times until all cells are in again are of interest")]
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,8 +15,8 @@ use rand_pcg::Pcg64Mcg;
 /// Cells are started in any order within a third of a second, and have until then to be a tree.
 const TREE_READY: Span = Span::from_millis(2_000);
 
-/// Starts all cells at random times, and waits until they are organised.
-fn organise(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
+/// Starts all cells at random times, and waits for the tree.
+fn wait_for_tree(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
     let mut starts: Vec<(u64, usize)> =
         (0..wiring.cells.len()).map(|cell| (dice.random_range(0..300), cell)).collect();
     starts.sort_unstable();
@@ -28,27 +28,31 @@ fn organise(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
     wiring.run(TREE_READY);
 }
 
-/// The tree spans what can be reached, numbers are dense and unique, and neighbours agree on their wires.
+/// The tree spans all reachable cells, node ids are dense and unique, and neighbours agree on their wires.
 fn check_tree_ready(wiring: &Wiring, seed: u64) {
     let reachable = wiring.reachable();
-    let mut numbers = BTreeSet::new();
+    let mut node_ids = BTreeSet::new();
     for (place, cell) in wiring.cells.iter().enumerate() {
         let reached = reachable.contains(&place);
-        assert_eq!(cell.number.is_some(), reached, "seed {seed}, cell {place}: {cell:?}");
-        if let Some(number) = cell.number {
-            assert!(numbers.insert(number.get()), "seed {seed}: number {number} twice");
-            assert!(wiring.route(place).is_some(), "seed {seed}: cell {place} has no way: {}", wiring.ways());
+        assert_eq!(cell.node_id.is_some(), reached, "seed {seed}, cell {place}: {cell:?}");
+        if let Some(node_id) = cell.node_id {
+            assert!(node_ids.insert(node_id.get()), "seed {seed}: node id {node_id} twice");
+            assert!(
+                wiring.route(place).is_some(),
+                "seed {seed}: cell {place} has no route: {}",
+                wiring.routes()
+            );
         }
     }
-    let dense = (1..=u8::try_from(numbers.len()).unwrap()).collect::<BTreeSet<_>>();
-    assert_eq!(numbers, dense, "seed {seed}: dense");
+    let dense = (1..=u8::try_from(node_ids.len()).unwrap()).collect::<BTreeSet<_>>();
+    assert_eq!(node_ids, dense, "seed {seed}: dense");
     for &place in &reachable {
-        let ports = wiring.cells[place].ports.expect("who is settled reports its ports").ports;
+        let ports = wiring.cells[place].ports.expect("a settled cell reports its ports").ports;
         for (port, state) in ports.iter().enumerate() {
             match wiring.cells[place].wires[port] {
                 Some(End::Cell(other, at)) => {
                     assert!(state.works, "seed {seed}: cell {place} port {port}");
-                    let there = wiring.cells[other].number.map_or(0, CellId::get);
+                    let there = wiring.cells[other].node_id.map_or(0, CellId::get);
                     assert_eq!((state.number, usize::from(state.port)), (there, at), "seed {seed}");
                 }
                 Some(End::Gateway(_)) | None => assert!(!state.hears, "seed {seed}"),
@@ -63,7 +67,7 @@ fn deepest(wiring: &Wiring) -> u8 {
     u8::try_from(depths.max().unwrap_or(0)).unwrap()
 }
 
-/// Everything that can be in a sum is in it, all the time.
+/// Presses all cells, so that every reachable cell is in every sum.
 fn press_all(wiring: &mut Wiring) {
     wiring.switch(deepest(wiring), false);
     wiring.run(Span::from_millis(1));
@@ -74,7 +78,7 @@ fn press_all(wiring: &mut Wiring) {
     wiring.run(Span(4 * PERIOD.0));
 }
 
-/// How many epochs in a row were not complete after something broke; the last of them must be.
+/// How many epochs in a row were not complete after a fault; the last one must be.
 fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
     let from = wiring.took.len();
     for _ in 0..epochs {
@@ -98,7 +102,7 @@ fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
     }
 }
 
-/// What breaks, or comes back.
+/// A random fault, or its end.
 fn inject_fault(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
     let cell = dice.random_range(0..wiring.cells.len());
     let port = dice.random_range(0..4);
@@ -112,21 +116,21 @@ fn inject_fault(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
             format!("hang {cell}")
         }
         2 | 3 => {
-            wiring.link_down(cell, port, true);
-            format!("cut {cell} port {port}")
+            wiring.set_link_down(cell, port, true);
+            format!("link_down {cell} port {port}")
         }
         4 => {
-            wiring.link_down(cell, port, true);
+            wiring.set_link_down(cell, port, true);
             if let Some(End::Cell(other, at)) = wiring.cells[cell].wires[port] {
-                wiring.link_down(other, at, true);
+                wiring.set_link_down(other, at, true);
             }
-            format!("cut {cell} port {port} both ways")
+            format!("link_down {cell} port {port} both ways")
         }
         _ => {
             for port in 0..4 {
-                wiring.link_down(cell, port, false);
+                wiring.set_link_down(cell, port, false);
             }
-            if wiring.runs(cell) { format!("mend {cell}") } else { restart(wiring, cell) }
+            if wiring.runs(cell) { format!("link_up {cell}") } else { restart(wiring, cell) }
         }
     }
 }
@@ -137,7 +141,7 @@ fn restart(wiring: &mut Wiring, cell: usize) -> String {
         wiring.start(cell);
     }
     wiring.run(Span::from_millis(700));
-    wiring.report_links_down(cell);
+    wiring.send_links_down(cell);
     wiring.switch(deepest(wiring), false);
     wiring.press(cell, true);
     format!("restart {cell}")
@@ -148,23 +152,23 @@ fn wirings() -> u64 {
     std::env::var("SKINBUS_WIRINGS").map_or(600, |wirings| wirings.parse().unwrap())
 }
 
-/// Organises, presses every cell, breaks four things, and says how many epochs were not complete after each.
+/// Waits for the tree, presses every cell, injects four faults, and prints how many epochs were not complete after each.
 fn campaign(seeds: impl Iterator<Item = u64>) {
     let mut repairs = BTreeMap::<(String, usize), usize>::new();
     for seed in seeds {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
         let mut wiring = Wiring::random(seed);
-        organise(&mut wiring, &mut dice);
+        wait_for_tree(&mut wiring, &mut dice);
         check_tree_ready(&wiring, seed);
         press_all(&mut wiring);
-        assert_eq!(incomplete(&mut wiring, 3), Some(0), "seed {seed}: all is in, before anything breaks");
+        assert_eq!(incomplete(&mut wiring, 3), Some(0), "seed {seed}: all are in, before any fault");
         for _ in 0..4 {
             let what = inject_fault(&mut wiring, &mut dice);
             let after = incomplete(&mut wiring, 40).unwrap_or_else(|| {
                 let (took, reachable) = (wiring.took.iter().rev().nth(1), wiring.reachable());
                 panic!(
-                    "seed {seed}: not whole again after {what}: {took:?} of {reachable:?}; {}",
-                    wiring.ways()
+                    "seed {seed}: not complete again after {what}: {took:?} of {reachable:?}; {}",
+                    wiring.routes()
                 )
             });
             let kind = what.split(' ').next().unwrap().to_owned();
@@ -173,9 +177,9 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
     }
     println!("epochs without some cell, after");
     for ((what, epochs), times) in &repairs {
-        println!("  {what:8}{epochs:4}: {times}");
+        println!("  {what:10}{epochs:4}: {times}");
     }
-    let broken = |(what, _): &&(String, usize)| ["cut", "hang", "kill"].contains(&what.as_str());
+    let broken = |(what, _): &&(String, usize)| ["link_down", "hang", "kill"].contains(&what.as_str());
     let of = |expected: &dyn Fn(usize) -> bool| {
         repairs
             .iter()
@@ -183,83 +187,93 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
             .map(|(_, times)| times)
             .sum::<usize>()
     };
-    // What is slower loses its root, or finds a way only through those that were below it.
-    assert!(of(&|epochs| epochs > 3) * 10 < of(&|epochs| epochs > 0) * 3, "most are whole again in 3 epochs");
+    // Slower ones lose their root, or find a route only through cells that were below them.
+    assert!(
+        of(&|epochs| epochs > 3) * 10 < of(&|epochs| epochs > 0) * 3,
+        "most are complete again in 3 epochs"
+    );
     assert_eq!(of(&|epochs| epochs > 12), 0, "all are, soon");
 }
 
 // All of these together: SUM-1, SUM-7, LEASE-1, LEASE-3, NACK-1, NACK-3, NACK-4, NACK-5, HELLO-2, HELLO-3, JOIN-1, JOIN-2,
 // JOIN-3, JOIN-4, JOIN-5, LOSS-1, LOSS-2, LOSS-3, LOSS-4, REPAIR-1, REPAIR-2, REPAIR-3, REPAIR-4, LINK-1.
 #[test]
-fn random_wirings_organise_themselves_and_never_count_a_cell_twice() {
+fn random_wirings_become_trees_and_never_count_a_cell_twice() {
     campaign((0..wirings()).step_by(2));
 }
 
 #[test]
-fn nor_do_others() {
+fn other_random_wirings_become_trees_and_never_count_a_cell_twice() {
     campaign((1..wirings()).step_by(2));
 }
 
 #[test]
-fn messages_that_are_lost_on_wires_make_no_cell_count_twice() {
+fn lost_messages_on_wires_never_count_a_cell_twice() {
     for seed in 0..wirings() / 4 {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
         let mut wiring = Wiring::random(seed);
-        organise(&mut wiring, &mut dice);
+        wait_for_tree(&mut wiring, &mut dice);
         press_all(&mut wiring);
-        // Who is in a sum is looked at in every epoch, see `Wiring`.
+        // The cells in a sum are checked in every epoch, see `Wiring`.
         wiring.loss = 0.05;
         for _ in 0..4 {
             inject_fault(&mut wiring, &mut dice);
             wiring.run(Span(20 * PERIOD.0));
         }
         wiring.loss = 0.0;
-        assert!(incomplete(&mut wiring, 80).is_some(), "seed {seed}: not whole again; {}", wiring.ways());
+        assert!(
+            incomplete(&mut wiring, 80).is_some(),
+            "seed {seed}: not complete again; {}",
+            wiring.routes()
+        );
     }
 }
 
 #[test]
-fn without_a_touch_all_be_reachable_again_within_a_second() {
+fn without_a_touch_all_cells_have_a_route_again_within_a_second() {
     let mut slowest = 0;
     for seed in 0..wirings() / 2 {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
         let mut wiring = Wiring::random(seed);
-        organise(&mut wiring, &mut dice);
+        wait_for_tree(&mut wiring, &mut dice);
         wiring.switch(deepest(&wiring), false);
         wiring.begin();
         wiring.run(Span::from_millis(300));
         for _ in 0..4 {
             let what = inject_fault(&mut wiring, &mut dice);
-            let repairs = what.starts_with("mend") || what.starts_with("restart");
+            let repairs = what.starts_with("link_up") || what.starts_with("restart");
             let from = wiring.now();
             let whole = |wiring: &Wiring| {
                 let mut reachable = wiring.reachable().into_iter();
                 let goes = |cell| {
                     wiring.route(cell).is_some_and(|route| route.iter().all(|&cell| wiring.runs(cell)))
                 };
-                reachable.all(|cell| wiring.cells[cell].number.is_none() || goes(cell))
+                reachable.all(|cell| wiring.cells[cell].node_id.is_none() || goes(cell))
             };
-            // What a cell hears no more it believes for 600 ms.
+            // A silent port times out after 600 ms.
             wiring.run(Span::from_millis(600));
             while !whole(&wiring) {
-                let (took, ways) = (wiring.now().since(from), wiring.ways());
-                assert!(took <= Span::from_millis(1_000) || repairs, "seed {seed}, {what}: {took:?}, {ways}");
+                let (took, routes) = (wiring.now().since(from), wiring.routes());
+                assert!(
+                    took <= Span::from_millis(1_000) || repairs,
+                    "seed {seed}, {what}: {took:?}, {routes}"
+                );
                 wiring.run(Span::from_millis(20));
             }
             slowest = slowest.max(wiring.now().since(from).0);
             wiring.run(Span::from_millis(400));
         }
     }
-    println!("the slowest has a way again after {} ms", slowest / 1_000);
+    println!("the slowest has a route again after {} ms", slowest / 1_000);
 }
 
 #[test]
-fn who_waits_for_children_is_woken_by_them_and_without_joints_by_itself() {
+fn a_cell_that_waits_for_children_is_woken_by_them_and_without_joints_by_a_timeout() {
     let mut wiring = Wiring::new(3, 1);
     wiring.wire(0, 0, 1, 0);
     wiring.wire(1, 1, 2, 1);
     wiring.add_root(0);
-    organise(&mut wiring, &mut Pcg64Mcg::seed_from_u64(1));
+    wait_for_tree(&mut wiring, &mut Pcg64Mcg::seed_from_u64(1));
     press_all(&mut wiring);
     let waits = |wiring: &Wiring| [0, 1, 2].map(|cell| wiring.waits_for_children(cell));
     assert_eq!(waits(&wiring), [false; 3]);

@@ -1,6 +1,6 @@
-//! A recording cut anywhere: whole benches in virtual time, with cells that hang and come too late, and packets that
-//! are lost on their way to the recording. What is in force at a cut, and the frames from there
-//! on up to another one, are replayed to cells that were just started: they answer as it is recorded.
+//! A recording split anywhere: whole benches in virtual time, with cells that hang and answer too late, and packets that
+//! are lost on their way to the recording. The frames latched at a split, and the frames from there up to another split,
+//! are replayed to cells that were just started: they answer as recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use analysis::explain::{Requested, Watch};
@@ -42,7 +42,7 @@ enum Trouble {
     Late,
 }
 
-/// What a recorder has of a bench in which cells are pressed and let go all the time.
+/// What a recorder has of a bench in which cells are pressed and released all the time.
 fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
@@ -112,20 +112,20 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
     (bench.skin, seen)
 }
 
-/// The first place from `at` on at which the recorder may begin another file, and what is in force there.
-fn link_down(seen: &[Seen], at: usize) -> (usize, Vec<capture::Latched>) {
-    let mut force = Latched::default();
+/// The first place from `at` on at which the recorder may begin another file, and the frames latched there.
+fn split(seen: &[Seen], at: usize) -> (usize, Vec<capture::Latched>) {
+    let mut latched_frames = Latched::default();
     for (place, frame) in seen.iter().enumerate() {
-        if place >= at && !force.is_within_a_packet(frame.at_nanos) {
-            return (place, latched(&force));
+        if place >= at && !latched_frames.is_within_a_packet(frame.at_nanos) {
+            return (place, latched(&latched_frames));
         }
-        force.take(*frame);
+        latched_frames.take(*frame);
     }
-    (seen.len(), latched(&force))
+    (seen.len(), latched(&latched_frames))
 }
 
-fn latched(force: &Latched) -> Vec<capture::Latched> {
-    let frames = force.frames().into_iter();
+fn latched(latched_frames: &Latched) -> Vec<capture::Latched> {
+    let frames = latched_frames.frames().into_iter();
     let kept = |seen: Seen| capture::Latched {
         bus: BUS.to_owned(),
         own: seen.own,
@@ -230,7 +230,7 @@ fn torques(part: &[Seen]) -> u64 {
 }
 
 #[test]
-fn a_recording_that_is_link_down_anywhere_replays_from_there() {
+fn a_recording_that_is_split_anywhere_replays_from_there() {
     let (mut equal, mut explained) = (0, 0);
     for seed in 0..SEEDS {
         let format = if seed % 3 == 2 { Format::Classic } else { Format::Fd };
@@ -239,7 +239,7 @@ fn a_recording_that_is_link_down_anywhere_replays_from_there() {
         assert!(whole.tally().is_good(), "seed {seed}: {:#?} {:#?}", whole.tally(), whole.first());
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         for _ in 0..12 {
-            let (from, before) = link_down(&seen, rng.random_range(0..seen.len() - 50));
+            let (from, before) = split(&seen, rng.random_range(0..seen.len() - 50));
             let to = rng.random_range(from + 40..=seen.len());
             let part = &seen[from..to];
             let comparator = replayed(&skin, &before, part);
@@ -251,7 +251,7 @@ fn a_recording_that_is_link_down_anywhere_replays_from_there() {
                 comparator.tally(),
                 comparator.first()
             );
-            // Each recorded torque is compared, or it is said why not.
+            // Each recorded torque is compared, or has a reason why not.
             let apart = lacking.joints_earlier + lacking.joints_unrecorded + lacking.said_later;
             assert!(comparator.tally().equal + apart >= torques(part), "{:#?}", comparator.tally());
             equal += comparator.tally().equal;
@@ -260,7 +260,7 @@ fn a_recording_that_is_link_down_anywhere_replays_from_there() {
     }
     assert!(
         equal > 20 * SEEDS * 12 && explained > 0 && explained < equal / 4,
-        "{equal} equal, {explained} excused"
+        "{equal} equal, {explained} explained"
     );
 }
 
@@ -270,7 +270,7 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
         let format = if seed % 2 == 0 { Format::Classic } else { Format::Fd };
         let (skin, seen) = recorded(seed, format, Trouble::None);
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
-            let (from, before) = link_down(&seen, at);
+            let (from, before) = split(&seen, at);
             // Up to the next joints: all that was asked is answered.
             let is_joints = |seen: &&Seen| seen.frame.raw_id() == 1;
             let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
@@ -304,7 +304,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
         else {
             continue;
         };
-        let (from, before) = link_down(&seen, at);
+        let (from, before) = split(&seen, at);
         packet.words[0] += 1;
         let kept = seen[place].frame;
         seen[place].frame = packet.frames(Format::Fd).next().unwrap();
@@ -338,7 +338,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             }
             watch.moments().unwrap().remove(0).unwrap()
         };
-        let (from, before) = link_down(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
+        let (from, before) = split(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
         let requested = |epoch| Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
         for epoch in [160, 172, 185] {
             let (whole, part) =

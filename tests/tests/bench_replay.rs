@@ -79,7 +79,7 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 }
             }
             9..=14 => {
-                // Two of three let go.
+                // Two of three are released.
                 let newtons = f64::from(random.random_range(-2..2_i8).max(0)) + 0.2;
                 let contact = [Q5_10::nearest(if newtons < 1.0 { 0.0 } else { newtons }); 3];
                 let from = match random.random_range(0..3) {

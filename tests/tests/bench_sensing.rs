@@ -67,7 +67,7 @@ fn to(to: Node, mode: Sensing) -> Message {
 }
 
 /// The sensors frames that stood on the wire since, by time, with their senders.
-fn told(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
+fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
     let format = bench.skin.buses[0].format;
     let mut segments = BTreeMap::new();
     let packet = |frame| match format {
@@ -83,16 +83,16 @@ fn told(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
     let all = bench.wire.iter();
     let packets =
         all.map(|it| (it.at, &it.frame)).scan(packet, |packet, (at, frame)| Some((at, packet(frame))));
-    let mut told = Vec::new();
+    let mut frames = Vec::new();
     for (at, packet) in packets {
         let message = packet.and_then(|packet| Message::decode(&packet).ok());
         if let Some(Message::Sensors { from, page, .. }) = message
             && at >= since
         {
-            told.push((at, from, page));
+            frames.push((at, from, page));
         }
     }
-    told
+    frames
 }
 
 /// A bench whose cells are in this mode, and since when; nothing of the switch is in the count.
@@ -107,13 +107,13 @@ fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros)
     (bench, since)
 }
 
-/// What every touched cell felt at each joints that it took, of stimuli that stood on the wire: each turn of its
+/// The sensors of every touched cell at each joints that it took, of stimuli on the wire: each turn of its
 /// contact is a touch or a release, and has its frame before the next joints.
 fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
     let events = bench.skin.events;
-    let told = told(bench, since);
+    let frames = sensors_frames(bench, since);
     let mut by_cell = BTreeMap::<CellId, Vec<(Micros, SkinSensors)>>::new();
-    for (at, cell, page) in told {
+    for (at, cell, page) in frames {
         if let SensorPage::Skin(skin) = page {
             by_cell.entry(cell).or_default().push((at, skin));
         }
@@ -166,7 +166,7 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     let seconds = LOOK.0 as f64 / 1e6;
     let count = |scenario, mode| {
         let (bench, since) = looked_at(&skin, scenario, mode);
-        let frames = told(&bench, since).len();
+        let frames = sensors_frames(&bench, since).len();
         (frames, bench, since)
     };
     let (continuous, mut bench, _) = count(&idle, AT_62_5_HZ);
@@ -211,11 +211,11 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
 }
 
 #[test]
-fn cells_of_a_continuous_bus_do_not_speak_at_once() {
+fn cells_of_a_continuous_bus_do_not_send_at_once() {
     let skin = skins::ur5_253();
     let (bench, since) = looked_at(&skin, &Scenario::idle(LOOK), AT_62_5_HZ);
-    let told = told(&bench, since);
-    let skins = told.iter().filter(|(_, _, page)| matches!(page, SensorPage::Skin(_)));
+    let frames = sensors_frames(&bench, since);
+    let skins = frames.iter().filter(|(_, _, page)| matches!(page, SensorPage::Skin(_)));
     let mut busiest = BTreeMap::<u64, usize>::new();
     skins.for_each(|(at, ..)| *busiest.entry(at.0 / 1_000).or_default() += 1);
     // 253 in 16 ms are 15.8 in one.
@@ -228,12 +228,12 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
         let mut bench = Bench::new(&skins::arm(6, format), 3).started();
         let from = bench.now();
         bench.run_epochs(30);
-        assert_eq!(told(&bench, from), [], "off, as every cell at its start");
+        assert_eq!(sensors_frames(&bench, from), [], "off, as every cell at its start");
         let third = bench.skin.cells[2].node;
         bench.act(Act::Inject(to(Node::Cell(third), AT_62_5_HZ)));
         let from = bench.now();
         bench.run(Span::from_millis(1_000));
-        let alone = told(&bench, from);
+        let alone = sensors_frames(&bench, from);
         assert!(alone.iter().all(|&(_, cell, _)| cell == third));
         assert!((62..=67).contains(&alone.len()), "{}", alone.len());
 
@@ -243,7 +243,7 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
         bench.press(4, 2.0);
         bench.run_epochs(2);
         let fifth = bench.skin.cells[4].node;
-        let events: Vec<_> = told(&bench, from);
+        let events: Vec<_> = sensors_frames(&bench, from);
         let pressed =
             |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact(&skin) > 0);
         assert!(events.iter().filter(pressed).all(|&(_, cell, _)| cell == fifth), "{events:?}");
@@ -254,14 +254,14 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
         let from = bench.now();
         bench.press(4, 0.0);
         bench.run_epochs(30);
-        assert_eq!(told(&bench, from), []);
+        assert_eq!(sensors_frames(&bench, from), []);
         bench.finish();
         accounts::check(&bench);
     }
 }
 
 #[test]
-fn a_lost_event_is_made_good_by_a_heartbeat() {
+fn a_heartbeat_makes_up_for_a_lost_event() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 5).started();
     bench.act(Act::Say(switch(Sensing::Event)));
     bench.run(Span::from_millis(300));
@@ -278,7 +278,7 @@ fn a_lost_event_is_made_good_by_a_heartbeat() {
 }
 
 #[test]
-fn what_cells_tell_changes_nothing_that_the_gateway_expects_of_them() {
+fn sensors_frames_do_not_change_the_expected_torques() {
     let course = |mode| {
         let mut bench = Bench::new(&skins::arm(4, Format::Fd), 11).started();
         bench.act(Act::Say(switch(mode)));

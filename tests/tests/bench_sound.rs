@@ -86,7 +86,7 @@ fn a_contact_ends_with_one_zero_torque_and_nothing_is_held() {
 }
 
 #[test]
-fn epochs_go_round_and_nothing_is_noticed() {
+fn epochs_wrap_around_without_notices() {
     let mut bench = Bench::new(&skins::arm(2, Format::Fd), 3).started();
     // Pressed from an epoch on that lies beyond the corner.
     bench.run_epochs(200);
@@ -103,7 +103,7 @@ fn epochs_go_round_and_nothing_is_noticed() {
 }
 
 #[test]
-fn the_arm_gives_way_and_the_torques_stay_right_as_it_moves() {
+fn the_arm_yields_and_the_torques_stay_right_as_it_moves() {
     let mut bench = Bench::new(&skins::arm(12, Format::Fd), 4).started();
     (0..12).for_each(|place| bench.press(place, 2.0));
     bench.run_epochs(120);

@@ -203,7 +203,7 @@ fn packets_add_up(place: &Place) -> (Log, Summary) {
     let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     assert_eq!(
         (whole, incomplete),
-        (packets - incomplete, summary.count("/buses/0/events", "incomplete pair"))
+        (packets - incomplete, summary.count("/buses/0/events", "incomplete packet"))
     );
     assert_eq!((summary.odd(0), summary.of_bus("/dropped_by_bus")), (incomplete, 0), "{:#}", summary.0);
     assert_eq!(summary.of_bus("/replies/unknown"), 0, "{:#}", summary.0);

@@ -232,7 +232,7 @@ fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
     };
     let described: String = described.lines().map(|line| renamed(line) + "\n").collect();
     let workshop = Workshop::with(&described, &older(&had), "");
-    let ended = workshop.commission("--numbers as-is.toml").end().well();
+    let ended = workshop.commission("--node-ids as-is.toml").end().well();
     assert!(
         ended.stderr.contains("the cell with serial number 100001 is 1 on vcan0, 6 in skin.toml"),
         "{ended:#?}"
@@ -263,7 +263,7 @@ fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters
         place.start("gateway", &format!("commission skin.toml --bus-kind embedded {more}")).end()
     };
     // A slow machine may not have started all of them before the first one ends.
-    until("all of them", || (commission("--quiet --numbers as-is.toml").code() == Some(0)).then_some(()));
+    until("all of them", || (commission("--quiet --node-ids as-is.toml").code() == Some(0)).then_some(()));
     let skin = Skin::read(&place.path("skin.toml")).unwrap();
     let copy = Skin::read(&place.path("as-is.toml")).unwrap();
     let mut node_ids: Vec<_> = copy.cells.iter().map(|cell| cell.node.get()).collect();
@@ -344,7 +344,7 @@ fn unknown_nodes_are_named_and_left_alone_and_who_is_missing_is_named() {
     // The stranger has what it had.
     workshop.place.write("skin.toml", &text);
     assert_eq!(workshop.none_is_mixed(), 5);
-    workshop.commission("--numbers out.toml").end().well();
+    workshop.commission("--node-ids out.toml").end().well();
     assert_eq!((workshop.none_is_mixed(), workshop.place.read("out.toml")), (6, text));
 }
 
@@ -407,7 +407,7 @@ fn what_cannot_be_done_is_one_line() {
     let line = said("commission skin.toml --quiet", 1);
     assert_eq!(line, "gateway: no cells are on vcan0: start them, or switch them on, and run this again");
     let line = said("cells vcan0 --for 0.4", 1);
-    assert!(line.starts_with("gateway: no cell was heard on vcan0 for 0.4 s: "), "{line}");
+    assert!(line.starts_with("gateway: no cell sent anything on vcan0 for 0.4 s: "), "{line}");
 
     place.write("other.toml", &skin(4).replace("serial = 1000", "serial = 2000"));
     let _cells = place.start("cell-node", "--bus vcan0 --nodes 1-4 --skin other.toml --bus-kind embedded");

@@ -34,7 +34,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_judged() {
     assert!((1e-4..0.0356).contains(&summed), "{summed}");
     assert!((value(finding(1, "active at once")) - 24.0).abs() < 0.5);
     assert!(value(finding(1, "velocity")) > 0.0);
-    assert!(value(finding(2, "after the switch, greatest")) <= 0.0, "the central computation is off");
+    assert!(value(finding(2, "after the switch, maximum")) <= 0.0, "the central computation is off");
     let page = place.read("results/report.html");
     assert!(page.contains("<svg") && page.contains("0.0356"));
     let torque = place.read("results/fig6-joint2.csv");

@@ -131,7 +131,7 @@ const WRITERS: [(&str, &str, &str); 13] = [
     ("-o ", "report in.mcap -o NAME", "new.html"),
     ("-o ", "skin generate --cells 3 -o NAME", "new.toml"),
     ("-o ", "dbc skin.toml -o NAME", "new.dbc"),
-    ("--numbers ", "commission skin.toml --bus-kind embedded --numbers NAME", "new.toml"),
+    ("--node-ids ", "commission skin.toml --bus-kind embedded --node-ids NAME", "new.toml"),
 ];
 
 #[test]

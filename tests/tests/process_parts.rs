@@ -123,10 +123,11 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     let parts = parts(&place).join(" ");
     // Cell 1 is pressed from the beginning of the run on: more than half of all epochs ago.
     let ended = place.start("gateway", "explain run-3.mcap --epoch 200 --cell 1").end().well();
-    assert!(ended.stdout.contains("felt       0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
+    assert!(ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
     let whole = place.start("gateway", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
-    let contact_state = |text: &str| text.lines().find(|line| line.contains("felt")).unwrap().to_owned();
+    let contact_state =
+        |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
     assert_eq!(contact_state(&whole.stdout), contact_state(&ended.stdout));
 
     let stats = |files: &str| -> Value {

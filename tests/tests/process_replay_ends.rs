@@ -50,7 +50,7 @@ fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
     place.write("many.log", &frames);
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let replay = place.replay("many.log", "--patience 1 --loop 3");
+    let replay = place.replay("many.log", "--send-timeout 1 --loop 3");
     let test_client = place.test_client();
     until("a frame", || test_client.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
     server.signal(Signal::STOP);

@@ -97,7 +97,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     place.write("some.log", "(1.000000) vcan0 123#00\n(1.001000) vcan0 123#01\n(3.000000) vcan0 123#02\n");
     let vcan0 = Vcan0;
     vcan0.fill();
-    let replay = place.replay("some.log", "--patience 50");
+    let replay = place.replay("some.log", "--send-timeout 50");
     // Until the second frame has been given up, which is told by the third.
     replay.hears("vcan0 is socketcan");
     std::thread::sleep(Duration::from_millis(1_000));

@@ -1,4 +1,4 @@
-//! What captures say afterwards, and what a bus can carry.
+//! Evaluation of captures, and what a bus can carry.
 //!
 //! | module | what |
 //! |---|---|
@@ -7,7 +7,7 @@
 //! | [`bus_model`], [`fit`], [`shadow`] | timing of buses: the model, a bench before it is built, a capture on its bus |
 //! | [`report`] | pages with figures |
 //! | [`dbc`] | packets for other tools |
-//! | [`paper`] | what the paper says |
+//! | [`paper`] | figures of the paper |
 
 pub mod bus_model;
 pub mod dbc;

@@ -1,4 +1,4 @@
-//! What the paper says: *Efficient Distributed Torque Computation for Large Scale Robot Skin*.
+//! Figures of the paper: *Efficient Distributed Torque Computation for Large Scale Robot Skin*.
 
 /// Mean error of a single cell's torques, Q3.12, in Nm (Fig. 6).
 pub const SINGLE_NM: f64 = 0.0054;
@@ -43,7 +43,7 @@ pub fn most_cells(per_cell: f64, fixed: f64, per_active: f64, active: f64) -> f6
 mod tests {
     use super::*;
 
-    /// The first limit is rounded in the paper: its own law says 2163.
+    /// The first limit is rounded in the paper: its own law gives 2163.
     #[test]
     fn the_papers_laws_lead_to_its_limits() {
         let none = most_cells(CELL_S, FIXED_S, ACTIVE_S, 0.0);

@@ -4,8 +4,8 @@
 //!   frames, each decoded ──> Stats ──> Report: buses, kinds, epochs, refused frames, losses, cells
 //! ```
 //!
-//! The work for a frame is bounded, and so is the memory: it grows with the buses, of which [`BUSES`] are told
-//! apart, and not with the frames.
+//! The work for a frame is bounded, and so is the memory: it grows with the buses, of which it distinguishes
+//! [`BUSES`], and not with the frames.
 
 use model::decode::{BUSES, Decoded};
 use model::tracker::{Tracked, Word};
@@ -102,7 +102,7 @@ impl Joints {
     }
 }
 
-/// What one cell said.
+/// What one cell sent.
 #[derive(Debug, Default)]
 struct Cell {
     tracked: Tracked,
@@ -125,7 +125,7 @@ pub struct Report {
     pub frames: u64,
     /// Frames whose time is before that of the frame before them.
     pub times_backwards: u64,
-    /// Lost frames of which nobody says on which bus, as whoever took the capture says.
+    /// Lost frames of an unknown bus, by the notes of the recorder.
     pub dropped: u64,
     /// Frames of buses beyond the first 64.
     pub frames_of_other_buses: u64,
@@ -148,15 +148,15 @@ pub struct BusReport {
     pub wires_per_s: Option<f64>,
     /// Packets by kind, those that there are.
     pub kinds: Vec<KindReport>,
-    /// What the joints say of themselves.
+    /// Epochs of the joints.
     pub epochs: Epochs,
     /// Damaged frames, and packets without a meaning, by reason.
     pub refused: RefusedFrames,
     /// Frames that are none of this protocol.
     pub foreign: ForeignFrames,
-    /// Frames that whoever took the capture lost here, as it says itself.
+    /// Frames that the recorder lost here, by its own notes.
     pub dropped: u64,
-    /// The cells that said something, by number.
+    /// The cells that sent something, by node id.
     pub cells: Vec<CellReport>,
 }
 
@@ -182,20 +182,20 @@ pub struct Epochs {
     pub missing: u64,
     /// Joints of the epoch of those before them.
     pub repeated: u64,
-    /// Steps back: the counting began anew.
+    /// Steps back: the counting restarted.
     pub jumps: u64,
 }
 
-/// Frames under identifiers that carry packets which are none, and packets that say nothing known, by reason.
+/// Damaged frames under identifiers that carry packets, and packets without a known meaning, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedFrames {
     /// Wrong length.
     pub length: u64,
     /// Wrong CRC.
     pub crc: u64,
-    /// Packets that say nothing this version knows.
+    /// Packets whose meaning this version does not know.
     pub meaning: u64,
-    /// Halves without their other half.
+    /// Segments whose packet is incomplete.
     pub incomplete: u64,
 }
 
@@ -211,7 +211,7 @@ impl RefusedFrames {
 /// One cell.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CellReport {
-    /// Its number.
+    /// Its node id.
     pub node: u8,
     /// All packets that it sent.
     pub packets: u64,
@@ -223,9 +223,9 @@ pub struct CellReport {
     pub sums: u64,
     /// Of these, sums of the epoch of the one before: with more cells in it.
     pub resent: u64,
-    /// Where its sums go, by its last word on that: a cell's number, 0 for the gateway's side.
+    /// Its parent, by its last tree page: a node id, 0 for the gateway's side.
     pub parent: Option<u8>,
-    /// Wires to the root of its tree, by the same word.
+    /// Wires to the root of its tree, by the same page.
     pub depth: Option<u8>,
     /// The epoch that its first torque answers.
     pub first_epoch: Option<u8>,
@@ -243,9 +243,9 @@ pub struct CellReport {
     pub refused: Option<u16>,
     /// Packets that it counted between two heartbeats and that are not here.
     pub lost: u64,
-    /// Starts anew.
+    /// Restarts.
     pub restarts: u64,
-    /// What its last heartbeat said of it.
+    /// Its state in its last heartbeat.
     pub state: Vec<&'static str>,
 }
 
@@ -264,7 +264,7 @@ impl Stats {
         }
     }
 
-    /// Frames were lost before this point; the bus is empty where nobody says which.
+    /// Frames were lost before this point; the bus is empty where it is unknown.
     pub fn dropped(&mut self, bus: &str, frames: u64) {
         let bus_stats = if bus.is_empty() { None } else { self.bus_stats(bus) };
         let dropped = bus_stats.map(|bus_stats| &mut bus_stats.counts.dropped);
@@ -410,7 +410,7 @@ impl Cell {
             self.counts.resent += u64::from(self.summed.replace(*epoch) == Some(*epoch));
         } else if let Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             self.counts.heartbeats += 1;
-            // An older word than the last torque does not end the contact.
+            // A report older than the last torque does not end the contact.
             let is_over = !heartbeat.state.has(State::ACTIVE)
                 && joints.and_then(|joints| joints.of(*epoch)) >= self.touching;
             if matches!(word, Some(Word::Started { .. })) || is_over && word != Some(Word::Claimant) {

@@ -265,7 +265,7 @@ impl Cycle {
     pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
         for (central, bus) in self.central.iter().zip(buses) {
-            let part = central.feel(&central.frames(&self.joints.positions), &bus.reference_torque);
+            let part = central.total(&central.frames(&self.joints.positions), &bus.sensors);
             for (sum, torque) in reference_torque.torque.iter_mut().zip(part.torque) {
                 *sum += torque;
             }

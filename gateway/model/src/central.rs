@@ -38,7 +38,7 @@ struct Link {
     offset: f64,
 }
 
-/// Where a cell sits in the frame of joint k, and what it counts as a touch.
+/// The pose of a cell in the frame of joint k, and its contact thresholds.
 #[derive(Clone, Copy, Debug)]
 struct Place {
     joint: usize,
@@ -52,7 +52,7 @@ struct Place {
 #[derive(Clone, Copy, Debug)]
 pub struct Frames([IsometryMatrix3<f64>; MAX_JOINTS + 1]);
 
-/// What the whole skin feels.
+/// The torque of the whole skin.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReferenceTorque {
     /// The sum of all cells' torques in Nm (paper, Eq. 1).
@@ -116,8 +116,8 @@ impl Central {
         Frames(frames)
     }
 
-    /// The force F_z in N that a cell makes of its words: Algorithm 1, exactly. Zero means not in
-    /// contact, and is what a cell that does not exist feels.
+    /// The force F_z in N that a cell computes from its sensor words: Algorithm 1, exactly. Zero means not in
+    /// contact, as for a cell that does not exist.
     #[must_use]
     pub fn force(&self, cell: usize, sensors: &SkinSensors) -> f64 {
         self.cells.get(cell).map_or(0.0, |place| force(&place.contact, sensors))
@@ -130,7 +130,7 @@ impl Central {
         place.map_or([0.0; 3], |position| position.coords.into())
     }
 
-    /// The joint torques in Nm of one cell that feels `f_z` (paper, Eq. 8); zero in joints that do not
+    /// The joint torques in Nm of one cell with the force `f_z` on it (paper, Eq. 8); zero in joints that do not
     /// move it, and for a cell that does not exist. Bounded work, no allocation.
     #[must_use]
     pub fn torque(&self, cell: usize, frames: &Frames, f_z: f64) -> [f64; MAX_JOINTS] {
@@ -141,11 +141,11 @@ impl Central {
         torque
     }
 
-    /// What the whole skin feels, cell by cell, `sensors` being in the order of [`Skin::cells`]: what a
-    /// gateway without computing cells has to do in every tick. Work grows with the cells and again
-    /// with the active ones; no allocation.
+    /// The torque of the whole skin, computed cell by cell; `sensors` are in the order of [`Skin::cells`]. This is the
+    /// work of a gateway without computing cells in every tick. It grows with the cells and again with the active
+    /// ones; no allocation.
     #[must_use]
-    pub fn feel(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
+    pub fn total(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
         for (place, sensors) in self.cells.iter().zip(sensors) {
             let f_z = force(&place.contact, sensors);
@@ -159,7 +159,7 @@ impl Central {
 }
 
 impl Frames {
-    /// Adds what a cell at `place` that feels `f_z` does to joints 1 to k:
+    /// Adds the torques of a cell at `place` with the force `f_z` on it about joints 1 to k:
     /// `z_(l-1) x (t - t_(l-1)) . force`.
     fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
         let Some(limb) = self.0.get(place.joint) else { return };

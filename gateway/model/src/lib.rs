@@ -1,13 +1,13 @@
-//! What is known of cells and buses, and what is asked of them. Nothing here opens a file or a socket, or looks at a clock.
+//! What is known of cells and buses, and the requests to them. Nothing here opens a file or a socket, or reads a clock.
 //!
 //! | module | what |
 //! |---|---|
-//! | [`decode`] | frames into packets, and packets into words |
-//! | [`tracker`] | what is known of a cell by what it says: who it is, whether it started again, what is lost |
-//! | [`table`] | what a live bus has said: each cell, and sums |
+//! | [`decode`] | frames into packets, and packets into text and JSON |
+//! | [`tracker`] | the state of a cell from its packets: identity, restarts, losses |
+//! | [`table`] | the state of a live bus: each cell, and sums |
 //! | [`central`] | torques computed centrally, in double precision |
-//! | [`network`] | the tree of cells, and whether it is as the skin says |
-//! | [`commission`], [`listing`] | who is there, and giving it its number and configuration |
+//! | [`network`] | the tree of cells, compared with the skin |
+//! | [`commission`], [`listing`] | which cells are on a bus; node ids and configuration for them |
 //! | [`repeat`] | requests that are repeated until they are confirmed |
 //! | [`scenario`], [`generate`] | what a run does, and skins made from a recipe |
 

@@ -1,4 +1,4 @@
-//! What the cells of a bus say of themselves, and nothing else: what a cell has not said is not there.
+//! What the cells of a bus report of themselves, and nothing else.
 
 use std::collections::BTreeMap;
 
@@ -8,12 +8,12 @@ use protocol::time::{Micros, Span};
 
 use crate::tracker::{Claim, Word};
 
-/// What one cell has said.
+/// The reports of one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cell {
-    /// Who it is and how it is.
+    /// Its identity and state.
     pub heartbeat: Option<Heartbeat>,
-    /// What became of what it heard.
+    /// Counters of what it received.
     pub heard: Option<Heard>,
     /// What it refused.
     pub refused: Option<Refused>,
@@ -21,15 +21,15 @@ pub struct Cell {
     pub tree: Option<Tree>,
     /// What its ports lead to.
     pub ports: Option<Ports>,
-    /// The serial number that claims its number, or spoke under it before.
+    /// The serial number that claims its node id, or had it before.
     pub other: Option<u32>,
     claim: Claim,
-    /// When it said its last word.
+    /// When its last packet came.
     last: Micros,
 }
 
 impl Cell {
-    /// How long ago its last word was.
+    /// How long ago its last packet came.
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
         now.since(self.last)
@@ -42,7 +42,7 @@ impl Cell {
                 if self.claim.hear(&heartbeat) == Word::Claimant {
                     self.other = Some(heartbeat.serial);
                 } else if before.is_some_and(|before| before != heartbeat.serial) {
-                    // Whatever is known is the other's.
+                    // All that is known is of the other cell.
                     *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
                 }
                 self.heartbeat = self.claim.heartbeat();
@@ -55,7 +55,7 @@ impl Cell {
     }
 }
 
-/// All that was heard on a bus.
+/// All that came on a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Listing {
     cells: BTreeMap<u8, Cell>,
@@ -64,7 +64,7 @@ pub struct Listing {
 }
 
 impl Listing {
-    /// Nothing heard yet.
+    /// Nothing received yet.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
@@ -84,24 +84,24 @@ impl Listing {
         }
     }
 
-    /// The cells, by number.
+    /// The cells, by node id.
     pub fn cells(&self) -> impl ExactSizeIterator<Item = (u8, &Cell)> {
-        self.cells.iter().map(|(&number, cell)| (number, cell))
+        self.cells.iter().map(|(&node, cell)| (node, cell))
     }
 
-    /// Whether a gateway was heard.
+    /// Whether a gateway sends on the bus.
     #[must_use]
     pub const fn has_gateway(&self) -> bool {
         self.gateway
     }
 
-    /// What the first cell that was heard sends its packets in.
+    /// The frame format of the first cell.
     #[must_use]
     pub const fn format(&self) -> Option<Format> {
         self.format
     }
 
-    /// Whether a cell with this serial number was heard, and under which number.
+    /// The node id of the cell with this serial number, if it is there.
     #[must_use]
     pub fn number_of(&self, serial: u32) -> Option<u8> {
         let is = |cell: &Cell| cell.claim.serial() == Some(serial);
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_a_cell_has_said_is_known_of_it() {
+    fn only_reports_of_a_cell_are_listed() {
         let mut listing = Listing::new();
         let heartbeat = Heartbeat { serial: 7, state: State(0x1101), ..Heartbeat::default() };
         listing.hear(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn another_cell_under_a_number_has_nothing_of_the_one_before_it() {
+    fn another_cell_with_a_node_id_has_no_reports_of_the_one_before_it() {
         let mut listing = Listing::new();
         let of = |serial| NetworkPage::Heartbeat(Heartbeat { serial, ..Heartbeat::default() });
         for page in [of(7), NetworkPage::Heard(Heard::default()), of(8)] {

@@ -1,4 +1,4 @@
-//! Distributions of times, and the quantiles that are said of them.
+//! Distributions of times, and their quantiles.
 
 use hdrhistogram::Histogram;
 use serde::Serialize;

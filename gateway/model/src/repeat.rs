@@ -1,23 +1,23 @@
-//! Requests that are repeated until they are confirmed: when each is due again, and when it is given up.
+//! Requests that are repeated until they are confirmed: when each is due again, and when it fails.
 //!
-//! Whoever asks knows what is still open, and looks here for what of it is to be said now. Nothing here has a clock.
+//! The caller knows which requests are open, and asks here which of them to send now. Nothing here has a clock.
 
 use std::collections::BTreeMap;
 
 use protocol::time::{Micros, Span};
 
-/// How often something is said, and how long an answer may take.
+/// The retry limit and the timeouts of a request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Limits {
-    /// After the first time.
+    /// Timeout after the first time.
     pub first: Span,
-    /// At most, when it doubles after each time.
+    /// The longest timeout; it doubles after each time.
     pub longest: Span,
-    /// How often it is said before it is given up.
+    /// How often it is sent before it fails.
     pub tries: u8,
 }
 
-/// A request whose answer is awaited.
+/// A request without an answer yet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt {
     limits: Limits,
@@ -25,37 +25,37 @@ pub struct Attempt {
     due: Micros,
 }
 
-/// What time asks for.
+/// What to do with a request now.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Turn {
     /// Nothing yet.
     Wait,
-    /// It is to be said again.
+    /// Send it again.
     Again,
-    /// It was said often enough.
+    /// The retry limit is reached.
     GiveUp,
 }
 
 impl Attempt {
-    /// It is said for the first time now.
+    /// It is sent for the first time now.
     #[must_use]
     pub fn new(now: Micros, limits: Limits) -> Self {
         Self { limits, tries: 1, due: now + limits.first }
     }
 
-    /// How often it was said.
+    /// How often it was sent.
     #[must_use]
     pub const fn tries(&self) -> u8 {
         self.tries
     }
 
-    /// When [`Attempt::turn`] asks for something.
+    /// When [`Attempt::turn`] is due.
     #[must_use]
     pub const fn due(&self) -> Micros {
         self.due
     }
 
-    /// Takes in that time has passed; what is to be said again is taken for said. Harmless when called early.
+    /// Handles the timeout; after [`Turn::Again`] it counts as sent again. Harmless when called early.
     pub fn turn(&mut self, now: Micros) -> Turn {
         if now < self.due {
             return Turn::Wait;
@@ -68,7 +68,7 @@ impl Attempt {
         Turn::Again
     }
 
-    /// Others may take as long from now on, for somebody has answered.
+    /// Restarts the timeout: a cell has answered, so others may still do.
     pub fn extend(&mut self, now: Micros) {
         let doubled = self.limits.first.0.saturating_mul(1 << (self.tries - 1).min(32));
         self.due = now + Span(doubled.min(self.limits.longest.0));
@@ -79,35 +79,35 @@ impl Attempt {
 #[derive(Clone, Debug)]
 pub struct Repeats<K> {
     every: Span,
-    /// When each was said last, and when all were at once.
-    said: BTreeMap<K, Micros>,
+    /// When each was sent last, and when all were at once.
+    sent: BTreeMap<K, Micros>,
     all: Option<Micros>,
 }
 
 impl<K: Copy + Ord> Repeats<K> {
-    /// None was said yet.
+    /// None was sent yet.
     #[must_use]
     pub const fn new(every: Span) -> Self {
-        Self { every, said: BTreeMap::new(), all: None }
+        Self { every, sent: BTreeMap::new(), all: None }
     }
 
-    /// Of those that are not confirmed, what is to be said now; it is taken for said.
+    /// Of the `open` requests, those to send now; they count as sent.
     pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
-        let last = |key: &K| self.said.get(key).copied().max(self.all);
+        let last = |key: &K| self.sent.get(key).copied().max(self.all);
         let is_due = |key: &K| last(key).is_none_or(|at| now.since(at) >= self.every);
         let due: Vec<_> = open.into_iter().filter(is_due).collect();
-        self.said.extend(due.iter().map(|key| (*key, now)));
+        self.sent.extend(due.iter().map(|key| (*key, now)));
         due
     }
 
-    /// All were said at once, to everyone.
+    /// All were sent at once, to everyone.
     pub const fn said_to_all(&mut self, now: Micros) {
         self.all = Some(now);
     }
 
-    /// One is another than it was: it is due at once.
+    /// The request has changed: it is due at once.
     pub fn renew(&mut self, key: K) {
-        self.said.remove(&key);
+        self.sent.remove(&key);
     }
 }
 
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_not_confirmed_is_due_at_first_and_then_at_most_so_often() {
+    fn an_open_request_is_due_at_once_and_then_once_per_interval() {
         let mut repeats = Repeats::<u8>::new(Span(100));
         assert_eq!(repeats.due(Micros(0), [1, 2]), [1, 2]);
         assert_eq!(repeats.due(Micros(99), [1, 2, 3]), [3]);
@@ -139,6 +139,6 @@ mod tests {
         assert!(repeats.due(Micros(299), [1, 2, 3, 4]).is_empty());
         assert_eq!(repeats.due(Micros(300), [1, 4]), [1, 4]);
         repeats.renew(4);
-        assert_eq!(repeats.due(Micros(301), [1, 4]), [4], "it is another now");
+        assert_eq!(repeats.due(Micros(301), [1, 4]), [4], "it has changed");
     }
 }

@@ -14,7 +14,7 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
 
 /// One in so many angles is drawn.
 const DRAWN: usize = 16;
-/// Angles of which the greatest error is drawn.
+/// Angles of which the maximum error is drawn.
 const PART: usize = 256;
 
 /// The error of a sine over all angles there are.
@@ -22,11 +22,11 @@ const PART: usize = 256;
 pub struct SineError {
     /// Mean absolute error.
     pub mean: f64,
-    /// Greatest absolute error.
+    /// Maximum absolute error.
     pub max: f64,
     /// Angle in quarter turns, signed error.
     pub points: Vec<(f64, f64)>,
-    /// The middle of each part of the circle in quarter turns, the greatest absolute error there.
+    /// The middle of each part of the circle in quarter turns, the maximum absolute error there.
     pub parts: Vec<(f64, f64)>,
 }
 
@@ -71,7 +71,7 @@ pub fn sine_section() -> Section {
     let max = |what: &str, error: &SineError, bar: f64| Finding::stated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
         .text(
-            "The difference to the sine in double precision, over all 65 536 angles that a word can say. Of the \
+            "The difference to the sine in double precision, over all 65 536 angles of a word. Of the \
              polynomial of fifth order the paper gives a mean error; the one of seventh order is what cells compute with, and \
              costs one multiplication more. Below it is what rounding to Q1.14 alone costs.",
         )
@@ -81,16 +81,16 @@ pub fn sine_section() -> Section {
                 Shape::Line,
                 fifth.points.clone(),
             ),
-            figure("sine-greatest", "The greatest errors in 256 parts of the circle", "greatest error")
+            figure("sine-max", "The maximum errors in 256 parts of the circle", "maximum error")
                 .draw("fifth order", Shape::Steps, fifth.parts.clone())
                 .draw("seventh order, the cells'", Shape::Steps, seventh.parts.clone())
                 .draw("rounding alone", Shape::Steps, rounded.parts.clone()),
         ])
         .findings([
             mean("sine of fifth order, mean error", &fifth, 1.9e-4),
-            max("sine of fifth order, greatest error", &fifth, 4.6e-4),
+            max("sine of fifth order, maximum error", &fifth, 4.6e-4),
             mean("sine of seventh order, mean error", &seventh, 2e-5),
-            max("sine of seventh order, greatest error", &seventh, 1e-4),
+            max("sine of seventh order, maximum error", &seventh, 1e-4),
             Finding::stated("rounding to Q1.14 alone, mean error", rounded.mean),
         ])
 }

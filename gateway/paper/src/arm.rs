@@ -1,4 +1,4 @@
-//! The bench of Fig. 6 to 8: an arm with 253 cells that gives way to touches.
+//! The bench of Fig. 6 to 8: an arm with 253 cells that yields to touches.
 
 use protocol::skin::Skin;
 
@@ -7,7 +7,7 @@ use model::generate::{Target, generate};
 
 pub use model::generate::Reply;
 
-/// How files of a run with these answers are called.
+/// The name of files of a run with these answers.
 #[must_use]
 pub const fn name(reply: Reply) -> &'static str {
     match reply {
@@ -23,7 +23,7 @@ const FEW: usize = 24;
 /// Strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
 const TOUCHES: &str = include_str!("../../examples/demo.toml");
 /// A touch of all cells at once; the central computation is off from 1.2 s on.
-const TOUCH: &str = "# A hand closes around the arm and lets go.
+const TOUCH: &str = "# A hand closes around the arm and opens again.
 version = 1
 duration_s = 2.4
 seed = 1

@@ -19,9 +19,9 @@ use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Shape, Table, number};
 use model::central::Central;
 
-/// Computations between two looks at the clock.
+/// Computations between two readings of the clock.
 const IN_A_ROW: u32 = 16;
-/// Looks at one touch; the least of them counts.
+/// Measurements of one touch; the minimum counts.
 const LOOKS: usize = 5;
 
 /// How much is measured.
@@ -61,7 +61,7 @@ fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() ->
     let began = now();
     for _ in 0..IN_A_ROW {
         let frames = central.frames(black_box(&joints));
-        black_box(central.feel(&frames, black_box(reference_torque)));
+        black_box(central.total(&frames, black_box(reference_torque)));
     }
     nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
 }
@@ -138,7 +138,7 @@ fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
     Figure::new(name, title, Axis::new(x, ""), Axis::new("T_skin", "µs"))
 }
 
-/// A figure again up to the greatest x, on a logarithmic axis, with the paper's law in s as a polyline that is smooth
+/// A figure again up to the largest x, on a logarithmic axis, with the paper's law in s as a polyline that is smooth
 /// there too.
 fn beside(
     figure: &Figure,
@@ -173,18 +173,18 @@ pub fn fig9(over: &OverCells) -> Section {
     let fig9 = figure("fig9", "T_skin over cells, none active", "cells, none active")
         .draw("middle half", Shape::Band, band.collect())
         .draw("median", Shape::Points, median.clone())
-        .draw("least squares", Shape::Line, law(line, most));
+        .draw("linear fit", Shape::Line, law(line, most));
     let papers = beside(&fig9, "Eq. 29", median, most, |cells| paper::CELL_S * cells + paper::FIXED_S);
     let cells = paper::most_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
     Section::new("fig9", "Fig. 9: central computation over the number of cells")
         .text(
-            "Whoever computes the skin's torques in the loop has to look at every cell in every cycle, also when none is \
+            "A loop that computes the skin's torques has to look at every cell in every cycle, also when none is \
              touched. Timed is the gateway's own central computation, the code that a comparing tick runs; the medians of \
              many rounds in random order, with the middle half of the measurements as a band.",
         )
         .text(format!(
             "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on a computer \
-             and in a program of its own: that the line is straight is the claim, how steep it is says how quick \
+             and in a program of its own: that the line is straight is the claim; its slope shows how fast \
              the computer and the loop are.",
             number(line.slope),
             number(line.intercept),
@@ -213,7 +213,7 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
     let fig10 = figure("fig10", format!("T_skin over active cells, of {of}"), "active cells")
         .draw("median of touches", Shape::Points, micros.clone())
-        .draw("least squares", Shape::Line, law(line, most));
+        .draw("linear fit", Shape::Line, law(line, most));
     let papers =
         beside(&fig10, "Eq. 30", micros, most, |active| paper::ACTIVE_S * active + paper::NONE_ACTIVE_S);
     let all = Finding::stated(

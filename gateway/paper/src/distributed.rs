@@ -151,7 +151,7 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
         debug_assert_eq!(
             table.snapshot().sums.contributing as usize,
             skin.cells.len(),
-            "everybody is in the sum"
+            "every cell is in the sum"
         );
     }
     super::line::quantile(&mut took, 0.5)
@@ -229,7 +229,7 @@ mod tests {
     use super::*;
     use crate::ticks;
 
-    /// A clock that every look moves on by 1 ns: a tick of the distributed way looks twice, whatever the cells.
+    /// A clock that goes on by 1 ns at each reading: a tick of the distributed way looks twice, whatever the cells.
     #[test]
     fn both_ways_are_measured_over_both_numbers() {
         let skin = ticks::skin(48, BUSES).unwrap();

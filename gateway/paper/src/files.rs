@@ -1,4 +1,4 @@
-//! What experiments leave beside their page: each figure's data as CSV, all findings as JSON.
+//! Files of experiments beside their page: each figure's data as CSV, all findings as JSON.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;

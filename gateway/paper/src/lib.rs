@@ -1,4 +1,4 @@
-//! The paper's experiments, and some beyond it: measured, drawn and judged.
+//! The paper's experiments, and some beyond it: measured, drawn and rated.
 //!
 //! ```text
 //!   Lab (a clock, whole benches) ─┐
@@ -6,8 +6,8 @@
 //!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
 //! ```
 //!
-//! What is computed here is pure but for the clock; benches of processes are run by whoever implements [`Lab`].
-//! Verdicts are computed from what was measured and stand nowhere.
+//! What is computed here is pure but for the clock; benches of processes are run by the implementation of [`Lab`].
+//! Verdicts are computed from the measurements, never stored.
 //!
 //! This module alone, of all the gateway, calls the cells' code: to count its operations and to sum without a bus. The
 //! gateway meets cells on the bus only, and `tests/cells.rs` holds it to that.
@@ -176,7 +176,7 @@ pub trait Lab {
     /// Whether to go on; asked between two measurements.
     ///
     /// # Errors
-    /// When somebody wants it to end.
+    /// When it has to end.
     fn go_on(&mut self) -> Result<(), Self::Error>;
 }
 

@@ -1,4 +1,4 @@
-//! A straight line through points by least squares, with its quality and how sure its slope is.
+//! Linear regression: a line through points, with its quality and the interval of its slope.
 
 use analysis::report::figure::Quantity;
 
@@ -35,8 +35,8 @@ pub struct Line {
 }
 
 impl Line {
-    /// The line from which the weighted squares of the distances along y are least. `None` for fewer than
-    /// three points, or when all have the same x: then there is no line, or no telling how sure it is.
+    /// The line with the minimum of the weighted squared distances along y. `None` for fewer than three points, or when
+    /// all have the same x: then there is no line, or no interval.
     ///
     /// With weights w, means over w, and n points:
     ///
@@ -82,7 +82,7 @@ impl Line {
         Self::through(&points)
     }
 
-    /// What the line says at `x`.
+    /// The value of the line at `x`.
     #[must_use]
     pub fn at(&self, x: f64) -> f64 {
         self.slope * x + self.intercept
@@ -100,7 +100,7 @@ impl Line {
         self.slope + self.slope_half
     }
 
-    /// The greatest x at which the line is not above `y`; not a number for a line that does not rise.
+    /// The largest x at which the line is not above `y`; not a number for a line that does not rise.
     #[must_use]
     pub fn reaches(&self, y: f64) -> f64 {
         if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }

@@ -22,7 +22,7 @@ pub fn section() -> Section {
         let points = (0..=MOST).step_by(10).map(load).collect();
         Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
     };
-    // Nobody has chosen any of these rates, so none is judged.
+    // These rates are defaults that were not chosen, so none is rated.
     let finding = |row: &Row| {
         let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
@@ -44,7 +44,7 @@ pub fn section() -> Section {
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
              each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
              100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
-             numbers of gateway fit, which says more about one skin.",
+             numbers of gateway fit, which shows more about one skin.",
         )
         .text(format!(
             "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_of_buses_are_those_of_fit_and_no_rate_that_nobody_chose_is_judged() {
+    fn bus_counts_match_fit_and_default_rates_are_not_rated() {
         let section = section();
         let column = |at: usize| section.tables[0].rows.iter().map(move |row| row[at].as_str());
         let named: Vec<_> = column(0).zip(column(5)).zip(column(6)).collect();

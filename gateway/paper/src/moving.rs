@@ -14,7 +14,7 @@ use analysis::report::figure::{
 pub struct Run {
     /// Its ticks, in the order of time.
     pub rows: Vec<Row>,
-    /// What it came to.
+    /// Its summary.
     pub summary: Value,
     /// Joints of the robot.
     pub joints: usize,
@@ -103,7 +103,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
     ];
     Section::new("fig6", title)
         .text(format!(
-            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm gives way to touches; up to {:.1} s \
+            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; up to {:.1} s \
              the loop computes the torques itself as well.",
             single.cells(),
             single.switched_s().unwrap_or(f64::NAN)
@@ -124,18 +124,18 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
         ])
         .tables([Table::new(
             "Errors against the central computation, Nm",
-            ["what", "mean", "greatest", "torques"],
+            ["what", "mean", "max", "torques"],
             rows,
         )])
 }
 
-/// Which joints bear nothing.
+/// Which joints have no torque.
 fn bare(run: &Run) -> String {
     let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
     let bare: Vec<_> =
         (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
     if bare.is_empty() {
-        "Every joint bears something.".to_owned()
+        "Every joint has a torque.".to_owned()
     } else {
         format!("No torque in joints {}, beyond which no cell sits.", bare.join(", "))
     }
@@ -158,14 +158,14 @@ pub fn fig7(run: &Run) -> Section {
     let cells = run.drawn("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
     let contributing = run.over_time(|row| f64::from(row.contributing));
     Section::new("fig7", "Fig. 7: joint velocities and active cells")
-        .text("The same run. The arm moves because the cells' torques say so: the loop uses theirs only.")
+        .text("The same run. The cells' torques move the arm: the loop uses only theirs.")
         .figures([
             velocities.series((0..run.joints).map(velocity)),
             cells.draw("active cells", Shape::Steps, contributing),
         ])
         .findings([
             Finding::stated("most cells active at once", (f64::from(active), "cells")),
-            Finding::stated("greatest joint velocity", (fastest, "rad/s")),
+            Finding::stated("maximum joint velocity", (fastest, "rad/s")),
         ])
 }
 
@@ -242,7 +242,7 @@ pub fn fig8(run: &Run) -> Section {
         ])
         .findings([
             none,
-            Finding::stated("T_skin after the switch, greatest", us(off)).beside(0.0).must("0", off <= 0.0),
+            Finding::stated("T_skin after the switch, maximum", us(off)).beside(0.0).must("0", off <= 0.0),
             Finding::stated("T_total before the switch, median", us(total[0])),
             after_switch.must("less than before", total[1] < total[0]),
         ])

@@ -1,4 +1,4 @@
-//! The ticks of a recorded run, as experiments look at them.
+//! The ticks of a recorded run, for experiments.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,7 +19,7 @@ pub struct Row {
     pub time_s: f64,
     /// Joint velocities in rad/s.
     pub velocity: [f64; WORDS],
-    /// The sum of what cells said, in Nm.
+    /// The sum of the cells' torques, in Nm.
     pub distributed: [f64; WORDS],
     /// The central torque in Nm, in ticks that compared.
     pub central: Option<[f64; WORDS]>,
@@ -40,7 +40,7 @@ pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
     let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {
-            // What is not as it should be was written by somebody else: it is no tick of ours.
+            // A message that is not as expected was written by another program.
             let _ = take(&mut rows, other.topic, other.schema, other.nanos, other.message);
         }
     }

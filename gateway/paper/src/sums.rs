@@ -20,7 +20,7 @@ const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
 const FOUND_AT: usize = 20;
 /// Epochs over which a constant touch is averaged.
 const AVERAGED: u32 = 32;
-/// Torques that Q7.8 cannot say are left out.
+/// Torques outside Q7.8 are left out.
 const MOST_NM: f64 = 127.0;
 
 /// How much is measured.
@@ -49,7 +49,7 @@ pub struct Errors {
     pub carried_average: f64,
 }
 
-/// So many cells of a skin, drawn at random, each of which feels 0.6 to 6 N.
+/// So many cells of a skin, drawn at random, each with a force of 0.6 to 6 N.
 fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
@@ -106,7 +106,7 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
             carried.add(carry.loaded, &carry.sum, &carry.central);
         }
         let q = phase.map(|phase| 1.5 * phase.sin());
-        // Who carries begins with nothing to carry.
+        // A sum with carry begins with nothing to carry.
         let mut fresh = Tree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
             let (mean, last) = averaged(tree, &q, &touch);
@@ -135,7 +135,7 @@ fn averaged(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -
     (mean, last)
 }
 
-/// A column of [`Errors`]: its label, what a finding of it says, and its value.
+/// A column of [`Errors`]: its heading, the text of its finding, and its value.
 type Way = (&'static str, &'static str, fn(&Errors) -> f64);
 
 /// Each way to sum.
@@ -176,7 +176,7 @@ pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
     let [a, b, c, d, e] = WAYS.map(|(caption, ..)| caption);
     Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
         .text(
-            "Random cells feel 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
+            "Random cells measure 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
              microcontroller. A cell that cuts off what Q7.8 has no room for errs by half a step of 0.0039 Nm to the same \
              side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
              carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",

@@ -78,7 +78,7 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
     assert_eq!(names.len(), all, "figures have names of their own");
 }
 
-/// Whether a finding without a bar is told only: by its verdict, which another comparison comes to as well.
+/// Whether a finding without a limit is for information only: by its verdict, which another comparison comes to as well.
 fn is_stated(finding: &analysis::report::figure::Finding) -> bool {
     finding.paper.is_none() || finding.verdict == Verdict::Stated
 }

@@ -24,7 +24,7 @@ pub const MOST_CELLS: usize = 3_000;
 pub const BUSES: usize = 12;
 /// Where the arm stands while times are measured, in rad.
 pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
-/// What an active cell feels, in N.
+/// The force on an active cell, in N.
 const TOUCH_N: f64 = 1.5;
 /// Ticks in an epoch, at 500 Hz and 62.5 Hz.
 const TICKS: u64 = 8;
@@ -49,18 +49,18 @@ pub fn spread(skin: &Skin, cells: usize) -> Skin {
     Skin { cells: (0..buses).flat_map(of_bus).collect(), ..skin.clone() }
 }
 
-/// What a touched cell feels.
+/// The contact state of a touched cell.
 #[must_use]
 pub fn touch() -> SkinSensors {
     SkinSensors { contact: contact_words(TOUCH_N), ..SkinSensors::default() }
 }
 
-/// What each cell of a skin feels when the first `active` of them in the order of `spread` are touched.
-fn reference_torque(cells: usize, active: usize) -> Vec<SkinSensors> {
+/// The contact state of each cell of a skin when the first `active` of them in the order of `spread` are touched.
+fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
     (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
 }
 
-/// What the receiver of a bus leaves for the loop when the first `active` cells of `cells` have answered an epoch: by
+/// What the receiver of a bus hands to the loop when the first `active` cells of `cells` have answered an epoch: by
 /// the real table, of real frames.
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     let mut table = Table::new(skin, bus);
@@ -76,7 +76,7 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
         // Some torque: what it is costs the same.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
     }
-    Snapshot { sums: table.snapshot().sums, reference_torque: reference_torque(cells.len(), active) }
+    Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
 }
 
 /// Holds the arm, and computes all that the kinesthetic controller computes: a robot that moved to its limits would make
@@ -92,7 +92,7 @@ impl Controller for Held {
     }
 }
 
-/// A control loop over buses whose receivers have left something.
+/// A control loop over buses whose receivers have handed over sums.
 #[derive(Debug)]
 pub struct Ticks {
     turn: Turn,
@@ -123,7 +123,7 @@ impl Ticks {
     /// A loop over a skin of which the first `active` cells, evenly over the buses, are touched.
     ///
     /// # Panics
-    /// When the skin has a controller of somebody else's: a generated one has not.
+    /// When the skin has an external controller: a generated one has none.
     #[must_use]
     pub fn new(skin: &Skin, active: usize, mode: Mode) -> Self {
         let buses = skin.buses.len();
@@ -213,7 +213,7 @@ mod tests {
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
             let mut compared = Ticks::new(&part, active, Mode::Compare);
-            // More than a hundred ticks: nobody is halted for want of what the buses carry.
+            // More than a hundred ticks: the robot is not halted for missing read-back.
             for _ in 0..20 {
                 compared.epoch(|| 0);
             }

@@ -29,7 +29,7 @@ struct Branch {
     children: Vec<(usize, usize)>,
 }
 
-/// A skin on one bus whose cells add up along the shortest ways to the nearest root.
+/// A skin on one bus whose cells add up along the shortest routes to the nearest root.
 #[derive(Clone, Debug)]
 pub struct Tree {
     skin: Skin,
@@ -57,7 +57,7 @@ pub struct Came {
 }
 
 impl Tree {
-    /// A tree in which rounding is carried into a cell's next value, or not. Cells without a way to a root have no part.
+    /// A tree in which rounding is carried into a cell's next value, or not. Unreachable cells have no part.
     #[must_use]
     pub fn new(skin: &Skin, carry: bool) -> Self {
         let place = |node: CellId| skin.cells.iter().position(|cell| cell.node == node);
@@ -92,13 +92,13 @@ impl Tree {
         Self { central: Central::new(skin), skin: skin.clone(), sums, order, kernels, epoch: Epoch(0) }
     }
 
-    /// Cells that have a way to a root.
+    /// Cells with a route to a root.
     #[must_use]
     pub fn cells(&self) -> usize {
         self.order.len()
     }
 
-    /// One epoch in which cells, by their places in the skin, feel something while the joints stand at `q` (rad).
+    /// One epoch in which cells, by their places in the skin, are in contact while the joints are at `q` (rad).
     pub fn turn(&mut self, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> Came {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
@@ -162,7 +162,7 @@ fn add(sum: &mut [f64; WORDS], more: [f64; WORDS]) {
     }
 }
 
-/// What a cell would say that drops the bits that Q7.8 has no room for, in Nm.
+/// The value of a cell that cuts off the bits below Q7.8, in Nm.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
 fn truncated(exact: Acc<30>) -> f64 {
     (exact.steps() >> SHORTENED) as f64 / 256.0

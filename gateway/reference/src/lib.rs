@@ -21,16 +21,16 @@ impl Reference {
         Self { kernel: Wrench::new(parameters), contact: parameters.contact }
     }
 
-    /// What a newton on the cell does to each joint, in m, at joint positions in quarter turns.
+    /// The torque about each joint of one newton on the cell, in m, at joint positions in quarter turns.
     #[must_use]
     pub fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [Q1_14; MAX_JOINTS] {
         self.kernel.jacobian(joints)
     }
 
-    /// The torques in Nm that it would send, when it feels this at joint positions in quarter turns.
+    /// The torques in Nm that it would send with these sensors at joint positions in quarter turns.
     #[must_use]
-    pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], contact_state: &SkinSensors) -> [Q3_12; MAX_JOINTS] {
-        let force = Force::fuse(contact_state.contact, contact_state.proximity, &self.contact);
+    pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], sensors: &SkinSensors) -> [Q3_12; MAX_JOINTS] {
+        let force = Force::fuse(sensors.contact, sensors.proximity, &self.contact);
         Torque::new(&self.jacobian(joints), force).words()
     }
 }

@@ -138,7 +138,7 @@ fn torques() -> Vec<Value> {
             "pose": case.parameters.words(Parameter::Pose),
             "contact": case.parameters.words(Parameter::Contact),
             "q": case.q.map(|word| word.to_bits()),
-            "sensors": case.contact_state(),
+            "sensors": case.sensors(),
             "jacobian": jacobian.map(|word| word.to_bits()),
             "jacobian_exact": case.exact_jacobian().map(|word| word.to_bits()),
             "torque": torque.map(|word| word.to_bits()),
@@ -189,7 +189,7 @@ fn the_vectors_are_what_the_code_says() {
         std::fs::write(PATH, &file).unwrap();
     }
     let _: Value = serde_json::from_str(&file).unwrap();
-    assert!(std::fs::read_to_string(PATH).unwrap() == file, "SKINBUS_TAKE_OVER=yes writes the vectors anew");
+    assert!(std::fs::read_to_string(PATH).unwrap() == file, "SKINBUS_TAKE_OVER=yes writes the vectors again");
 }
 
 #[test]

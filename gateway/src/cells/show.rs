@@ -16,15 +16,15 @@ use serde::Serialize;
 
 use crate::print::{filled, some, words};
 
-/// What a description says of a bus.
+/// A bus in a description.
 pub(super) struct Known {
     file: String,
     pub(super) format: Format,
-    /// Numbers and hashes, by serial number.
+    /// Node ids and hashes, by serial number.
     cells: BTreeMap<u32, (CellId, u16)>,
 }
 
-/// A column: its head, and what stands there of a cell that has said it.
+/// A column: its head, and the text of a cell that has reported it.
 type Column = (&'static str, fn(&CellShown) -> Option<String>);
 
 const COLUMNS: [Column; 10] = [
@@ -40,7 +40,7 @@ const COLUMNS: [Column; 10] = [
     ("age", |it| Some(format!("{:.2}", it.age_s))),
 ];
 
-/// For who has the room.
+/// Columns for wide terminals.
 const COUNTERS: [Column; 9] = [
     ("sent", |it| text(it.sent)),
     ("refused", |it| text(it.refused)),
@@ -60,14 +60,14 @@ fn text(value: Option<impl Display>) -> Option<String> {
     value.map(|value| value.to_string())
 }
 
-/// A bus and the cells that are heard on it.
+/// A bus and the cells that send on it.
 #[derive(Serialize)]
 pub(super) struct Shown<'a> {
     bus: &'a str,
     kind: String,
     gateway_heard: bool,
     cells: Vec<CellShown>,
-    /// Cells of the description that were not heard.
+    /// Cells of the description that are missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     missing: Option<Vec<u8>>,
     #[serde(skip)]
@@ -75,7 +75,7 @@ pub(super) struct Shown<'a> {
 }
 
 impl<'a> Shown<'a> {
-    /// What was heard, beside what a description says.
+    /// The cells of the bus, compared with a description.
     pub(super) fn of(watch: &'a Watch, known: Option<&'a Known>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
         let missing = |known: &Known| {
@@ -92,7 +92,7 @@ impl<'a> Shown<'a> {
         }
     }
 
-    /// One line a cell, and what is odd; without counters where there is no room for them.
+    /// One line a cell, and anomalies; without counters where there is no room for them.
     pub(super) fn table(&self) -> String {
         let whole = self.lines(COLUMNS.into_iter().chain(COUNTERS));
         let text = match Table::new().width() {
@@ -102,7 +102,7 @@ impl<'a> Shown<'a> {
         text + &self.end()
     }
 
-    /// One line a cell; a column in which nobody has said anything is left out.
+    /// One line a cell; empty columns are left out.
     fn lines(&self, columns: impl IntoIterator<Item = Column>) -> String {
         let (heads, lines) = filled(columns, &self.cells, "-");
         let mut table = Table::new();
@@ -117,7 +117,7 @@ impl<'a> Shown<'a> {
         table.lines().map(|line| format!("{}\n", line.trim_end())).collect()
     }
 
-    /// How many there are, and what is odd.
+    /// Counts, and anomalies.
     fn end(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
         let active = self.cells.iter().filter(|cell| cell.is("active")).count();
@@ -134,18 +134,18 @@ impl<'a> Shown<'a> {
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
-            text += &format!("numbers under which two cells speak: {}\n", some(&shared));
+            text += &format!("node ids that two cells use: {}\n", some(&shared));
         }
         let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
         if !missing.is_empty() {
-            text += &format!("cells of {} that were not heard: {}\n", self.file, some(&missing));
+            text += &format!("cells of {} that are missing: {}\n", self.file, some(&missing));
         }
         text
     }
 }
 
 impl Known {
-    /// What a skin, from this file, says of one of its buses.
+    /// One bus of a skin, from this file.
     pub(super) fn of(skin: &Skin, bus: usize, file: String) -> Self {
         let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
         let cells = skin.cells_of(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
@@ -153,7 +153,7 @@ impl Known {
     }
 
     /// Whether a cell is as the description has it.
-    fn says(&self, number: u8, heartbeat: &Heartbeat) -> Option<String> {
+    fn compared(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
         };
@@ -162,7 +162,7 @@ impl Known {
             (true, true) => "yes",
             (true, false) => "other",
         };
-        let moved = described.get() != number;
+        let moved = described.get() != node;
         Some(if moved { format!("{is}, there {described}") } else { is.to_owned() })
     }
 }
@@ -182,7 +182,7 @@ pub(super) fn screen(text: &str) -> String {
     format!("\x1b[H{lines}\x1b[J")
 }
 
-/// What it has not said is null.
+/// What it has not reported is null.
 #[derive(Serialize)]
 struct CellShown {
     node: u8,
@@ -221,7 +221,7 @@ impl CellShown {
             joint: configured.map(|it| it.state.joint()),
             version: beat.map(|it| it.state.version()),
             hash: configured.map(|it| format!("{:04X}", it.configuration)),
-            skin: known.and_then(|known| known.says(node, beat?)),
+            skin: known.and_then(|known| known.compared(node, beat?)),
             sent: beat.map(|it| it.sent),
             refused: beat.map(|it| it.rejected),
             heard: cell.heard,
@@ -233,12 +233,12 @@ impl CellShown {
         }
     }
 
-    /// Whether it says that it is in this state.
+    /// Whether it reports this state.
     fn is(&self, state: &str) -> bool {
         self.state.iter().flatten().any(|name| *name == state)
     }
 
-    /// The state in words; that a cell is configured is said when there is nothing else to say.
+    /// The state in words; "configured" stands only where there is no other state.
     fn state(&self) -> Option<String> {
         let bare = (self.configured == Some(false)).then_some(&"unconfigured");
         let others = self.state.as_ref()?.iter().filter(|name| **name != "configured");
@@ -276,7 +276,7 @@ impl TreeShown {
 
 #[derive(Serialize)]
 struct PortShown {
-    /// Of the cell at the other end; null where nothing is heard, 0 of a cell without a number.
+    /// Node id of the neighbour; null where nothing is received, 0 of a cell without a node id.
     node: Option<u8>,
     port: Option<u8>,
     works: bool,
@@ -289,7 +289,7 @@ impl PortShown {
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
     }
 
-    /// In words: `?` after a cell that does not hear back, `!` after one of another version.
+    /// In words: `?` after a cell that does not receive, `!` after one of another version.
     fn leads_to(&self) -> String {
         match (self.node, self.works, self.other_version) {
             (None, _, _) => ".".to_owned(),

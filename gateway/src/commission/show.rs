@@ -1,4 +1,4 @@
-//! What became of a commissioning, as a table, as JSON, and in lines for people.
+//! The result of a commissioning, as a table, as JSON, and in notes.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::print::{Rows, some};
 
-/// Cells with other numbers that get a line each.
+/// Cells with other node ids that get a line each.
 const LINES: usize = 8;
 
 /// All of it.
@@ -65,9 +65,9 @@ impl<'a> BusShown<'a> {
         }
     }
 
-    /// Cells under another number than the description's, and which.
+    /// Cells with another node id than in the description, and which.
     fn moved(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
-        self.cells.iter().filter_map(|cell| Some((cell.number.filter(|&node| node != cell.described)?, cell)))
+        self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
 
     fn rows(&self, rows: &mut Rows) {
@@ -98,14 +98,14 @@ impl<'a> BusShown<'a> {
             rows.row("ended", failure, "");
         }
         let moved = self.moved().count();
-        rows.any("under another number", moved, "than in the description; --numbers writes a copy");
-        rows.any("requests", self.requests, format!("{} said again", self.repeated));
+        rows.any("with another node id", moved, "than in the description; --node-ids writes a copy");
+        rows.any("requests", self.requests, format!("{} retries", self.repeated));
         rows.any("frames lost", self.frames_dropped, "they came faster than they were read");
     }
 }
 
 impl Whole<'_> {
-    /// What people should know beside the table.
+    /// Notes beside the table.
     pub(super) fn notes(&self, has_copy: bool) -> Vec<String> {
         let file = self.file;
         let mut notes = Vec::new();
@@ -127,8 +127,8 @@ impl Whole<'_> {
             notes.extend(elsewhere);
             let moved = bus.moved().count();
             if moved > LINES {
-                let copy = if has_copy { "" } else { "; --numbers FILE writes a copy with theirs" };
-                notes.push(format!("{moved} cells have other numbers on {name} than in {file}{copy}"));
+                let copy = if has_copy { "" } else { "; --node-ids FILE writes a copy with theirs" };
+                notes.push(format!("{moved} cells have other node ids on {name} than in {file}{copy}"));
             } else {
                 notes.extend(bus.moved().map(|(node, CellReport { serial, described, .. })| {
                     format!("the cell with serial number {serial} is {node} on {name}, {described} in {file}")
@@ -138,7 +138,7 @@ impl Whole<'_> {
         notes
     }
 
-    /// A table for people.
+    /// The table.
     pub(super) fn table(&self) -> String {
         let cells = self.buses.iter().map(|bus| bus.cells.len()).sum::<usize>();
         let ended = match (self.interrupted, self.dry_run) {
@@ -151,7 +151,7 @@ impl Whole<'_> {
         rows.text()
     }
 
-    /// How it ends, when all has been shown.
+    /// The result of the program, when all has been shown.
     pub(super) fn end(&self) -> Result<(), Failure> {
         let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));
@@ -163,9 +163,7 @@ impl Whole<'_> {
         match (self.interrupted, failed) {
             (_, 0) => Ok(()),
             (true, _) => Err(Failure::run(format!("interrupted: {what}; run it again to go on"))),
-            (false, _) => {
-                Err(Failure::run(format!("{what}, see the table; run it again when that is mended")))
-            }
+            (false, _) => Err(Failure::run(format!("{what}, see the table; fix that and run it again"))),
         }
     }
 }

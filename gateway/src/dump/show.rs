@@ -1,4 +1,4 @@
-//! What is shown of each frame.
+//! Output for each frame.
 
 use std::fmt::Write as _;
 use std::io::{self, Write};
@@ -27,15 +27,15 @@ const PLAIN: &str = "\x1b[0m";
 pub(super) enum How {
     /// One line each, in colours or not.
     Lines { colour: bool },
-    /// The same without the raw frame: the time since the first one, the bus, and what it says.
+    /// The same without the raw frame: the time since the first one, the bus, and the decoded frame.
     Brief { colour: bool },
     /// One JSON object each.
     Json,
-    /// Not each; all of them in numbers at the end.
+    /// None; statistics at the end.
     Stats(Box<Stats>),
 }
 
-/// A frame of which it is not known yet what it is.
+/// A frame that is not settled yet.
 struct Waiting {
     time: Timestamp,
     bus: Arc<str>,
@@ -50,7 +50,7 @@ pub(super) struct Show<W> {
     /// The bus of the last frame.
     bus: Arc<str>,
     pick: Pick,
-    /// Only what tells of a touch.
+    /// Only traffic of touches.
     contact: bool,
     how: How,
     /// Frames that may still be shown.
@@ -66,7 +66,7 @@ impl<W: Write> Show<W> {
         Self { out, settler, bus, pick, contact, how, left: max, first: None, raw: String::new() }
     }
 
-    /// Takes the next frame; it is shown if it is wanted, as soon as it is known what it is.
+    /// Takes the next frame; it is shown once it is settled, if the filters select it.
     pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<()> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
@@ -77,7 +77,7 @@ impl<W: Write> Show<W> {
         self.settled()
     }
 
-    /// It is that late, and no frame came.
+    /// Time passed without a frame.
     pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
         self.settled()
@@ -94,7 +94,7 @@ impl<W: Write> Show<W> {
         self.settler.is_waiting()
     }
 
-    /// Shows what is known by now.
+    /// Shows the frames that are settled.
     fn settled(&mut self) -> io::Result<()> {
         while self.left > 0
             && let Some((Waiting { time, bus, frame, direction }, decoded)) = self.settler.pop()
@@ -109,7 +109,7 @@ impl<W: Write> Show<W> {
         self.left == 0
     }
 
-    /// Shows a frame if it is wanted.
+    /// Shows a frame if the filters select it.
     fn show(&mut self, record: &Record<'_>, decoded: Decoded) -> io::Result<()> {
         let nanos = record.time.nanos;
         let first = *self.first.get_or_insert(nanos);
@@ -169,7 +169,7 @@ impl<W: Write> Show<W> {
     }
 }
 
-/// The colour of what a frame says.
+/// The colour of a decoded frame.
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Segment { .. } => DIM,

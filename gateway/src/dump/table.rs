@@ -1,4 +1,4 @@
-//! The numbers of a capture as tables.
+//! The statistics of a capture as tables.
 
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 use comfy_table::Table;
@@ -11,8 +11,8 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = Rows::new(name, head, format!("{} frames", report.frames));
     rows.any("frames before the one before them", report.times_backwards, "times run backwards");
-    rows.any("frames missing", report.dropped, "lost by whoever took the capture");
-    rows.any("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    rows.any("frames missing", report.dropped, "lost by the recorder");
+    rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     for bus in &report.buses {
         numbers(&mut rows, bus);
     }
@@ -42,7 +42,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
     }
     let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
-        let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "begun anew")];
+        let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "restarts")];
         let odd = list(odd.map(|(count, what)| format!("{count} {what}")));
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
@@ -60,7 +60,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
         let chance = format!("{packets_by_chance:.1}");
         rows.row("  packets by chance", chance, "expected");
     }
-    let why = if bus.dropped > 0 { "lost by whoever took the capture" } else { "" };
+    let why = if bus.dropped > 0 { "lost by the recorder" } else { "" };
     rows.row("frames missing", bus.dropped, why);
 }
 
@@ -110,12 +110,12 @@ fn foreign(bus: &BusReport) -> Table {
     print::table(head, lines, |column| column < 6)
 }
 
-/// What stands in a column: its head, and a cell's text there, if it has any.
+/// A column: its head, and the text of a cell, if it has any.
 type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 
-/// One line a cell. What no cell has (missed, lost, ...) has no column.
+/// One line a cell. Columns without a value (unanswered, lost, ...) are left out.
 fn cells(bus: &BusReport) -> Table {
-    // What is not there is no zero.
+    // A zero is left blank.
     fn some(count: u64) -> Option<String> {
         (count > 0).then(|| count.to_string())
     }
@@ -125,7 +125,7 @@ fn cells(bus: &BusReport) -> Table {
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
-        ("missed", |cell| some(cell.unanswered)),
+        ("unanswered", |cell| some(cell.unanswered)),
         ("twice", |cell| some(cell.repeated)),
         ("sums", |cell| some(cell.sums)),
         ("again", |cell| some(cell.resent)),

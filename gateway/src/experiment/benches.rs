@@ -1,4 +1,4 @@
-//! The moving arm's benches: this program again, as anybody would run it.
+//! The moving arm's benches: this program again, as from a shell.
 
 use std::fs;
 use std::io;
@@ -24,7 +24,7 @@ pub(super) struct Benches {
     /// For their skins, scenarios, recordings and summaries.
     pub(super) folder: PathBuf,
     pub(super) programs: Programs,
-    /// Set when it shall end.
+    /// Set when it has to end.
     pub(super) stop: Arc<AtomicBool>,
 }
 
@@ -65,7 +65,7 @@ impl Benches {
         let ended = self.wait(command).map_err(|error| failed(&own, &error))?;
         if !ended.status.success() {
             let said = String::from_utf8_lossy(&ended.stderr);
-            let last = said.trim_end().lines().last().unwrap_or("it said nothing").to_owned();
+            let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();
             let last = last.strip_prefix("gateway: ").unwrap_or(&last);
             return Err(Failure::run(format!("the bench of the moving arm ({name}): {last}")));
         }
@@ -85,14 +85,14 @@ impl Benches {
 }
 
 impl Benches {
-    /// Waits for the bench's end, which comes early when somebody says so.
+    /// Waits for the bench's end, which a signal makes early.
     fn wait(&self, mut command: Command) -> io::Result<Output> {
         let mut child = command.spawn()?;
         let mut stated = false;
         while child.try_wait()?.is_none() {
             if !stated && self.stop.load(Ordering::Relaxed) {
                 stated = true;
-                // If it has just ended there is nobody to tell.
+                // If it has just ended, no process gets the signal.
                 let _ = kill_process(Pid::from_child(&child), Signal::INT);
             }
             std::thread::sleep(LOOK);

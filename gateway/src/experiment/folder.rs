@@ -9,7 +9,7 @@ use trace::files::rename;
 
 use crate::output::Force;
 
-/// A folder for what experiments come to. What is written stands in a hidden folder in it until [`Folder::finish`]; if that
+/// A folder for results of experiments. What is written stands in a hidden folder in it until [`Folder::finish`]; if that
 /// never comes, nothing of it stays.
 #[derive(Debug)]
 pub(super) struct Folder {

@@ -6,7 +6,7 @@ use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origi
 
 use crate::print::{self, decimals, or};
 
-/// Which part is wanted.
+/// Which part is shown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum What {
     /// One line a cell; a single cell in every step.
@@ -96,7 +96,7 @@ fn one_line_each(cells: &[CellExplained]) -> String {
         line
     });
     format!(
-        "\nwhat cells said in Nm, and by how many steps of 2^-12 at most; --cell shows how\n{}",
+        "\ntorques of the cells in Nm, and the largest difference in steps of 2^-12; --cell shows each step\n{}",
         table(head, lines, true)
     )
 }
@@ -105,7 +105,7 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
     cell.force.as_ref().map(|force| force.force_n)
 }
 
-/// How cells are called: by their numbers, and by their bus where there are several.
+/// Names of cells: their node ids, with their bus where there are several.
 struct Names(Option<String>);
 
 impl Names {
@@ -138,16 +138,16 @@ fn sign(steps: i32) -> String {
     if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
 }
 
-/// How much a verdict asks of the reader, the word for it, and what that means where it is not plain.
+/// The rank of a verdict by importance, its word, and an explanation where it needs one.
 fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         Verdict::Nearest => (0, "nearest", None),
         Verdict::Rounded { .. } => {
-            let means = "a J so many steps of 2^-14 m from the exact one gives this very word";
+            let means = "a J so many steps of 2^-14 m from the exact one gives this word";
             (1, "16 bits", Some(means.to_owned()))
         }
         Verdict::Saturated => {
-            let means = "the product is beyond 8 Nm, and the word says so";
+            let means = "the product is above 8 Nm: the word is saturated";
             (2, "saturated", Some(means.to_owned()))
         }
         Verdict::Open => (3, "open", None),
@@ -158,12 +158,12 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     }
 }
 
-/// The verdict that asks most of the reader.
+/// The most important verdict.
 fn worst(rows: &[Row]) -> String {
     or(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
-/// The same with the J that a word comes of.
+/// The same with the J that gives the word.
 fn long(verdict: &Verdict) -> String {
     let (_, short, _) = about(verdict);
     match verdict {
@@ -183,7 +183,7 @@ fn every_step(cell: &CellExplained, first: u64) -> String {
     let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
     match &cell.force {
         Some(force) => text += &force_steps(force, first),
-        None => text += "  felt       not known\n",
+        None => text += "  contact    not known\n",
     }
     match cell.answered_after_ns {
         Some(nanos) => text += &format!("  answered   {} after the joints\n", millis(nanos)),
@@ -205,7 +205,7 @@ fn force_steps(force: &Force, first: u64) -> String {
     let [touch_counts, near_counts] =
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
-        "  felt       {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
+        "  contact    {a:.4} + {b:.4} + {c:.4} N, proximity {proximity:.4}\n  \
          since      {origin}\n  \
          F_c        {touch_n:.4} N, {touch} {contact_threshold_n:.4} N: {touch_counts}\n  \
          F_p        {proximity:.4}, {near} {proximity_threshold:.4}: {near_counts}\n  \
@@ -223,7 +223,7 @@ fn origin(origin: &Origin, first: u64) -> String {
     match *origin {
         Origin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
         Origin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),
-        Origin::Said { at_ns } => format!("it said so itself at {} s", at(at_ns)),
+        Origin::Said { at_ns } => format!("it reported so itself at {} s", at(at_ns)),
         Origin::Stimulus { at_ns, from_epoch: None, .. } => {
             format!("stimulus of {} s, from the next joints on", at(at_ns))
         }

@@ -1,4 +1,4 @@
-//! What `gateway fit` prints for people.
+//! The tables of `gateway fit`.
 
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};
@@ -71,7 +71,7 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     for bus in buses {
         section(&mut rows, bus);
     }
-    // Of one bus its own section says the same.
+    // With one bus its own section has the same.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
         rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
         rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
@@ -118,7 +118,7 @@ fn section(rows: &mut Rows, bus: &BusFit) {
         rows.row(format!("  {}", hint.change), figures(&hint.after), hint.after.verdict());
     }
     if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
-        rows.row("  sums", "not possible", "a cell has no way to a root");
+        rows.row("  sums", "not possible", "a cell is unreachable");
     }
 }
 

@@ -9,7 +9,7 @@ use model::table::Errors;
 
 use crate::print::{Rows, count, list, or, quantiles, words};
 
-/// Halts that are told one by one.
+/// Halts that are listed one by one.
 const HALTS: usize = 10;
 
 /// Cells of a bus that are told one by one, because they stand out.
@@ -54,7 +54,7 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
     if !single && !sums {
         return;
     }
-    rows.section("accuracy", "mean (greatest) error, Nm", "distributed against central");
+    rows.section("accuracy", "mean (max) error, Nm", "distributed against central");
     if single {
         let paper = format!("paper {}", paper::SINGLE_NM);
         rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
@@ -78,7 +78,7 @@ fn errors(errors: &Errors) -> String {
 
 fn control(rows: &mut Rows, summary: &Summary) {
     let control = &summary.control;
-    rows.section("control loop", "50 % / 90 % / 99 % / greatest, µs", "");
+    rows.section("control loop", "50 % / 90 % / 99 % / max, µs", "");
     rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
     if control.central_us.count > 0 {
         rows.row("tick", quantiles(&control.took_us), "");
@@ -123,17 +123,17 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
             format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
         rows.row(format!("sums from {}", count(sums.roots, "root")), counts.first, more);
         let on_the_bus = counts.received + bus.uplink.unheard;
-        let plainly =
-            format!("the gateway took {}: the tree spares it frames, and a shared bus none", counts.received);
-        rows.row("sums on the bus, of all cells", on_the_bus, plainly);
+        let taken =
+            format!("the gateway took {}: the tree saves it frames, but not a shared bus", counts.received);
+        rows.row("sums on the bus, of all cells", on_the_bus, taken);
         if let Some(network) = &bus.network {
             let tree_ready =
-                network.tree_ready_s.map_or_else(|| "never whole".to_owned(), |s| format!("in {s:.2} s"));
+                network.tree_ready_s.map_or_else(|| "never complete".to_owned(), |s| format!("in {s:.2} s"));
             let changes = format!("{tree_ready}, {} changes of parents", network.parent_changes);
             rows.row("tree, wires deep", network.deepest, changes);
             if !network.unreachable.is_empty() {
-                let without = words(&network.unreachable);
-                rows.row("cells without a way to a root", without, "no sum holds them");
+                let unreachable = words(&network.unreachable);
+                rows.row("unreachable cells", unreachable, "no sum contains them");
             }
             for difference in &network.differences {
                 rows.row("not as described", difference, "");
@@ -155,7 +155,7 @@ fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String
     list(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
 }
 
-/// The reasons that there were, and always how many nobody knows.
+/// The reasons that there were, and always how many are unknown.
 fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));

@@ -11,7 +11,7 @@ use analysis::shadow::{
 
 use crate::print::{Rows, list, or};
 
-/// Writes the frames of which it is known what became of them, one object a line.
+/// Writes the frames that have left the model, one object a line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
     let mut line = Vec::with_capacity(192);
     while let Some(frame) = shadow.poll() {
@@ -60,7 +60,7 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
     for bus in &report.buses {
         one(&mut rows, bus, report.bit_error_rate);
     }
-    rows.any("frames of further buses", report.frames_of_other_buses, "64 buses are told apart");
+    rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     rows.text()
 }
 
@@ -86,7 +86,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
     bench(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    rows.any("left out: error frames", bus.counts.error_frames, "words of a driver, never on a wire");
+    rows.any("left out: error frames", bus.counts.error_frames, "of a driver, never on a wire");
     rows.any("out of order, and sorted", bus.counts.out_of_order, of_all(bus.counts.out_of_order));
     rows.any("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
     rows.any("never sent", bus.counts.no_room, "4 million frames waited already");
@@ -122,7 +122,7 @@ fn operation(rows: &mut Rows, bus: &BusShadow) {
     load(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
     rows.row("  bus taken", share(bus.load.busy), "");
     pauses(rows, bus, &bus.stretches);
-    rows.row("delay, µs", "half / 99 % / greatest", "until it is sent");
+    rows.row("delay, µs", "50 % / 99 % / max", "until it is sent");
     rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
@@ -138,12 +138,12 @@ fn operation(rows: &mut Rows, bus: &BusShadow) {
     }
 }
 
-/// Start-up, which is judged by nobody: it takes as long as it takes.
+/// Start-up, which has no limits and is not rated.
 fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     load(rows, bus, &start_up.load, ("start-up: average load", &beside));
     pauses(rows, bus, &start_up.stretches);
-    rows.row("  delay, µs", delays(&start_up.delay_us), "half / 99 % / greatest");
+    rows.row("  delay, µs", delays(&start_up.delay_us), "50 % / 99 % / max");
 }
 
 fn bench(rows: &mut Rows, bus: &BusShadow) {
@@ -176,7 +176,7 @@ fn share(share: Option<f64>) -> String {
 
 fn answers(rows: &mut Rows, replies: &Replies) {
     let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
-    rows.row("answers after joints, µs", delays(after_joints_us), "half / 99 % / greatest");
+    rows.row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
         Some("after the next joints".to_owned()),
         (*late_when_ready > 0).then(|| format!("{late_when_ready} were ready too late for any bus")),

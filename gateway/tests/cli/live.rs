@@ -120,7 +120,7 @@ fn what_is_sent_on_an_embedded_bus_is_shown() {
     let skin = "force 3.000 N (1.000 1.000 1.000), proximity 0.0000, temperature 0.00 0.00 °C";
     let expected = [
         &format!("ok      stimulus 12 from the next joints on: {skin}"),
-        "half    sync",
+        "segment sync",
         "ok      sync",
         "ok      resume",
     ];
@@ -182,23 +182,23 @@ fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
     let bench = Bench::new();
     let mut dump = bench.dump("");
     bench.open().send(&[Frame::classic(0x20C, &[7; 8]).unwrap()]).unwrap();
-    // It might be half of a packet, and nobody says so but the time.
+    // It may be the first segment of a packet until the reassembly timeout.
     let mut line = String::new();
     BufReader::new(dump.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other half\n"), "{line}");
+    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other segment\n"), "{line}");
     kill_process(Pid::from_child(&dump), Signal::INT).unwrap();
     assert_eq!(dump.wait().unwrap().code(), Some(0));
 }
 
 #[test]
-fn cells_on_a_bus_of_other_people_says_that_frames_came_and_none_was_of_a_cell() {
+fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let bench = Bench::new();
     let bus = bench.open();
     let mut command = bench.gateway("cells vcan0 --for 1");
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut sent = 0_u64;
     while child.try_wait().unwrap().is_none() {
-        // A frame that is not taken, because nobody listens any more, is no matter.
+        // A frame that is not taken, because the command has ended, does not matter.
         let _ = bus.send(&[Frame::classic(0x20C, &sent.to_le_bytes()).unwrap()]);
         sent += 1;
         std::thread::sleep(Duration::from_millis(5));
@@ -206,7 +206,7 @@ fn cells_on_a_bus_of_other_people_says_that_frames_came_and_none_was_of_a_cell()
     let Output { status, stderr, .. } = child.wait_with_output().unwrap();
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
-    assert!(said.contains(" frames are none of a cell; `gateway dump` shows them): start them"), "{said}");
+    assert!(said.contains(" frames are of no cell; `gateway dump` shows them): start them"), "{said}");
 }
 
 #[test]
@@ -259,7 +259,7 @@ fn a_bus_that_ends_ends_its_dump_with_an_error() {
 }
 
 #[test]
-fn a_dump_says_what_it_missed_though_its_bus_has_ended() {
+fn a_dump_reports_lost_frames_though_its_bus_has_ended() {
     const FLOOD: u32 = 10_000;
     let bench = Bench::new();
     let mut dump = bench.dump("");

@@ -44,7 +44,7 @@ fn output(mut command: Command) -> String {
     text(&stdout).to_owned()
 }
 
-/// What a command says that ends with this code and prints nothing: one line.
+/// The one-line error of a command that ends with this code and prints nothing.
 fn refusal(arguments: &str, code: i32) -> String {
     let Output { status, stdout, stderr } = gateway(arguments).output().unwrap();
     let said = text(&stderr);
@@ -103,7 +103,7 @@ fn filters_pick_by_kind_node_and_time() {
     assert_eq!(dump("--from 0.002 --to 0.005"), dump("")[2..5]);
     let classic = output(gateway(&format!("dump {} --from 0.0005 --max 2", golden("classic.log"))));
     let pair =
-        ["half    joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
+        ["segment joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
     assert_eq!(decoded(&classic), pair);
     let only_fd = output(gateway(&format!("dump {} --format fd --max 1", golden("classic.log"))));
     assert_eq!(decoded(&only_fd), ["foreign no packet: 8 data bytes, not 16"]);
@@ -235,8 +235,8 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
 #[test]
 fn wrong_use_is_one_line_and_exit_code_2() {
     for (arguments, expected) in [
-        ("frame stimulus --node 300", "--node 300: a cell's number, 1 to 254, or everyone is possible"),
-        ("frame stimulus --node 12 --force 100", "--force 100: three contact words say -96 to 95.997 N"),
+        ("frame stimulus --node 300", "--node 300: a node id, 1 to 254, or everyone is possible"),
+        ("frame stimulus --node 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
         ("frame stimulus", "the following required arguments were not provided: --node <NODE>; try '--help'"),
         (
             "frame joints --epoch 256 --rad 0",
@@ -250,7 +250,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("dump / ", "/ is a directory: name a candump log or a bus"),
         (
             "skin generate --cells 255",
-            "255 cells do not fit on one bus: a bus has numbers for 254; say --buses 2",
+            "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2",
         ),
         ("skin check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
         (
@@ -280,7 +280,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
 fn the_example_is_what_the_command_in_its_header_prints() {
     let example = include_str!("../../examples/ur5-253.toml");
     let command = example.lines().next().unwrap().strip_prefix("# gateway ").unwrap();
-    assert!(output(gateway(command)) == example, "make it anew with gateway {command}");
+    assert!(output(gateway(command)) == example, "generate it with gateway {command}");
 }
 
 #[test]

@@ -59,7 +59,7 @@ fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
     (status, String::from_utf8_lossy(&fs::read(folder.join("said")).unwrap()).into_owned())
 }
 
-/// With `SKINBUS_MUTATIONS_DIR` files are only written there, for whoever wants to try other programs with them.
+/// With `SKINBUS_MUTATIONS_DIR` files are only written there, to try other programs with them.
 fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
     if let Some(there) = std::env::var_os("SKINBUS_MUTATIONS_DIR") {
         let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
@@ -107,7 +107,7 @@ fn whatever_a_recording_is_every_command_ends_and_says_why() {
             scope.spawn(|| {
                 let folder = tempfile::tempdir().unwrap();
                 fs::write(folder.path().join("skin.toml"), &skin).unwrap();
-                // The lock is held while a file is made, and by nobody who panicked.
+                // The lock is held while a file is made, which does not panic.
                 let next = || files.lock().unwrap().next();
                 while let Some((what, file)) = next() {
                     passes(folder.path(), &what, &file, COMMANDS);

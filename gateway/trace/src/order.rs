@@ -4,10 +4,10 @@
 //!   frames in the capture's order ──> push ──> [ window ] ──> pop ──> frames in the order in which they are sent
 //! ```
 //!
-//! Whoever records several buses reads them in turn, so in a capture the frames of one bus stand in the bus' order and
-//! those of two may not stand in the order of their times. So the buses are merged by time, and no bus' own order is
-//! ever changed: what a cell heard before it heard the joints, it has to hear before the joints again, whatever the
-//! time stamps say. Frames of the same time keep the capture's order.
+//! A recorder of several buses reads them in turn, so in a capture the frames of one bus are in the bus' order, and
+//! those of two may not be in the order of their times. So the buses are merged by time, and no bus' own order is
+//! changed: frames that a cell received before the joints must come before the joints again, whatever their time
+//! stamps are. Frames of the same time keep the capture's order.
 
 use std::collections::BTreeMap;
 
@@ -35,7 +35,7 @@ pub struct Order<T> {
     /// Those that wait, by their time, or that of a frame before them on their bus when that was later, and by where
     /// they stood in the capture: their own time, and what they are.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
-    /// The greatest time so far on each bus.
+    /// The latest time so far on each bus.
     buses: Vec<u64>,
     places: u64,
     newest: u64,

@@ -1,4 +1,4 @@
-//! The wire of a bench: from who sends a frame to everybody who hears it.
+//! The wire of a bench: from the sender of a frame to its receivers.
 
 use protocol::can::Frame;
 use protocol::packet::Packet;
@@ -76,16 +76,15 @@ impl Bench {
     /// A frame wants a place on the wire.
     pub(super) fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
         if may_be_hit {
-            let broadcast_status =
-                self.faults.broadcast_status(self.agenda.now, sent.truth.from, None, sent.frame);
-            sent.frame = broadcast_status.frame;
-            sent.truth = sent.truth.and(broadcast_status.damage);
-            if broadcast_status.after_next && broadcast_status.times > 0 && self.held.is_none() {
+            let effect = self.faults.effect(self.agenda.now, sent.truth.from, None, sent.frame);
+            sent.frame = effect.frame;
+            sent.truth = sent.truth.and(effect.damage);
+            if effect.after_next && effect.times > 0 && self.held.is_none() {
                 self.held = Some(sent);
                 return;
             }
-            for _ in 0..broadcast_status.times {
-                self.agenda.enter_in(broadcast_status.delay, Event::Send(sent, false));
+            for _ in 0..effect.times {
+                self.agenda.enter_in(effect.delay, Event::Send(sent, false));
             }
             return;
         }
@@ -98,7 +97,7 @@ impl Bench {
     /// A frame has its place in the order, or waits for it.
     fn stand(&mut self, sent: &Sent) {
         if let Some(real) = &mut self.real {
-            real.probe(self.agenda.now, &sent.frame, *sent);
+            real.request(self.agenda.now, &sent.frame, *sent);
             self.look_at_the_bus();
             return;
         }
@@ -107,7 +106,7 @@ impl Bench {
         self.reach(stood, sent);
     }
 
-    /// A frame stood on the wire, and goes to whoever hears it.
+    /// A frame was on the wire, and goes to its receivers.
     pub(super) fn reach(&mut self, stood: Micros, sent: &Sent) {
         let from = sent.truth.from;
         self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
@@ -122,8 +121,7 @@ impl Bench {
 
     /// From the wire to one receiver.
     fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
-        let broadcast_status =
-            self.faults.broadcast_status(self.agenda.now, sent.truth.from, Some(to), sent.frame);
+        let effect = self.faults.effect(self.agenda.now, sent.truth.from, Some(to), sent.frame);
         // A real bus is everywhere at once.
         let latency = match self.real {
             Some(_) => Span(0),
@@ -132,14 +130,14 @@ impl Bench {
         let mut at = stood + latency;
         if let Some(inlet) = self.inlet(to) {
             at = at.max(inlet.newest);
-            if broadcast_status.delay == Span(0) {
+            if effect.delay == Span(0) {
                 inlet.newest = at;
             }
         }
-        let sent = Sent { frame: broadcast_status.frame, truth: sent.truth.and(broadcast_status.damage) };
-        for _ in 0..broadcast_status.times {
-            let delivery = Delivery { to, stood, sent, after_next: broadcast_status.after_next };
-            self.agenda.enter(at + broadcast_status.delay, Event::Deliver(delivery));
+        let sent = Sent { frame: effect.frame, truth: sent.truth.and(effect.damage) };
+        for _ in 0..effect.times {
+            let delivery = Delivery { to, stood, sent, after_next: effect.after_next };
+            self.agenda.enter(at + effect.delay, Event::Deliver(delivery));
         }
     }
 

@@ -29,11 +29,11 @@ pub(super) enum Inlet {
 /// One cell.
 #[derive(Debug)]
 pub struct Place {
-    /// Its number, once it has one; kept over restarts as in flash.
-    pub number: Option<CellId>,
+    /// Its node id, once it has one; kept over restarts as in flash.
+    pub node_id: Option<CellId>,
     /// What its ports lead to.
     pub wires: [Option<End>; PORTS + 1],
-    /// Port p hears nothing.
+    /// Port p receives nothing.
     pub deaf: [bool; PORTS + 1],
     /// The last page of its place in the tree.
     pub tree: Option<Tree>,
@@ -46,10 +46,10 @@ pub struct Place {
     pub(super) force: Force,
     pub(super) life: Life<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
-    /// What it hears aside, and when that stood on the bus: it does not wake it.
+    /// Deferred frames, which do not wake it, and when they were on the bus.
     pub(super) deferred: VecDeque<(Micros, Frame)>,
     pub(super) newest: Micros,
-    /// What it said in each of the last epochs: words, and who is in it.
+    /// Its sums in each of the last epochs: words, and the cells in them.
     pub(super) said: HashMap<u8, Vec<(Words, u128)>>,
 }
 
@@ -93,7 +93,7 @@ impl Place {
             i32::from(word.to_bits())
         });
         Self {
-            number: None,
+            node_id: None,
             wires: [None; PORTS + 1],
             deaf: [false; PORTS + 1],
             tree: None,

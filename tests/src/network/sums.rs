@@ -1,4 +1,4 @@
-//! Who is in a sum that a cell says, and who hears it.
+//! The cells in a sum, and its receivers.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +12,7 @@ use super::place::Inlet;
 use super::{End, Event, Wiring};
 
 impl Wiring {
-    /// A cell says a sum: who is in it, and who hears it.
+    /// A cell sends a sum: finds the cells in it, and its receivers.
     pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
         let cells = self.decode(cell, epoch, words);
         let said = &mut self.cells[cell].said;
@@ -52,7 +52,7 @@ impl Wiring {
                         0,
                         "root {root} counts cells of another one in {epoch:?}: {:?}; {}",
                         self.root_sums,
-                        self.ways()
+                        self.routes()
                     );
                     took.cells |= cells;
                 }
@@ -89,7 +89,7 @@ impl Wiring {
             TWICE,
             "cell {cell} counts a cell twice in {epoch:?} at {:?}: {words:?} of {heard:?}; {}",
             self.agenda.now,
-            self.ways()
+            self.routes()
         );
         cells
     }

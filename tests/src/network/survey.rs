@@ -1,4 +1,4 @@
-//! What is true of the cells and their wires, and what they say of it.
+//! The actual state of the cells and their wires, and what they report.
 
 use std::collections::BTreeSet;
 
@@ -21,7 +21,7 @@ impl Wiring {
         matches!(&self.cells[cell].life, Life::Runs(node) if node.defers(joints))
     }
 
-    /// Cells that have a way to the gateway, by wires that work in both directions and cells that run.
+    /// Cells with a route to the gateway, by wires that work in both directions and cells that run.
     #[must_use]
     pub fn reachable(&self) -> BTreeSet<usize> {
         let mut reached = BTreeSet::new();
@@ -42,7 +42,7 @@ impl Wiring {
         reached
     }
 
-    /// The way of a cell's sums to a root, by what the cells report; `None` without one, or in a circle.
+    /// The route of a cell's sums to a root, by the cells' reports; `None` without one, or in a circle.
     #[must_use]
     pub fn route(&self, cell: usize) -> Option<Vec<usize>> {
         let mut route = vec![cell];
@@ -55,7 +55,7 @@ impl Wiring {
                     let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
                         return None;
                     };
-                    if self.cells[other].number.map(CellId::get) != Some(parent) || route.contains(&other) {
+                    if self.cells[other].node_id.map(CellId::get) != Some(parent) || route.contains(&other) {
                         return None;
                     }
                     route.push(other);
@@ -64,13 +64,13 @@ impl Wiring {
         }
     }
 
-    /// All ways, for people.
+    /// All routes, as text.
     #[must_use]
-    pub fn ways(&self) -> String {
+    pub fn routes(&self) -> String {
         let route = |cell: usize| {
             let place = &self.cells[cell];
             let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
-            format!("{cell}={:?} {tree:?} {:?}", place.number.map(CellId::get), self.route(cell))
+            format!("{cell}={:?} {tree:?} {:?}", place.node_id.map(CellId::get), self.route(cell))
         };
         (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")
     }

@@ -15,7 +15,7 @@
 //!
 //! What it leaves out: bus-off and the error counters that lead to it, overload frames, clocks that are not alike, the time from
 //! one end of the cable to the other (which the bit rate has to allow for), and two nodes that send under one
-//! identifier, which is a fault on a real bus; here the one that asked first goes first.
+//! identifier, which is a fault on a real bus; here the earlier request is sent first.
 
 mod noise;
 mod priority;
@@ -30,19 +30,19 @@ use protocol::wire_time::{BitRates, Bits};
 pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME};
 pub use priority::Priority;
 
-/// A frame that somebody wants to send.
+/// A frame that is to be sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Request<T = u64> {
     /// From when on, in ns.
     pub at: u64,
-    /// What arbitration goes by.
+    /// What arbitration compares.
     pub priority: Priority,
     /// How long it takes.
     pub bits: Bits,
     /// The transmit queue that it waits in: its frames go out in the order in which they were asked for, as from SocketCAN. Any
     /// small numbers. Without one it takes part in every arbitration, as from a controller with room for each identifier.
     pub queue: Option<u16>,
-    /// Whatever the caller knows it by.
+    /// The caller's own tag.
     pub tag: T,
 }
 
@@ -51,17 +51,17 @@ pub struct Request<T = u64> {
 pub struct Attempt<T = u64> {
     /// The request's tag.
     pub tag: T,
-    /// When it was asked for, in ns; at the earliest the time of the request before it.
+    /// When it was requested, in ns; at the earliest the time of the request before it.
     pub at: u64,
     /// Its first bit, in ns.
     pub start: u64,
     /// When the bus was free again, in ns: the end of the intermission, of the frame or of an error frame.
     pub end: u64,
-    /// Whether it was damaged. Then it goes on waiting, and comes again.
+    /// Whether it was damaged. Then it waits again and is sent again.
     pub is_damaged: bool,
 }
 
-/// A bus, whose frames the caller knows by a `T` each.
+/// A bus, whose frames each carry a tag `T` of the caller.
 #[derive(Debug)]
 pub struct BusModel<T = u64> {
     rates: BitRates,
@@ -98,7 +98,7 @@ struct Queue<T> {
 }
 
 impl<T> Ord for Waiting<T> {
-    /// The greatest is the first one out of a heap: the one that wins.
+    /// The maximum leaves the heap first: the frame that wins the arbitration.
     fn cmp(&self, other: &Self) -> Ordering {
         (other.request.priority, other.number).cmp(&(self.request.priority, self.number))
     }
@@ -151,7 +151,7 @@ impl<T: Copy> BusModel<T> {
         self.rates
     }
 
-    /// Somebody wants to send from a time on. A time before that of the newest request counts as that one's.
+    /// Requests to send from a time on. A time before that of the newest request counts as that one's.
     ///
     /// Time passes up to then: attempts that ended are there to be polled.
     pub fn request(&mut self, mut request: Request<T>) {
@@ -212,7 +212,7 @@ impl<T: Copy> BusModel<T> {
         self.ended.pop_front()
     }
 
-    /// Until when time has to pass for anything to happen, if nothing more is asked for; nothing when nobody waits.
+    /// Until when time has to pass for anything to happen, if nothing more is requested; `None` when no frame waits.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<u64> {
         match self.on_wire {

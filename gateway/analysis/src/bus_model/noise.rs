@@ -13,7 +13,7 @@ const INTERMISSION: u32 = 3;
 /// Bits of an FD frame's tail that are at the nominal bit rate, the intermission among them.
 const FD_TAIL: u32 = 12;
 
-/// A bit-error rate that is none, or too high for a frame to come through.
+/// A bit-error rate out of range: not a number, or too high for frames to arrive.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX)]
 pub struct BitErrorsError {
@@ -32,7 +32,7 @@ pub struct BitErrors {
 }
 
 impl BitErrors {
-    /// The greatest rate: a frame of 200 bits then comes through in one of seven attempts.
+    /// The maximum rate: a frame of 200 bits is then undamaged in one of seven attempts.
     pub const MAX: f64 = 0.01;
 
     /// Errors by their rate, in [0, [`BitErrors::MAX`]].
@@ -52,7 +52,7 @@ impl BitErrors {
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
-        reason = "above 0; what is too great is the greatest"
+        reason = "above 0; larger values saturate"
     )]
     fn draw(&mut self) {
         let uniform: f64 = self.dice.random();

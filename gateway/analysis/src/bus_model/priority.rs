@@ -45,7 +45,7 @@ mod tests {
         }
     }
 
-    /// The first bit that is not alike decides; on a wire 0 is what everybody sees.
+    /// The first bit that is not alike decides; on the wire 0 is dominant.
     fn wins(one: &Frame, other: &Frame) -> bool {
         let unlike = bits(one).into_iter().zip(bits(other)).find(|(one, other)| one != other);
         unlike.is_some_and(|(one, _)| !one)

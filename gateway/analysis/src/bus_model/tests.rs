@@ -111,7 +111,7 @@ fn damaged_frames_come_again_until_they_are_whole() {
         let error_frame = u64::from(ERROR_FRAME);
         assert!((1 + error_frame..=97 + error_frame).contains(&bits), "{bits}");
         let next = attempts.iter().find(|it| it.start == attempt.end).unwrap();
-        assert_eq!(next.tag, attempt.tag, "nobody else waits");
+        assert_eq!(next.tag, attempt.tag, "no other frame waits");
     }
     let mut whole: Vec<_> = attempts.iter().filter(|it| !it.is_damaged).map(|it| it.tag).collect();
     whole.sort_unstable();

@@ -5,11 +5,11 @@
 //! ```
 //!
 //! Every identifier of the bus is a message, every field of a packet a signal with its scale, unit and range;
-//! where byte 13 says what the words are, it multiplexes them. Angles are in rad, whose step is pi / 2^15: exact to the
+//! where byte 13 selects the meaning of the words, it multiplexes them. Angles are in rad, whose step is pi / 2^15: exact to the
 //! last bit of a double.
 //!
-//! What cells say over simulated wires is not in it: these frames are on no real bus, and their identifiers number
-//! wires and not cells. `gateway dump` shows them.
+//! Frames of simulated wires are left out: no real bus has them, and their identifiers number wires and not cells.
+//! `gateway dump` shows them.
 //!
 //! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in two frames
 //! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.
@@ -26,7 +26,7 @@ use protocol::skin::{Bus, Skin};
 
 use signal::Signal;
 
-/// How often a cell says that it is there, in ms.
+/// Period of heartbeats, in ms.
 const HEARTBEAT_MS: u32 = 250;
 
 /// The DBC of one bus, an index into [`Skin::buses`]; of one that does not exist, an empty text.
@@ -50,14 +50,14 @@ enum Party {
     Cell(u8),
     /// All cells of the bus.
     Cells,
-    /// Nobody whom the skin names.
+    /// No node of the skin.
     Unnamed,
 }
 
 /// When a message is sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Rhythm {
-    /// When there is reason to.
+    /// On events.
     Seldom,
     /// So many ms after the last.
     Every(u32),
@@ -88,7 +88,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
             Kind::Command => vec![said(Node::Everyone)],
             Kind::Network => {
                 let (from, to, rhythm) = (Party::Gateway, Party::Unnamed, Rhythm::Seldom);
-                let comment = "Another gateway: none has to send this, whoever hears it knows of it.";
+                let comment = "For several gateways on one bus: no gateway has to send it; receiving it shows that another one is there.";
                 let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
                 iter::once(other).chain(each).collect()
             }
@@ -101,7 +101,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     packets().iter().flat_map(of).collect()
 }
 
-/// What a cell says of this kind, or what is said to it; a command.
+/// What a cell sends of this kind, or what is sent to it; a command.
 fn message(schema: &'static PacketSchema, node: Node, period_ms: u32) -> Message {
     let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };

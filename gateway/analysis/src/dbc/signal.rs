@@ -1,4 +1,4 @@
-//! Signals: where they stand in a packet, and what their words are worth.
+//! Signals: their place in a packet, scale, unit and range.
 
 use core::f64::consts::FRAC_PI_2;
 use core::slice;
@@ -10,12 +10,12 @@ use protocol::schema::{Field, Format, Layout, PacketSchema, Range, parameters, r
 /// Where the words end.
 const END: usize = WORDS * 16;
 
-/// When a signal is there.
+/// When a signal is present.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Page {
     /// In every packet of the message.
     Every,
-    /// In every packet; it says which page this is.
+    /// In every packet; it is the number of the page.
     Number,
     /// On one page.
     Only(u8),
@@ -26,20 +26,20 @@ pub(super) enum Page {
 pub(super) struct Signal {
     pub(super) name: String,
     pub(super) page: Page,
-    /// The first bit, counted from the least significant one of byte 0.
+    /// The first bit; bit 0 is the lowest one (LSB) of byte 0.
     pub(super) start: usize,
     pub(super) bits: u8,
     pub(super) signed: bool,
     /// What one step is worth, in the unit.
     pub(super) factor: f64,
-    /// The least and the greatest value that means something.
+    /// The minimum and maximum value that has a meaning.
     pub(super) range: [f64; 2],
     pub(super) unit: &'static str,
     /// Values that have a name.
     pub(super) names: Vec<(i64, &'static str)>,
 }
 
-/// The signals of a kind of packet: those of its pages, what bytes 12 and 13 say, and the CRC.
+/// The signals of a kind of packet: those of its pages, of bytes 12 and 13, and the CRC.
 pub(super) fn all(schema: &'static PacketSchema) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
     let of_layout = |layout: &'static Layout| {

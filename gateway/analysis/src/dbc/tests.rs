@@ -22,7 +22,7 @@ fn parsed(skin: &Skin, bus: usize) -> Dbc {
     Dbc::try_from(dbc(skin, bus).as_str()).unwrap()
 }
 
-/// What a frame says by the DBC alone: the message's name, and each signal that is there with its value.
+/// A frame decoded by the DBC alone: the message's name, and each signal that is present with its value.
 fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; BYTES]) -> (String, BTreeMap<String, f64>) {
     let whole = u128::from_le_bytes(*bytes);
     let raw = |signal: &can_dbc::Signal| {
@@ -133,7 +133,7 @@ fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
         })
         .collect();
     let expected = [
-        // Nobody whom the skin names hears another gateway: can-dbc gives nobody for that.
+        // No node of the skin receives it: can-dbc gives none for that.
         ("halt", "gateway", "cell_1"),
         ("joints", "gateway", "cell_1"),
         ("sync", "gateway", "cell_1"),

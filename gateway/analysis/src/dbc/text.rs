@@ -9,7 +9,7 @@ use protocol::skin::{Bus, Skin};
 use super::signal::{Page, Signal};
 use super::{Message, Party, Rhythm, are_packets};
 
-/// Who sends or receives and has no name, by the format.
+/// The placeholder of the format for a sender or receiver without a name.
 const UNNAMED: &str = "Vector__XXX";
 /// The sections that a reader may meet.
 const SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
@@ -95,7 +95,7 @@ fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Resul
             Page::Only(page) => write!(out, "m{page} ")?,
         }
         let sign = if *signed { '-' } else { '+' };
-        // After the @ stands 1: least significant byte first.
+        // `@1`: little-endian.
         write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{min}|{max}] \"{unit}\" ")?;
         parties(out, message.to, everyone)?;
         writeln!(out)?;
@@ -131,7 +131,7 @@ fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
     writeln!(
         out,
         "CM_ \"Skin {skin}, bus {bus_name}, protocol version {VERSION}. {travels} The crc is CRC-16/CCITT-FALSE over \
-         the identifier (2 bytes, least significant first) and bytes 0 to 13. Epochs and counters wrap.\";"
+         the identifier (2 bytes, little-endian) and bytes 0 to 13. Epochs and counters wrap.\";"
     )
 }
 

@@ -1,15 +1,15 @@
 //! Why a torque is what it is: `gateway explain`.
 //!
 //! ```text
-//!   frames up to some joints ──> Watch ──> what each cell felt and answered ─┐
-//!                                                                            ├──> Explanation
-//!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ──────┘
+//!   frames up to some joints ──> Watch ──> contact state and answer of each cell ─┐
+//!                                                                                 ├──> Explanation
+//!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ───────────┘
 //! ```
 //!
-//! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of what it felt, so a word
-//! that is not the step nearest to the exact product comes of the cell's own J: [`Row::verdict`] looks for a J near
-//! the exact one that makes the very word. What a capture does not tell is named in [`Explanation::missing`] and
-//! left open.
+//! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a
+//! word that is not the step nearest to the exact product comes from the cell's own J: [`Row::verdict`] looks for a J
+//! near the exact one that gives this word. What a capture does not contain is listed in [`Explanation::missing`]
+//! and left open.
 
 mod read;
 mod watch;
@@ -34,15 +34,15 @@ pub const JACOBIAN_STEPS: i64 = 8;
 pub struct Explanation {
     /// The joints, bus by bus.
     pub buses: Vec<BusExplained>,
-    /// Cells that were in contact or answered, bus by bus and by number.
+    /// Cells that were in contact or answered, by bus and node id.
     pub cells: Vec<CellExplained>,
-    /// What the skin as a whole did to each joint.
+    /// The total torque of the skin at each joint.
     pub total: Vec<Total>,
     /// What is not known, a line each.
     pub missing: Vec<String>,
 }
 
-/// What a bus was told.
+/// What was sent on a bus.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusExplained {
     /// Its name.
@@ -62,13 +62,13 @@ pub struct BusExplained {
 pub struct CellExplained {
     /// Its bus.
     pub bus: String,
-    /// Its number.
+    /// Its node id.
     pub node: u8,
     /// The joint that moves it.
     pub joint: u8,
-    /// What it felt, and what it made of it; not there when that is not known.
+    /// Its contact state and the force from it; absent when not known.
     pub force: Option<Force>,
-    /// The time from the joints to its torque; not there when none came.
+    /// The time from the joints to its torque; absent when none came.
     pub answered_after_ns: Option<u64>,
     /// Joint by joint.
     pub rows: Vec<Row>,
@@ -77,7 +77,7 @@ pub struct CellExplained {
 /// Algorithm 1, step by step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Force {
-    /// How it is known what it felt.
+    /// Where its contact state is known from.
     pub origin: Origin,
     /// The three contact words in N.
     pub contact_n: [f64; 3],
@@ -108,7 +108,7 @@ pub struct Force {
 pub struct Row {
     /// The joint, from 1.
     pub joint: u8,
-    /// The exact J of the quantised parameters in m; not there when they are not known.
+    /// The exact J of the quantised parameters in m; absent when they are not known.
     pub jacobian_m: Option<f64>,
     /// J F_z in f64, in Nm.
     pub product_nm: Option<f64>,
@@ -120,7 +120,7 @@ pub struct Row {
     pub word_nm: Option<f64>,
     /// The word less the nearest step.
     pub difference_steps: Option<i32>,
-    /// What the difference comes of.
+    /// Where the difference comes from.
     pub verdict: Verdict,
 }
 
@@ -130,9 +130,9 @@ pub struct Row {
 pub enum Verdict {
     /// The step nearest to the exact product.
     Nearest,
-    /// Beyond the word: it says *saturated*, as it must.
+    /// Out of range: the word is saturated, as required.
     Saturated,
-    /// What 16-bit arithmetic makes of it: this J, near the exact one, gives the very word.
+    /// Rounding in 16 bits: this J, near the exact one, gives this word.
     Rounded {
         /// The J in m.
         jacobian_m: f64,
@@ -156,13 +156,13 @@ pub struct Total {
     pub words_nm: f64,
     /// The sum of the exact products of the cells that answered, in Nm.
     pub products_nm: f64,
-    /// What the central computation gives for all that is known to be felt, in Nm.
+    /// The central computation on all known contact states, in Nm.
     pub central_nm: f64,
-    /// The same with the numbers of the skin's file, before they were made words.
+    /// The same with the unrounded values of the skin's file.
     pub unrounded_nm: f64,
     /// Words less central, in Nm.
     pub difference_nm: f64,
-    /// Cells with a saturated word: the sum is no better than that.
+    /// Cells with a saturated word: the sum is inexact.
     pub saturated: u32,
     /// Cells of which the word or what it should be is not known: the sums do not mean the same.
     pub open: u32,
@@ -189,7 +189,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
         if bus.reply != Reply::Torque {
             explanation
                 .missing
-                .push(format!("{name} answers with sums, of which no single torque can be told"));
+                .push(format!("{name} answers with sums, which do not contain the torques of single cells"));
         }
         let positions = moment.joints.positions;
         let frames = [&central, &unquantised].map(|central| central.frames(&positions));
@@ -256,7 +256,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
         }
         if silent > 0 {
             explanation.missing.push(format!(
-                "{name}: {silent} cells said nothing, and what they felt is not in the capture; they are taken as not \
+                "{name}: {silent} cells sent nothing, and their contact state is not in the capture; they are taken as not \
                  in contact"
             ));
         }
@@ -299,13 +299,13 @@ fn too_late(nanos: u64) -> String {
     format!("it came {ms:.3} ms after the joints, when four more had come, and is not used")
 }
 
-/// Why a cell in contact says nothing, as far as is known.
+/// Why a cell in contact sends nothing, as far as is known.
 fn silence(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
     if halted || has(State::HALTED) {
         "it was halted"
     } else if has(State::CLAIMING) {
-        "it had just started and claimed its number"
+        "it had just started and was claiming its node id"
     } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
         "it had no configuration"
     } else {
@@ -313,7 +313,7 @@ fn silence(halted: bool, state: Option<State>) -> &'static str {
     }
 }
 
-/// What a cell felt, if its torque can be computed from that; else why not, when it matters.
+/// The contact state of a cell, if its torque can be computed from it; else why not, when it matters.
 fn known(
     skin: &Skin,
     bus: &str,
@@ -329,23 +329,23 @@ fn known(
         Some(hash) if hash != target => {
             if answered || touched {
                 missing.push(format!(
-                    "{bus} {node}: it computes with configuration {hash:04X}, the skin says {target:04X}: its force \
+                    "{bus} {node}: it computes with configuration {hash:04X}, the skin has {target:04X}: its force \
                      and its torque cannot be computed from this skin"
                 ));
             }
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it said nothing of its configuration; taken to be the skin's, {target:04X}"
+            "{bus} {node}: it did not report its configuration; taken to be the skin's, {target:04X}"
         )),
         Some(_) | None => {}
     }
     if answered && said.contact_state.is_none() {
         let why = match said.test_mode {
-            Some(false) => "it measures, and said no sensors page of this epoch",
+            Some(false) => "it measures, and sent no sensors page in this epoch",
             Some(true) | None => "no stimulus, start or sensors page of it came before",
         };
-        missing.push(format!("{bus} {node}: what it felt is not in the capture: {why}"));
+        missing.push(format!("{bus} {node}: its contact state is not in the capture: {why}"));
     }
     if said.repeated > 0 {
         missing.push(format!("{bus} {node}: {} further torques of this epoch are not used", said.repeated));
@@ -430,7 +430,7 @@ fn row(
     }
 }
 
-/// What a word that should be `nearest` comes of.
+/// Where a word that should be `nearest` comes from.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_precision_loss,

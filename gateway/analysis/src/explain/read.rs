@@ -1,4 +1,4 @@
-//! Reads a capture as far as the joints that are asked about.
+//! Reads a capture up to the requested joints.
 
 use model::decode::{Decoded, Decoder};
 use protocol::skin::Skin;
@@ -7,20 +7,20 @@ use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 
 use super::watch::{Moment, NotFound, Requested, Watch};
 
-/// What a capture tells up to some joints.
+/// What a capture contains up to some joints.
 #[derive(Debug)]
 pub struct Found {
-    /// What each bus was told and said then.
+    /// What was sent on each bus until then.
     pub moments: Result<Vec<Option<Moment>>, NotFound>,
     /// When its first frame came, in ns since 1970.
     pub first_ns: u64,
-    /// Frames before that which whoever took the capture lost.
+    /// Frames before that which the recorder lost.
     pub dropped: u64,
     /// Lines before that which cannot be read.
     pub unreadable: u64,
 }
 
-/// Reads a capture from its beginning up to what is asked for.
+/// Reads a capture from its beginning up to the requested joints.
 ///
 /// # Errors
 /// When it cannot be read, or is damaged.

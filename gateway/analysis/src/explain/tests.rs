@@ -129,16 +129,16 @@ fn another_configuration_is_named_and_nothing_computed() {
     let skin = skin();
     let said = [heartbeat(0x1234), press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    let expected = "vcan0 12: it computes with configuration 1234, the skin says 266D: its force and its torque cannot \
+    let expected = "vcan0 12: it computes with configuration 1234, the skin has 266D: its force and its torque cannot \
                     be computed from this skin";
     assert_eq!(explanation.missing, [expected]);
     assert!(explanation.cells[0].force.is_none());
     assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
-    // Its first word came after the torque: it was the same then.
+    // Its first report came after the torque: it was the same before.
     let said = [press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
-    let expected = "vcan0 12: it said nothing of its configuration; taken to be the skin's, 266D";
+    let expected = "vcan0 12: it did not report its configuration; taken to be the skin's, 266D";
     assert_eq!(without.missing, [expected]);
     assert!(without.cells[0].force.is_some());
 }
@@ -162,11 +162,10 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
     // A stimulus is refused by a cell that measures.
     let said = [measuring, press(From::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    let expected =
-        "vcan0 12: what it felt is not in the capture: it measures, and said no sensors page of this epoch";
+    let expected = "vcan0 12: its contact state is not in the capture: it measures, and sent no sensors page in this epoch";
     assert_eq!(explanation.missing, [expected]);
-    let told = [&said[..], &[page(7)]].concat();
-    let explanation = explained(&skin, &told, first(7)).unwrap();
+    let with_page = [&said[..], &[page(7)]].concat();
+    let explanation = explained(&skin, &with_page, first(7)).unwrap();
     assert_eq!(explanation.missing, Vec::<String>::new());
     assert_eq!(explanation.cells[0].force.unwrap().force_steps, 196_608);
 }
@@ -233,7 +232,7 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_changes_nothing() {
+fn a_claim_of_an_owned_node_id_changes_nothing() {
     let skin = skin();
     let claim = {
         let heartbeat = Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() };

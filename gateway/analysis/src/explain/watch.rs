@@ -1,4 +1,4 @@
-//! Finds the joints that are asked about, and what each cell felt and answered then.
+//! Finds the requested joints, and the contact state and answer of each cell at them.
 
 use model::tracker::{Claim, Contact, LATEST, PerCell, Word, is_late};
 use protocol::fixed::Q3_12;
@@ -17,16 +17,16 @@ const TIMEOUT: u32 = 32;
 /// Runs of epochs that an error names.
 const RUNS: usize = 8;
 
-/// How it is known what a cell felt.
+/// Where the contact state of a cell is known from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "by")]
 pub enum Origin {
     /// It had just started: nothing touched it.
     Start {
-        /// When it said so.
+        /// When it reported that.
         at_ns: u64,
     },
-    /// Its mode was written, which forgets what it felt.
+    /// Its mode was written, which clears its contact state.
     Mode {
         /// When.
         at_ns: u64,
@@ -35,12 +35,12 @@ pub enum Origin {
     Stimulus {
         /// When it was sent.
         at_ns: u64,
-        /// The epoch from which on it was to hold; none for the next joints.
+        /// The epoch from which on it holds; none for the next joints.
         from_epoch: Option<u8>,
         /// Whether it came after the joints of that epoch.
         late: bool,
     },
-    /// The cell said itself what it felt.
+    /// The cell reported its own contact state.
     Said {
         /// When.
         at_ns: u64,
@@ -79,14 +79,14 @@ pub enum NotFound {
     /// The epoch is not there, or not so often, or not so late.
     #[error("there are no joints {requested}; there are {runs}")]
     Epoch {
-        /// What was asked for.
+        /// The requested joints.
         requested: String,
         /// Epochs that are there, in their order, and from when to when.
         runs: String,
     },
 }
 
-/// What one bus' cells were told and answered.
+/// What was sent to the cells of one bus, and their answers.
 #[derive(Clone, Debug)]
 pub struct Moment {
     /// When the joints came.
@@ -102,19 +102,19 @@ pub struct Moment {
 /// One cell at that moment.
 #[derive(Clone, Debug, Default)]
 pub struct CellMoment {
-    /// What it felt and how that is known.
+    /// Its contact state and where that is known from.
     pub contact_state: Option<(SkinSensors, Origin)>,
-    /// Whether it obeys stimuli; `None` when it has not said.
+    /// Whether it obeys stimuli; `None` when not reported.
     pub test_mode: Option<bool>,
-    /// How it was, by its last heartbeat.
+    /// Its state in its last heartbeat.
     pub state: Option<State>,
-    /// Hash of its configuration; `None` when it has not said.
+    /// Hash of its configuration; `None` when not reported.
     pub hash: Option<u16>,
     /// The torque that it answered, and when.
     pub answer: Option<(u64, [Q3_12; WORDS])>,
     /// When its torque came, if that was too late to be used.
     pub too_late: Option<u64>,
-    /// Further torques of this epoch, which nobody uses.
+    /// Further torques of this epoch, which are not used.
     pub repeated: u32,
 }
 
@@ -138,7 +138,7 @@ struct LinkId {
     cells_here: bool,
     last: Option<Epoch>,
     halted: bool,
-    /// How many there were of those that are asked about.
+    /// How many of the requested joints there were.
     occurrences: u32,
     moment: Option<Moment>,
     /// Joints since the moment.
@@ -173,7 +173,7 @@ impl<'a> Watch<'a> {
         Self { skin, requested, first: None, bus_watches, others: Vec::new() }
     }
 
-    /// Takes in what was said before the first frame and is in force when the capture begins.
+    /// Takes in a frame from before the capture that is latched when it begins.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         let joints = self.skin.robot.joints.len();
         if let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) {
@@ -187,7 +187,7 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Takes in the next frame; `message` is what it says, when that is anything. Whether all is known now.
+    /// Takes in the next frame; `message` is its meaning, if it has one. Whether all is known now.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let first = *self.first.get_or_insert(nanos);
         let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) else {
@@ -275,7 +275,7 @@ impl Run {
 
 impl LinkId {
     fn is_complete(&self) -> bool {
-        // Whoever answered has said its configuration, and whoever was touched has answered.
+        // A cell that answered has reported its configuration, and a cell that was touched has answered.
         let settled = |cell: &CellMoment| match cell.answer {
             Some(_) => cell.hash.is_some(),
             None => {
@@ -399,12 +399,12 @@ impl LinkId {
         }
     }
 
-    /// Whether so many joints have come since the moment that answers are of no use any more.
+    /// Whether so many joints have followed that answers are too late to be used.
     const fn is_too_late(&self) -> bool {
         self.since as usize > LATEST
     }
 
-    /// The cell at the moment, when it speaks of it; and whether that is in time.
+    /// The cell at the moment, if the packet is about it; and whether that is in time.
     fn answering(
         &mut self,
         from: CellId,
@@ -440,7 +440,7 @@ impl Cell {
         true
     }
 
-    /// It begins to obey stimuli, and nothing touches it; or to measure, and what it feels does not come by the bus.
+    /// It begins to obey stimuli, and nothing touches it; or to measure, and its contact state is not on the bus.
     fn mode(&mut self, obeys: bool, origin: Origin) {
         self.contact.reset();
         self.contact.set_obeys(obeys);

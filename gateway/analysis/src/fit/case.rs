@@ -1,4 +1,4 @@
-//! One bus, what its cells say on it, and how long that takes at most.
+//! One bus, what its cells send on it, and how long that takes at most.
 
 use protocol::can::Format;
 use protocol::parameters::Sensing;
@@ -7,7 +7,7 @@ use protocol::wire_time::{BitRates, Coding, Shape};
 
 use super::response::{Response, Stream, response};
 
-/// A cell says how it is this often, in ns.
+/// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
 /// With sensors on, a frame of acceleration follows every fourth heartbeat.
 const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
@@ -28,7 +28,7 @@ pub enum Answers {
         by_depth: Vec<u32>,
         /// Width of a slot in ns.
         slot_ns: u64,
-        /// Whether those below the roots are on the bus too; else they speak over wires of their own.
+        /// Whether cells below the roots are on the bus too; else they send over wires of their own.
         shared: bool,
     },
 }
@@ -75,7 +75,7 @@ pub struct Case {
     pub period_ns: u64,
     /// The longest that a cell takes from the end of the joints until its answer is ready, in ns.
     pub computation_ns: u64,
-    /// When cells say what they measure without being asked.
+    /// When cells send what they measure without a request.
     pub sensing: Sensing,
     /// What they answer with.
     pub answers: Answers,
@@ -112,7 +112,7 @@ pub struct Times {
     pub chain_ns: Option<u64>,
     /// The same by response-time analysis, for torques.
     pub response_ns: Option<Response>,
-    /// From when a heartbeat is due to its end, in ns; it may be said a period early.
+    /// From when a heartbeat is due to its end, in ns; it may be sent a period early.
     pub heartbeat_ns: Option<u64>,
 }
 
@@ -173,7 +173,7 @@ impl Case {
 
     /// What is on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
     ///
-    /// Heartbeats and what goes with them may be said up to a period of the joints early.
+    /// Heartbeats and what goes with them may be sent up to a period of the joints early.
     fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
         let (cells, early_ns, frame_ns) = (self.answers.cells(), self.period_ns, self.frame_ns());
         let stream = |senders: u32, period_ns, jitter_ns| {
@@ -211,7 +211,7 @@ impl Case {
     #[must_use]
     pub fn times(&self) -> Times {
         let joints_ns = self.joints_ns();
-        // From the earliest that it may be said, which is a period before it is due.
+        // From the earliest time that it may be sent, a period before it is due.
         let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
         Times {
             joints_ns,
@@ -257,10 +257,10 @@ impl Case {
     ///
     /// A frame of lower priority can be in the way twice: one of the joints, and, as the bus is idle while cells compute,
     /// another of the answers. From then on the bus sends nothing but answers until there are none. Of sums, nothing is
-    /// sent only while every cell that has not spoken waits for one that computes, which happens once for each wire down
-    /// the tree at most. `None` when it is longer than a period: what is left then delays the next answers.
+    /// sent only while every cell that has not sent yet waits for one that computes, which happens once for each wire down
+    /// the tree at most. `None` when it is longer than a period: the remaining frames then delay the next answers.
     fn chain_ns(&self, joints_ns: u64) -> Option<u64> {
-        // Answers that are ready when the joints end let nobody pass.
+        // Answers that are ready when the joints end leave no gap for other frames.
         let blocking_ns = if self.computation_ns > 0 { self.frame_ns() } else { 0 };
         let step_ns = self.computation_ns.saturating_add(blocking_ns);
         let ready_ns = match &self.answers {
@@ -299,7 +299,7 @@ fn torques(skin: &Skin, bus: usize) -> Answers {
     Answers::Torques { cells: u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX) }
 }
 
-/// The tree as the wires of a bus allow it; `None` when a cell has no way to a root. Without a described slot, one as
+/// The tree as the wires of a bus allow it; `None` when a cell is unreachable. Without a described slot, one as
 /// `gateway skin generate` would choose.
 pub(super) fn sums(
     skin: &Skin,

@@ -1,4 +1,4 @@
-//! What to change where a bus does not hold what it should, each with what comes of it.
+//! Hints: changes for a bus that exceeds its limits, each with its result.
 
 use protocol::can::Format;
 use protocol::parameters::Sensing;
@@ -17,12 +17,12 @@ const LONGEST_NS: u64 = 65_535_000;
 pub struct Hint {
     /// What to change.
     pub change: String,
-    /// What comes of it; of several buses, of the fullest.
+    /// The result; of several buses, of the fullest.
     #[serde(flatten)]
     pub after: Rated,
 }
 
-/// What can be done about a bus; nothing when it holds all limits.
+/// Hints for a bus; none when it keeps all limits.
 #[must_use]
 pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
     let exceeded = exceeded(case);
@@ -30,7 +30,7 @@ pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
         return Vec::new();
     }
     let mut hints = more_buses(case);
-    // Transceivers do not care how fast it goes.
+    // The limit of transceivers does not depend on the rate.
     if exceeded != [Limit::Nodes] {
         hints.extend(faster(case));
         hints.extend(slower_joints(skin, case));
@@ -77,7 +77,7 @@ fn is_in_time(case: &Case) -> bool {
     exceeded(case).iter().all(|&limit| limit == Limit::Nodes)
 }
 
-/// The shortest period of whole ticks in which everything has its time.
+/// The shortest period of whole ticks in which everything is in time.
 fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
     let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= LONGEST_NS);
@@ -90,7 +90,7 @@ fn hertz(period_ns: u64) -> f64 {
     (1e9 / period_ns as f64 * 1e6).round() / 1e6
 }
 
-/// Sensors that speak when something changes.
+/// Sensors that send on changes.
 fn events(case: &Case) -> Option<Hint> {
     match case.sensing {
         Sensing::Off | Sensing::Event => None,
@@ -102,7 +102,7 @@ fn events(case: &Case) -> Option<Hint> {
 }
 
 /// What the cells of a bus can answer with instead of what they do: torques, sums with all cells on the bus, and sums
-/// with only the roots on it, where its wires lead everywhere.
+/// with only the roots on it, where its wires reach all cells.
 #[must_use]
 pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {

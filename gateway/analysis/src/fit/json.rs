@@ -21,7 +21,7 @@ struct Document<'a> {
     table: Vec<BusFit>,
 }
 
-/// What was found of single buses with their whole, or of common rates; all times in µs, loads as shares of 1, and what
+/// Results for single buses and all of them together, or for common rates; all times in µs, loads as shares of 1, and what
 /// has no bound as null.
 #[must_use]
 pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> Value {
@@ -31,7 +31,7 @@ pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row])
     json!(Document { skin: &skin.name, cells, buses, whole, table: table.collect() })
 }
 
-/// How many buses, and what asks for so many.
+/// How many buses, and which limits require them.
 pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok, S::Error> {
     let Need { bandwidth, deadline, nodes } = need;
     json!({

@@ -1,4 +1,4 @@
-//! How many cells a bus takes, how many buses so many cells take, and which limit says so.
+//! How many cells fit on a bus, how many buses cells need, and which limit decides.
 
 use serde::Serialize;
 
@@ -7,7 +7,7 @@ use super::case::Case;
 /// About as many nodes as common transceivers drive on one bus; the gateway is one of them.
 pub const NODES: u32 = 110;
 
-/// Nobody has more cells than this on one bus, whatever fits.
+/// The most cells that are looked at on one bus.
 const ENDLESS: u32 = 1 << 20;
 
 /// What keeps more cells from a bus.
@@ -23,7 +23,7 @@ pub enum Limit {
 }
 
 impl Limit {
-    /// What people call it.
+    /// Its name in texts.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -99,7 +99,7 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
     holds.broken()
 }
 
-/// The greatest number that something holds for which holds for all lesser ones; 0 when it does not even for 1.
+/// The largest number up to which a condition holds; 0 when it does not hold for 1.
 fn max(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < ENDLESS && holds(beyond) {
@@ -140,7 +140,7 @@ impl Need {
         Some(self.in_time()?.max(self.nodes?))
     }
 
-    /// The limits that ask for that many.
+    /// The limits that require that many.
     #[must_use]
     pub fn binding(&self) -> Vec<Limit> {
         // None is more than any number.
@@ -149,7 +149,7 @@ impl Need {
         self.which(|buses| Some(key(buses)) == most)
     }
 
-    /// How many buses, and what asks for so many, in few words: `3 nodes`. Bandwidth and deadline are both a matter of time.
+    /// How many buses, and which limits require them, in few words: `3 nodes`. Bandwidth and deadline are both a matter of time.
     #[must_use]
     pub fn in_short(&self) -> String {
         let word = |limit| match limit {

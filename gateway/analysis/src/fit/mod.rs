@@ -1,5 +1,5 @@
 //! Would it fit on a real bus: load, the longest time from joints to the last answer, and how many cells and buses that makes.
-//! Every command that says whether something fits takes it from here: limits, verdicts and their words ([`verdict`]), bit
+//! Every command that reports whether something fits uses this module: limits, verdicts and their words ([`verdict`]), bit
 //! rates ([`rates`]), and what of a bench's traffic a real bus carries ([`traffic`]).
 //!
 //! The worst case: all frames are taken as long as stuffing can make them ([`protocol::wire_time`]), all cells as in contact, and the bus
@@ -8,7 +8,7 @@
 //!
 //! ```text
 //!   skin, rates ──> Case ──> streams ──> response   ┐
-//!                      └───> chain ─────────────────┴─> Times ──> limits ──> remedies
+//!                      └───> chain ─────────────────┴─> Times ──> limits ──> hints
 //! ```
 
 pub mod case;
@@ -58,7 +58,7 @@ impl Common {
     }
 }
 
-/// How people write a format with its rates: `1M/5M`, `classic 1M`.
+/// A format with its rates as text: `1M/5M`, `classic 1M`.
 #[must_use]
 pub fn name(format: Format, rates: BitRates) -> String {
     match format {
@@ -67,7 +67,7 @@ pub fn name(format: Format, rates: BitRates) -> String {
     }
 }
 
-/// A bus with these rates and cells, judged.
+/// A bus with these rates and cells, rated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rated {
     /// What was looked at.
@@ -103,16 +103,16 @@ pub struct BusFit {
     /// As it is described.
     #[serde(flatten)]
     pub rated: Rated,
-    /// The most cells that it takes.
+    /// The most cells that fit on it.
     #[serde(rename = "most_cells")]
     pub most: Most,
-    /// Buses that its cells take.
+    /// Buses that its cells need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
-    /// What its cells could answer with instead.
+    /// Other kinds of answers for its cells.
     #[serde(rename = "other_answers")]
     pub answers: Vec<Hint>,
-    /// What else can be done when it is too much.
+    /// Other hints, when it exceeds a limit.
     #[serde(rename = "changes")]
     pub hints: Vec<Hint>,
 }
@@ -140,7 +140,7 @@ pub fn bus(
 }
 
 /// One bus of a skin as it is described, at these rates, with all cells answering; `None` where a cell that answers with
-/// sums has no way to a root.
+/// sums is unreachable.
 #[must_use]
 pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
     let format = skin.buses.get(index)?.format;
@@ -156,7 +156,7 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
 pub struct Whole {
     /// So many cells.
     pub cells: u32,
-    /// Buses that they take.
+    /// Buses that they need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
     /// The same on more and more buses.
@@ -178,10 +178,11 @@ pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
     let need = Need::of(&fullest.most, cells);
     let numbers = 1..=need.buses().unwrap_or(1);
-    // Of many only those that say something: all that is less than needed is too little.
-    let told = |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
+    // Of many only the informative ones: any number below the required one is too small.
+    let is_shown =
+        |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
     let spread = numbers
-        .filter(told)
+        .filter(is_shown)
         .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
         .map(|(buses, case)| Spread { buses, fullest: Rated::of(&case) });
     Whole { cells, need, spread: spread.collect() }
@@ -192,7 +193,7 @@ pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
 pub struct Row {
     /// The fullest bus as it is described.
     pub fullest: BusFit,
-    /// Buses that all cells of the skin take.
+    /// Buses that all cells of the skin need.
     pub need: Need,
 }
 
@@ -212,7 +213,7 @@ pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Ro
     rows.filter_map(row).collect()
 }
 
-/// The bus with the greatest load.
+/// The bus with the highest load.
 #[must_use]
 pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
     buses.max_by(|one, other| one.rated.load.total().total_cmp(&other.rated.load.total()))

@@ -1,15 +1,15 @@
-//! The bit rates of a bus: those asked for, else the skin's, else common ones.
+//! The bit rates of a bus: the requested ones, else the skin's, else common ones.
 
 use protocol::can::Format;
 use protocol::skin::Bus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
-/// Bits in a second where nobody says anything.
+/// The default, in bit/s.
 const NOMINAL: u32 = 1_000_000;
-/// The same of FD frames' data.
+/// The default for FD frames' data.
 const DATA: u32 = 5_000_000;
 
-/// Bits in a second that are asked for, for all buses.
+/// Requested bit rates, for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Requested {
     /// Of identifiers, and of all of a classic frame.
@@ -23,7 +23,7 @@ pub struct Requested {
 pub struct Chosen {
     /// The rates.
     pub rates: BitRates,
-    /// Whether the skin or somebody who asks has chosen them; else they are common ones.
+    /// Whether the skin or the caller has chosen them; else they are common ones.
     pub is_chosen: bool,
 }
 

@@ -1,4 +1,4 @@
-//! Response times on a bus that gives the lowest identifier its way and interrupts no frame.
+//! Response times on a bus with priority by identifier, lowest first, and without preemption.
 //!
 //! Davis, Burns, Bril and Lukkien, *Controller Area Network (CAN) schedulability analysis: Refuted, revisited and
 //! revised*, Real-Time Systems 35 (2007) 239-272, without errors on the bus. With B the longest frame of a lower priority,
@@ -13,7 +13,7 @@
 //!
 //! All instances of the busy period are looked at: the first one is not always the slowest.
 
-/// Busy periods longer than this are none that anybody waits for, in ns.
+/// Busy periods longer than this count as unbounded, in ns.
 const HORIZON_NS: u64 = 60_000_000_000;
 
 /// Frames that come again and again, all of one priority class.
@@ -21,7 +21,7 @@ const HORIZON_NS: u64 = 60_000_000_000;
 pub struct Stream {
     /// How many streams like this one there are, each with a priority of its own, one after the other.
     pub count: u32,
-    /// The least time from one release to the next in ns, above 0; but for the jitter.
+    /// The minimum time from one release to the next in ns, above 0, without the jitter.
     pub period_ns: u64,
     /// By how much a release may come late in ns.
     pub jitter_ns: u64,
@@ -56,7 +56,7 @@ pub struct Response {
 }
 
 /// The longest response of the last (slowest) of the streams at one place in a list, whose order is that of priority,
-/// highest first. `bit_ns` is a bit of the arbitration: who comes that much later still takes part.
+/// highest first. `bit_ns` is a bit of the arbitration: a frame that comes that much later still takes part.
 ///
 /// `None` where there is no such stream, and where there is no bound, because what has the same or a higher priority fills
 /// the bus, or none within a minute.
@@ -95,7 +95,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
     Some(worst)
 }
 
-/// The least fixed point of a function that grows, from below; `None` beyond the horizon.
+/// The lowest fixed point of an increasing function, from below; `None` beyond the horizon.
 fn settle(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= HORIZON_NS {

@@ -1,4 +1,4 @@
-//! What is said of skins, against what is known of them, and every remedy against the skin that it makes.
+//! Results for skins against known values, and every hint against the skin that it gives.
 
 mod simulated;
 
@@ -82,7 +82,7 @@ fn a_single_cell_waits_for_joints_and_one_heartbeat_at_most() {
     let case = fit(&skin(&text(&Target { cells: 1, ..Target::default() })), "1M/5M").rated.case;
     // Its own heartbeat: once before the joints, once while it computes.
     assert_eq!(case.times().chain_ns, Some(4 * 70_400 + 68_500));
-    // Who computes in no time answers before anybody else begins.
+    // A cell that needs no time to compute answers before others begin.
     let at_once = Case { computation_ns: 0, ..case };
     assert_eq!(at_once.times().chain_ns, Some(3 * 70_400));
 }
@@ -174,7 +174,7 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
     assert!(
         matches!(skin.buses[0].reply, protocol::skin::Reply::Sum { slot_us, .. } if u64::from(slot_us) * 1_000 == *slot_ns)
     );
-    // Of every wire on the way up one computation, and one frame of somebody else's.
+    // For every wire on the route to the root one computation, and one frame of another node.
     let chain_ns = 70_400 * 62 + (u64::from(deepest) + 1) * (68_500 + 70_400);
     assert_eq!(fit.rated.times.chain_ns, Some(chain_ns));
     let changes: Vec<_> = fit.answers.iter().map(|it| it.change.as_str()).collect();

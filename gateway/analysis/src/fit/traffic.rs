@@ -1,4 +1,4 @@
-//! What of the traffic on a bench's bus a real bus carries too, and what only a bench sends.
+//! Which traffic on a bench's bus a real bus carries too, and which only a bench sends.
 //!
 //! A real bus carries joints, answers, sensors, heartbeats, the tree's messages, commands and configuration. Only a bench
 //! sends stimuli, sync and report with their answers, and what stands for wires between cells.
@@ -18,7 +18,7 @@ const IDS: usize = 0x800;
 /// What only a bench sends.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Bench {
-    /// What a cell shall feel.
+    /// Stimuli.
     Stimulus,
     /// Sync, and the heartbeats that answer it.
     Sync,
@@ -59,7 +59,7 @@ impl BenchFrames {
     }
 }
 
-/// What a frame says about the course of a run.
+/// What a frame means for the course of a run.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Says {
     /// Nothing.
@@ -72,14 +72,14 @@ pub enum Says {
     Halt,
     /// They go on.
     Resume,
-    /// Something that is said before the first joints: numbers are claimed, parameters written or read, a report is asked for.
+    /// Something that is sent before the first joints: address claims, parameters written or read, requests for a report.
     Preparation,
 }
 
 /// A frame, sorted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Sorted {
-    /// What it says.
+    /// Its meaning.
     pub says: Says,
     /// Set when only a bench sends it.
     pub bench: Option<Bench>,
@@ -101,11 +101,11 @@ pub struct Traffic {
     others: u64,
     /// By identifier.
     segments: Vec<Segment>,
-    /// By cell: what it owes the bench.
+    /// By cell: replies to the bench that are outstanding.
     owed: Vec<Owed>,
 }
 
-/// What a cell still answers to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
+/// Outstanding replies of a cell to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
 type Owed = [bool; 4];
 /// The place of the tree.
 const TREE: usize = 3;
@@ -198,14 +198,14 @@ impl Traffic {
         }
     }
 
-    /// A page that a cell says on a report, and at other times too.
+    /// A page that a cell sends on a report, and at other times too.
     fn page(&mut self, from: CellId, page: usize) -> Sorted {
         let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
         let owed = owed.map(std::mem::take).unwrap_or(false);
         Sorted { bench: owed.then_some(Bench::Report), ..Sorted::OTHER }
     }
 
-    /// What a cell owed; now it owes nothing.
+    /// Takes the outstanding replies of a cell.
     fn take(&mut self, from: CellId) -> Owed {
         self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
@@ -260,7 +260,7 @@ mod tests {
             }
             assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(Bench::Report), None, None]);
             assert_eq!([last(&tree), last(&tree)], [Some(Bench::Report), None]);
-            // A cell without ports says no tree; its next one comes by itself.
+            // A cell without ports sends no tree; its next one comes by itself.
             last(&page(1, NetworkPage::Refused(Refused::default())));
             assert_eq!([last(&alive), last(&tree)], [None; 2]);
         }

@@ -1,4 +1,4 @@
-//! Whether a bus carries what is on it, in the words of every command that says so.
+//! Whether a bus carries its traffic, in the words that all commands share.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -14,14 +14,14 @@ pub enum Verdict {
     Fits,
     /// In bandwidth and deadline, but so many nodes are more than transceivers drive.
     Nodes(u32),
-    /// More is asked of the bus than it carries.
+    /// The load is higher than the bus carries.
     Bandwidth,
     /// An answer comes after the next joints.
     Deadline,
 }
 
 impl Verdict {
-    /// Of what is too much on a bus of so many cells, as [`ByLimit::broken`] says it.
+    /// From the broken limits of a bus of so many cells, see [`ByLimit::broken`].
     #[must_use]
     pub fn of(exceeded: &[Limit], cells: u32) -> Self {
         match exceeded.first() {
@@ -71,10 +71,10 @@ pub enum Cells {
         most: u32,
         /// Of so many on the bus.
         cells: u32,
-        /// Whether the skin says so; else that many were heard.
+        /// Whether that is from the skin; else that many were received.
         described: bool,
     },
-    /// The bus speaks another protocol.
+    /// The bus has another protocol.
     Foreign,
 }
 
@@ -98,7 +98,7 @@ impl Display for Cells {
                 write!(f, "at most {most} of {cells} cells answered")
             }
             Self::Some { most, cells, described: false } => {
-                write!(f, "at most {most} of {cells} cells heard answered")
+                write!(f, "at most {most} of {cells} cells seen answered")
             }
             Self::Foreign => f.write_str("another protocol"),
         }
@@ -119,7 +119,7 @@ impl Display for Cells {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answer {
-    /// The share of the bus' time that is asked for; of a run, in the second in which that is most.
+    /// The load; of a run, in the second with the highest one.
     pub load: f64,
     /// The bus' format and rates.
     pub rates: String,
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_judged_by_its_load_then_by_late_answers_then_by_nodes() {
+    fn a_run_is_rated_by_load_then_by_late_answers_then_by_nodes() {
         let run = "this run: 55.3 % of 1M/5M";
         for (late, cells, verdict) in [
             (0, 109, "fits"),

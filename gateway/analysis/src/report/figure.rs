@@ -1,4 +1,4 @@
-//! What a page says, before anybody draws it: sections with figures, findings beside the paper's, and tables.
+//! The contents of a page before it is drawn: sections with figures, findings beside the paper's, and tables.
 
 use std::fmt;
 
@@ -13,13 +13,13 @@ pub struct Page {
     pub title: String,
     /// What it is about, in a sentence or two.
     pub intro: String,
-    /// Name and value of what it came about with: machine, command, revision.
+    /// Facts by name: machine, command, revision.
     pub facts: Vec<(String, String)>,
-    /// What it says, one after the other.
+    /// Its sections, in order.
     pub sections: Vec<Section>,
 }
 
-/// One thing that a page says.
+/// One section of a page.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Section {
     /// Letters, digits and `-`; the link to it, and what names of its files begin with: `fig6`.
@@ -37,7 +37,7 @@ pub struct Section {
 }
 
 impl Section {
-    /// A section that says nothing yet.
+    /// An empty section.
     #[must_use]
     pub fn new(name: &str, title: impl Into<String>) -> Self {
         Self { name: name.to_owned(), title: title.into(), ..Self::default() }
@@ -92,7 +92,7 @@ pub struct Figure {
 }
 
 impl Figure {
-    /// Colours that can be told apart; series beyond these begin with the first again.
+    /// Distinguishable colours; series beyond these begin with the first again.
     pub const COLOURS: usize = 7;
 
     /// A figure of the page's width in which nothing is drawn yet.

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// A number that was found, beside what the paper says.
+/// A result beside the paper's number.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
     /// What was measured, with how.
@@ -34,20 +34,20 @@ impl Finding {
         Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
-    /// A number that is told and not judged.
+    /// A number for information, not rated.
     #[must_use]
     pub fn stated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
         Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Stated }
     }
 
-    /// The same, told beside the paper's in the same unit: of what is no better for being more or less.
+    /// The same beside the paper's in the same unit, where neither more nor less is better.
     #[must_use]
     pub fn beside(mut self, paper: f64) -> Self {
         self.paper = Some(Quantity::new(paper, self.ours.unit.clone()));
         self
     }
 
-    /// The same, judged by a limit in its own unit.
+    /// The same, rated by a limit in its own unit.
     #[must_use]
     pub fn at_most(self, limit: f64) -> Self {
         let unit = if self.ours.unit.is_empty() { String::new() } else { format!(" {}", self.ours.unit) };
@@ -55,7 +55,7 @@ impl Finding {
         self.must(format!("at most {limit}{unit}"), kept)
     }
 
-    /// The same, judged by whether it holds what it must: kept or better is [`Verdict::Better`].
+    /// The same, rated by a requirement: met is [`Verdict::Better`].
     #[must_use]
     pub fn must(mut self, bar: impl Into<String>, kept: bool) -> Self {
         self.bar = Some(bar.into());
@@ -73,7 +73,7 @@ pub enum Verdict {
     Same,
     /// Worse than the paper's, or outside of the bar.
     Worse,
-    /// Not judged.
+    /// Not rated.
     #[default]
     Stated,
 }

@@ -6,7 +6,7 @@
 //!   experiments ────────┘        └────────> svg::draw ──> an SVG file for each figure
 //! ```
 //!
-//! [`figure`] is what is said, [`svg`] draws it, [`page`] sets it; all three are pure.
+//! [`figure`] has the contents, [`svg`] draws them, [`page`] lays them out; all three are pure.
 
 pub mod figure;
 mod finding;

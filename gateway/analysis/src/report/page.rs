@@ -107,7 +107,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
             (Verdict::Same, _) => ("same", "= the same"),
             (Verdict::Worse, None) => ("worse", "✗ worse"),
             (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
-            (Verdict::Stated, _) => ("told", ""),
+            (Verdict::Stated, _) => ("stated", ""),
         };
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
         let cells: [(&str, &str); 5] = [

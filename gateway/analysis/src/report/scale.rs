@@ -55,7 +55,7 @@ impl Span {
         }
     }
 
-    /// How a tick is written: with the digits that tell neighbours apart.
+    /// How a tick is written: with the digits that distinguish neighbours.
     pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
         let size = self.from.abs().max(self.to.abs());
         match self.scale {

@@ -30,7 +30,7 @@ const DOTTED: u32 = 9;
 const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
 
 /// Colour, class, and the colour on a dark screen: of words, of what is faint, of the grid, and of series. On paper those
-/// are Okabe and Ito's, that can be told apart by everybody, without the yellow that nobody sees on white.
+/// are Okabe and Ito's, which are distinguishable for colour-blind readers, without the yellow, which is invisible on white.
 const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOURS] = [
     (INK, "ink", "#E4E4E4"),
     (FAINT, "faint", "#A6A6A6"),

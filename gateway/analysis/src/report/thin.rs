@@ -1,8 +1,8 @@
-//! Many points in a picture of few columns: what a column shows is its first, least, greatest and last point, and
-//! so these four are kept. A line through them covers the same pixels as a line through all (Jugel, Jerzak,
+//! Many points in a picture of few columns: a column shows its first, minimum, maximum and last point, so these
+//! four are kept. A line through them covers the same pixels as a line through all (Jugel, Jerzak,
 //! Hackenbroich and Markl, *M4: A Visualization-Oriented Time Series Data Aggregation*, 2014).
 
-/// A column's first, least, greatest and last point.
+/// A column's first, minimum, maximum and last point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Column {
     first: (f64, f64),
@@ -110,7 +110,7 @@ impl Thinned {
         self.columns = merged;
     }
 
-    /// What is left: at most four points a column, by increasing x, and points that are not numbers where it has gaps.
+    /// The remaining points: at most four a column, by increasing x, and points that are not numbers where it has gaps.
     #[must_use]
     pub fn points(&self) -> Vec<(f64, f64)> {
         let mut points = Vec::with_capacity(self.columns.len() * 4);

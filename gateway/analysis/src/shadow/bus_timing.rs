@@ -45,7 +45,7 @@ struct Pending {
     sorted: Sorted,
 }
 
-/// What a bus is known to be.
+/// What is known of a bus.
 #[derive(Clone, Debug)]
 pub(super) struct Known {
     pub(super) rates: BitRates,
@@ -102,7 +102,7 @@ impl LinkId {
         }
     }
 
-    /// A frame that was on the bus before the capture began, and still says what holds.
+    /// A frame from before the capture that is latched when it begins.
     pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
             Says::Joints(_) => self.phases.beginning.in_the_middle = true,
@@ -168,7 +168,7 @@ impl LinkId {
         self.drain(reported);
     }
 
-    /// The next frame in order of time wants to go out.
+    /// Requests the next frame in order of time.
     fn enter(&mut self, pending: Pending, mut reported: Option<&mut Reported>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
         let Sorted { says, bench, from, .. } = sorted;

@@ -35,9 +35,9 @@ pub struct Answering {
     pub mean: Option<f64>,
     /// How many answered the same joints at most.
     pub most: u32,
-    /// Cells of the bus, by the skin, else those that were heard.
+    /// Cells of the bus, by the skin, else those that were received.
     pub cells: u32,
-    /// Whether the skin says so.
+    /// Whether that is from the skin.
     pub described: bool,
 }
 
@@ -54,7 +54,7 @@ impl Answering {
 struct Numbered {
     /// When they were to go out.
     at: u64,
-    /// Who answered them, if they were sent while cells were not halted.
+    /// Cells that answered them, if they were sent while cells were not halted.
     answered: Option<Set>,
 }
 
@@ -89,7 +89,7 @@ impl Counts {
 }
 
 impl Epochs {
-    /// What a frame says of joints and answers; the joints that it answers, and whether it is late.
+    /// Takes what a frame means for joints and answers; the joints that it answers, and whether it is late.
     pub(super) fn hear(&mut self, at: u64, says: Says, from: Option<CellId>) -> Option<(Epoch, bool)> {
         from.into_iter().for_each(|cell| self.heard.insert(cell));
         match says {
@@ -149,7 +149,7 @@ impl Epochs {
         Replies { after_joints_us: Delays::of(&self.after_joints), ..self.replies }
     }
 
-    /// Cells that answered; the skin may say how many there are.
+    /// Cells that answered; the skin may have the number of cells.
     pub(super) fn answering(&self, described: Option<u32>) -> Answering {
         let mut all = self.closed;
         self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.close(answered));
@@ -168,22 +168,22 @@ impl Epochs {
 mod tests {
     use super::*;
 
-    fn cell(number: i64) -> CellId {
-        CellId::new(number).unwrap()
+    fn cell(node: i64) -> CellId {
+        CellId::new(node).unwrap()
     }
 
     #[test]
     fn each_cell_counts_once_an_epoch_however_late_and_halted_epochs_not_at_all() {
         let mut epochs = Epochs::default();
-        let answer = |epochs: &mut Epochs, number, epoch| {
-            epochs.hear(0, Says::Answer(Epoch(epoch)), Some(cell(number)));
+        let answer = |epochs: &mut Epochs, node, epoch| {
+            epochs.hear(0, Says::Answer(Epoch(epoch)), Some(cell(node)));
         };
         let joints = |epochs: &mut Epochs, epoch| epochs.hear(0, Says::Joints(Epoch(epoch)), None);
         answer(&mut epochs, 9, 255);
         for epoch in 0..=255 {
             joints(&mut epochs, epoch);
             let cells = if epoch == 7 { 254 } else { 2 };
-            (1..=cells).chain([1]).for_each(|number| answer(&mut epochs, number, epoch));
+            (1..=cells).chain([1]).for_each(|node| answer(&mut epochs, node, epoch));
         }
         // One is late, and joints come again.
         joints(&mut epochs, 0);

@@ -1,13 +1,13 @@
-//! How much is asked of a bus within any span of a length, and how long it is busy without a pause.
+//! The highest load of a bus within any span of a length, and how long it is busy without a pause.
 
 use std::collections::VecDeque;
 
 use super::report::{Most, Stretches};
 
-/// Moments that are told apart within a span; more count at the last one's.
+/// Times that are distinguished within a span; more count at the last one.
 const MOMENTS: usize = 1 << 16;
 
-/// The most that was asked for within any `SPAN` ns, wherever they begin.
+/// The highest load within any `SPAN` ns, wherever they begin.
 #[derive(Debug, Default)]
 pub(super) struct Window<const SPAN: u64> {
     /// When, and how much.
@@ -18,7 +18,7 @@ pub(super) struct Window<const SPAN: u64> {
 }
 
 impl<const SPAN: u64> Window<SPAN> {
-    /// So many ns of the bus were asked for at a time, which never runs backwards.
+    /// A request for so many ns of the bus at a time; times never run backwards.
     pub(super) fn request(&mut self, at: u64, nanos: u64) {
         while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
             self.requested.pop_front();

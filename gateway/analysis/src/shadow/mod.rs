@@ -2,11 +2,11 @@
 //!
 //! ```text
 //!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
-//!                           one lane a bus: sorts,   who sends when └──> report: load, delays, late replies, queues
+//!                           for each bus:  sorts,   arbitrates       └──> report: load, delays, late replies, queues
 //! ```
 //!
-//! A frame's time stamp is taken for the moment at which its sender wanted to send it, which on a bus without bit rate (vcan, the
-//! embedded bus) it is; each sender has room for each of its identifiers. In bounded memory, however long it lasts: what is out
+//! A frame's time stamp is taken as the time at which its sender requested it, which is right on a bus without bit rate (vcan,
+//! the embedded bus); each sender has a transmit buffer for each of its identifiers. In bounded memory, however long it lasts: what is out
 //! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`MAX_QUEUE`] frames wait on a bus.
 
 mod bus_timing;
@@ -42,7 +42,7 @@ pub const SATURATED_NS: u64 = 16_000_000;
 /// The longer span in which the load is looked at, in ns.
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// Buses that are told apart.
+/// Buses that are modelled.
 pub const BUSES: usize = 64;
 
 /// What the buses are like.
@@ -56,7 +56,7 @@ pub struct Options {
     pub bit_errors: f64,
     /// From what errors are drawn; each bus has its own.
     pub seed: u64,
-    /// Whether each frame is wanted from [`Shadow::poll`].
+    /// Whether [`Shadow::poll`] returns each frame.
     pub each_frame: bool,
     /// Whether what only a bench sends is counted.
     pub bench_traffic: bool,
@@ -140,13 +140,13 @@ impl Shadow {
         }
     }
 
-    /// A frame that was on a bus before the capture began, and still says what holds.
+    /// A frame from before the capture that is latched when it begins.
     pub fn latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
         bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
     }
 
-    /// Frames that whoever took the capture lost.
+    /// Frames that the recorder lost.
     pub fn missing(&mut self, bus: &str, frames: u64) {
         if let Some(bus_timing) =
             self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing))

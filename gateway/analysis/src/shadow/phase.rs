@@ -16,9 +16,9 @@ const SOON_NS: u64 = 100_000_000;
 /// What a bus is doing.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Phase {
-    /// Cells claim numbers, are configured and organise themselves; until joints come, and when none have for [`PAUSE_NS`].
+    /// Cells claim node ids, are configured and build the tree; until joints come, and when none have for [`PAUSE_NS`].
     StartUp,
-    /// Joints are sent; or the bus speaks another protocol.
+    /// Joints are sent; or the bus has another protocol.
     Operation,
 }
 

@@ -13,7 +13,7 @@ use crate::fit::verdict::Answer;
 pub struct Report {
     /// Frames of any kind, on all buses.
     pub frames: u64,
-    /// Of those, frames of buses beyond the 64 that are told apart; they are not modelled.
+    /// Of those, frames of buses beyond the first 64, which are not modelled.
     pub frames_of_other_buses: u64,
     /// The share of bits that were damaged on purpose.
     pub bit_error_rate: f64,
@@ -43,7 +43,7 @@ pub struct BusShadow {
     pub worst_case: Option<Answer>,
     /// Whether what there was fits; none without operation.
     pub this_run: Option<Answer>,
-    /// How many cells answered, where the bus speaks this project's protocol.
+    /// How many cells answered, where the bus has this project's protocol.
     pub answering: Option<Answering>,
     /// What was sent before the first joints, and when there were none for a second.
     pub start_up: Option<StartUp>,
@@ -56,9 +56,9 @@ pub struct BusShadow {
     pub stretches: Stretches,
     /// From wanting to send to the end of the intermission, in µs: all frames.
     pub delay_us: Delays,
-    /// The same by kind; empty where the bus does not speak this project's protocol.
+    /// The same by kind; empty where the bus has another protocol.
     pub kinds: Vec<KindDelays>,
-    /// Answers to joints, where the bus speaks this project's protocol.
+    /// Answers to joints, where the bus has this project's protocol.
     pub replies: Option<Replies>,
     /// The most frames that waited at the same time.
     pub queue: Most,
@@ -79,7 +79,7 @@ pub struct Counts {
     pub bench_omitted: bool,
     /// The driver's error frames, which never were on a wire.
     pub error_frames: u64,
-    /// Frames that whoever took the capture lost: the load is that much too low.
+    /// Frames that the recorder lost: the load is too low by these.
     pub missing: u64,
     /// Frames before the one before them, which were sorted.
     pub out_of_order: u64,
@@ -119,7 +119,7 @@ pub struct Loads {
     pub busy: Option<f64>,
 }
 
-/// The greatest of something, and when.
+/// The maximum of something, and when.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Most {
     /// How much.

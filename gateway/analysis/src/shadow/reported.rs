@@ -9,7 +9,7 @@ use protocol::wire_time::Bits;
 pub struct Shaded {
     /// Its time in the capture, in ns.
     pub nanos: u64,
-    /// Its bus, for [`super::Shadow::bus`]; none of a bus beyond those that are told apart.
+    /// Its bus, for [`super::Shadow::bus`]; none of a bus beyond those that are modelled.
     pub bus: Option<usize>,
     /// Its identifier; of a driver's error frame with its flag.
     pub id: u32,

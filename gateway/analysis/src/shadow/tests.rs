@@ -146,7 +146,7 @@ fn an_answer_is_late_when_the_next_joints_were_to_go_out_before_its_end() {
         assert_eq!((replies.count, replies.late_before), (81, 1));
         match format {
             Format::Fd => assert_eq!(replies.late, 0),
-            // 7 of 20 come in time in the first epoch, and then fewer; none after the last one can be told to be late.
+            // 7 of 20 come in time in the first epoch, and then fewer; after the last joints no answer counts as late.
             Format::Classic => assert!((30..60).contains(&replies.late), "{replies:?}"),
         }
         let kinds: Vec<_> = bus.kinds.iter().map(|kind| kind.kind).collect();

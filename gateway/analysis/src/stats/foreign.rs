@@ -10,7 +10,7 @@ use super::{Count, seconds};
 use model::decode::Foreign;
 use protocol::packet::PacketError;
 
-/// Identifiers of a bus that are told apart; frames of others are counted together.
+/// Identifiers of a bus that are counted separately; frames of others are counted together.
 const IDENTIFIERS: usize = 4096;
 
 /// What kind of frame it is, beside its identifier.
@@ -19,9 +19,9 @@ const IDENTIFIERS: usize = 4096;
 pub enum FrameType {
     /// It carries data.
     Data,
-    /// It asks for data.
+    /// It requests data.
     Remote,
-    /// The driver's report of an error; its identifier says which.
+    /// The driver's report of an error; its identifier has the kind.
     Error,
 }
 
@@ -29,9 +29,9 @@ pub enum FrameType {
 #[derive(Debug, Default)]
 pub(super) struct Foreigners {
     identifiers: BTreeMap<(FrameType, u32), Seen>,
-    /// Frames of identifiers beyond those that are told apart.
+    /// Frames of identifiers beyond those that are counted separately.
     others: u64,
-    /// Frames whose CRC, or that of the pair with the one before it, was looked at.
+    /// Frames whose CRC, alone or joined with the frame before, was checked.
     tried: u64,
 }
 
@@ -55,7 +55,7 @@ pub struct ForeignFrames {
     pub remote: u64,
     /// The driver's error frames.
     pub error: u64,
-    /// So many pairs of these frames would have a right CRC by chance: one of 65 536. They count as packets.
+    /// Expected number of packets by chance: one of 65 536 pairs has a right CRC. They count as packets.
     pub packets_by_chance: f64,
     /// Each, the one with the most frames first.
     pub identifiers: Vec<ForeignId>,
@@ -66,7 +66,7 @@ pub struct ForeignFrames {
 /// Foreign frames under one identifier.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ForeignId {
-    /// In hexadecimal, as candump prints it: 3 or 8 digits; of an error frame the bits that say which error.
+    /// In hexadecimal, as candump prints it: 3 or 8 digits; of an error frame the bits of the kind of error.
     pub id: String,
     /// What kind of frames these are.
     #[serde(rename = "type")]
@@ -79,7 +79,7 @@ pub struct ForeignId {
     pub first_s: f64,
     /// The last.
     pub last_s: f64,
-    /// Fewest data bytes; of a remote frame those that it asks for.
+    /// Fewest data bytes; of a remote frame those that it requests.
     pub bytes_min: u8,
     /// Most data bytes.
     pub bytes_max: u8,

@@ -100,7 +100,7 @@ fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not()
     let cell = tape.cell();
     assert_eq!((cell.unanswered, cell.repeated, cell.saturated), (2 + 2, 1, 1));
     assert_eq!((cell.first_epoch, cell.last_epoch, cell.torques), (Some(250), Some(9), 6));
-    // A heartbeat after it says that the contact has ended: its last word was lost.
+    // A heartbeat after it reports that the contact has ended: its last torque was lost.
     tape.heartbeat(9, 0, State::default());
     tape.joints(10);
     tape.joints(11);
@@ -191,7 +191,7 @@ fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
 }
 
 #[test]
-fn sums_said_again_and_the_place_in_the_tree_are_told() {
+fn resent_sums_and_the_place_in_the_tree_are_counted() {
     let mut tape = Tape::default();
     let sum = |epoch, word, count| {
         let torque = [Q7_8::from_bits(word); 6];
@@ -237,8 +237,8 @@ fn times_that_run_backwards_are_counted_and_the_duration_is_that_of_all() {
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_is_no_restart_and_loses_nothing() {
-    let told = |intruded: bool, lost: u16| {
+fn a_claim_of_an_owned_node_id_is_no_restart_and_no_loss() {
+    let counts = |intruded: bool, lost: u16| {
         let mut tape = Tape::default();
         let owner = |sent| Heartbeat { serial: 7, sent, state: State::CONFIGURED, ..Heartbeat::default() };
         tape.page(owner(40));
@@ -254,26 +254,30 @@ fn a_claim_of_a_number_that_is_taken_is_no_restart_and_loses_nothing() {
         let CellReport { lost, restarts, unanswered, refused, state, .. } = tape.cell();
         (lost, restarts, unanswered, refused, state)
     };
-    assert_eq!(told(true, 0), told(false, 0));
-    assert_eq!((told(true, 5).0, told(true, 5).1, told(true, 5).2), (5, 0, 1), "what is lost is still lost");
-    assert_eq!(told(true, 5), told(false, 5));
+    assert_eq!(counts(true, 0), counts(false, 0));
+    assert_eq!(
+        (counts(true, 5).0, counts(true, 5).1, counts(true, 5).2),
+        (5, 0, 1),
+        "what is lost is still lost"
+    );
+    assert_eq!(counts(true, 5), counts(false, 5));
 }
 
 #[test]
-fn a_claim_before_the_first_word_of_the_cell_that_has_the_number_is_no_restart() {
+fn a_claim_before_the_first_packet_of_the_owner_is_no_restart() {
     let mut tape = Tape::default();
     tape.page(Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() });
     for sent in [40, 41] {
         tape.page(Heartbeat { serial: 7, sent, ..Heartbeat::default() });
     }
     assert_eq!((tape.cell().restarts, tape.cell().lost), (0, 0));
-    // Another cell takes the number: that is one.
+    // Another cell owns the node id now: that is a restart.
     tape.page(Heartbeat { serial: 9, sent: 3, ..Heartbeat::default() });
     assert_eq!((tape.cell().restarts, tape.cell().lost), (1, 0));
 }
 
 #[test]
-fn a_start_is_known_by_the_count_where_its_claim_was_not_heard_and_a_late_word_is_none() {
+fn a_restart_is_detected_by_the_counter_and_a_late_heartbeat_is_none() {
     let mut tape = Tape::default();
     let mut say = |sent| {
         tape.page(Heartbeat { serial: 7, sent, ..Heartbeat::default() });

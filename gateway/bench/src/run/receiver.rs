@@ -244,7 +244,7 @@ impl Receiver {
         }
         let Some((number, epoch, at)) = self.table.newest() else { return };
         if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
-            let cells = self.table.reference_torque(at).collect();
+            let cells = self.table.sensors(at).collect();
             outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
         }
     }

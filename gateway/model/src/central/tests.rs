@@ -46,7 +46,7 @@ fn words_and_numbers_agree_within_what_words_can_hold() {
         assert!((coarse - fine).abs() < 5.0 * 5e-4, "{coarse} is not near {fine}");
     }
     assert_ne!(coarse, fine);
-    assert_eq!(coarse[3..], [0.0; 3], "joints above the cell's feel nothing");
+    assert_eq!(coarse[3..], [0.0; 3], "no torque about joints above the cell's");
 }
 
 #[test]
@@ -84,13 +84,13 @@ fn contact_and_proximity_are_fused_above_their_thresholds() {
 }
 
 #[test]
-fn the_whole_skin_feels_the_sum_of_its_active_cells() {
+fn the_torque_of_the_skin_is_the_sum_of_its_active_cells() {
     let mut skin = skin();
     let cell = skin.cells[0].clone();
     skin.cells = vec![cell; 3];
     let central = Central::new(&skin);
     let frames = central.frames(&[Q1_14::nearest(0.3); 6]);
-    let reference_torque = central.feel(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
+    let reference_torque = central.total(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
     assert_eq!(reference_torque.active, 2);
     for (got, target) in reference_torque.torque.iter().zip(central.torque(0, &frames, 3.0)) {
         assert!((got - target).abs() < 1e-12);
@@ -98,8 +98,8 @@ fn the_whole_skin_feels_the_sum_of_its_active_cells() {
 }
 
 proptest! {
-    /// The principle of virtual work, with a finite difference as the witness: the torque of a joint is
-    /// the force times what the cell moves when the joint does. So a pressed joint gives way.
+    /// The principle of virtual work, with a finite difference as the oracle: the torque of a joint is
+    /// the force times the displacement of the cell per joint angle. So a pressed joint yields.
     #[test]
     fn the_torque_is_the_work_of_the_force_per_angle(q in any::<[i16; 6]>(), k in 1_u8..=6) {
         let mut skin = skin();

@@ -1,19 +1,19 @@
-//! Who speaks under which number.
+//! Which cell has which node id.
 
 use protocol::id::CellId;
 use protocol::message::Heartbeat;
 
 use crate::tracker::{Claim, PerCell, Word};
 
-/// All numbers of a bus.
+/// All node ids of a bus.
 #[derive(Debug, Default)]
 pub(super) struct AddressTable(PerCell<Claim>);
 
 impl AddressTable {
-    /// Takes a heartbeat; two serial numbers that both come back under one number are returned.
+    /// Takes a heartbeat. Returns two serial numbers that use one node id in turn.
     ///
-    /// One change is a cell that took another's place; it is the way back that shows that both are there. A cell
-    /// that claims a number gives way where it is taken, and says nothing of who has it.
+    /// One change is a cell that replaced another one; only a change back shows that both are there. An address claim
+    /// for a taken node id is given up, and does not change the owner.
     pub(super) fn hear(&mut self, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;
@@ -22,12 +22,12 @@ impl AddressTable {
         (took && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
     }
 
-    /// Who has a number.
+    /// The serial number of the owner of a node id.
     pub(super) fn holder(&self, number: CellId) -> Option<u32> {
         self.0.get(number).and_then(Claim::serial)
     }
 
-    /// All that were heard, with their serial numbers.
+    /// All node ids in use, with the serial numbers of their owners.
     pub(super) fn all(&self) -> impl Iterator<Item = (CellId, u32)> {
         self.0.iter().filter_map(|(number, claim)| Some((number, claim.serial()?)))
     }
@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn the_way_back_shows_that_two_cells_have_one_number() {
+    fn a_change_back_shows_that_two_cells_share_one_node_id() {
         let (claims, settled) = (State::CLAIMING, State::default());
         let both = [(7, settled), (9, settled), (7, settled), (9, settled)];
         assert_eq!(heard(&both), [None, None, Some([7, 9]), Some([9, 7])]);

@@ -1,4 +1,4 @@
-//! Writes what a description says into the cells of one bus: what each still needs, and what it was asked last.
+//! Writes a description into the cells of one bus: the state and the last request of each cell.
 //!
 //! ```text
 //!   message, now ─> handle_message ─┐                  ┌─> poll_transmit ─> message
@@ -6,14 +6,14 @@
 //!                   stop ───────────┘                  └─> progress, report
 //! ```
 //!
-//! A cell is known by its serial number; the number that it has on the bus may be another than the description's.
-//! What it computes with changes at its commit, as a whole: the hash in the commit says what must be staged. So a
-//! commissioning may end at any moment, of itself or not, and the next one goes on: cells that have the right hash
-//! already are left as they are.
+//! A cell is identified by its serial number; its node id on the bus may differ from the description's. Its
+//! configuration changes at its commit, as a whole: the commit has the hash of what must be staged. So a
+//! commissioning may end at any moment, intended or not, and the next one continues: cells with the right hash are
+//! left as they are.
 //!
-//! One listens first, and then asks: what all cells want to be the same of everyone at once, one request at a time;
-//! the rest of each cell, some cells at a time. What was not answered is asked again. When all have committed, all is
-//! read back and compared, and so is the hash in their heartbeats.
+//! It listens first, then sends requests: parameters that all cells share to everyone, one request at a time; the
+//! rest to each cell, some cells at a time. Requests without an answer are repeated. When all cells have committed,
+//! all parameters are read back and compared, and so is the hash in the heartbeats.
 
 mod address_table;
 pub mod node_ids;
@@ -38,19 +38,19 @@ pub use outcome::{Outcome, Reason, Step, Trouble};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::Wish;
 
-/// How long a bus is listened to before anything is said: two gateways notice each other in this time.
+/// How long it only listens before it sends: two gateways detect each other in this time.
 pub const LISTEN: Span = Span::from_millis(500);
-/// How long cells may stay away after the last one showed up.
+/// How long to wait for further cells after the last one appeared.
 const SHOWING: Span = Span::from_millis(3_000);
-/// Cells that are asked by themselves at the same time.
+/// Cells with a request of their own at the same time.
 const WINDOW: usize = 16;
-/// How often everyone is asked the same, when most do not answer; and how long nobody may answer before it is over,
-/// and what remains is asked of each.
+/// How often a request to everyone is repeated when most cells do not answer; after so long without any answer, the
+/// remaining cells get requests of their own.
 const CALLS: Limits = Limits { first: QUIET, longest: QUIET, tries: 3 };
 const QUIET: Span = Span::from_millis(150);
-/// From one sync to the next while heartbeats are awaited.
+/// From one sync to the next while it waits for heartbeats.
 const SYNC: Span = Span::from_millis(300);
-/// How often a gateway says that it is there: nobody begins beside it.
+/// Interval of this gateway's heartbeats, by which others detect it.
 const ANNOUNCE: Span = Span::from_millis(250);
 /// Set in the tags of requests to everyone.
 const EVERYONE: u8 = 0x80;
@@ -58,7 +58,7 @@ const EVERYONE: u8 = 0x80;
 /// What is done next.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Phase {
-    /// Only listening, until then.
+    /// Only listening, until this time.
     Listen(Micros),
     /// Waiting for cells; since when no further one has shown up.
     Find(Micros),
@@ -66,7 +66,7 @@ enum Phase {
     Write,
     /// All parameters are read back.
     Read,
-    /// Heartbeats are awaited; when the last sync was said.
+    /// Waiting for heartbeats; when the last sync was sent.
     Beat(Micros),
     /// Nothing is left to do.
     Over,
@@ -79,7 +79,7 @@ struct Call {
     tag: u8,
     /// Cells that needed it at first.
     needed: usize,
-    /// When it is over, unless somebody answers before that.
+    /// When it times out, unless a cell answers before that.
     attempt: Attempt,
 }
 
@@ -97,7 +97,7 @@ pub struct Commission {
     phase: Phase,
     calls: VecDeque<Step>,
     call: Option<Call>,
-    /// All requests to everyone so far, with their tags: who is late has answered all the same.
+    /// All requests to everyone so far, with their tags: late answers count too.
     called: Vec<(Step, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
@@ -142,13 +142,13 @@ impl Commission {
         self.phase == Phase::Over
     }
 
-    /// Whether something may be said on the bus: not while it is only listened to, and not in a dry run.
+    /// Whether it may send on the bus: not while it only listens, and not in a dry run.
     #[must_use]
     pub const fn speaks(&self) -> bool {
         !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run
     }
 
-    /// Takes what somebody else said on the bus; [`Commission::handle_time`] says what that leads to.
+    /// Takes a message of another sender on the bus; [`Commission::handle_time`] acts on it.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
             self.end(Trouble::OtherGateway);
@@ -157,12 +157,12 @@ impl Commission {
         {
             self.end(Trouble::Meddler);
         } else if let Message::Network {
-            from: Node::Cell(number),
+            from: Node::Cell(node),
             page: NetworkPage::Heartbeat(heartbeat),
             ..
         } = *message
         {
-            self.hear(now, number, &heartbeat);
+            self.hear(now, node, &heartbeat);
         } else if let Message::Configured { from, tag, answer } = *message {
             let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
             let wish = self.wish;
@@ -174,7 +174,7 @@ impl Commission {
         }
     }
 
-    /// The described cell that has a number now.
+    /// The described cell that has a node id now.
     fn holder(&mut self, number: CellId) -> Option<&mut Task> {
         let serial = self.address_table.holder(number)?;
         let task = self.tasks.get_mut(*self.by_serial.get(&serial)?)?;
@@ -190,7 +190,7 @@ impl Commission {
             return;
         }
         if self.address_table.holder(number) != Some(heartbeat.serial) {
-            return; // it claims a number that is taken, and will give way
+            return; // an address claim for a taken node id, which will be given up
         }
         if let Some(loser) = before.and_then(|serial| self.task(serial))
             && loser.number == Some(number)
@@ -223,7 +223,7 @@ impl Commission {
         }
     }
 
-    /// Ends it now; nothing more is said.
+    /// Ends it now; nothing more is sent.
     pub fn stop(&mut self) {
         self.outbox.clear();
         self.give_up(Reason::Stopped, Reason::Stopped);
@@ -237,13 +237,13 @@ impl Commission {
         self.phase = Phase::Over;
     }
 
-    /// Takes in that time has passed, and decides what to ask. Harmless when called early.
+    /// Handles timeouts, and decides what to send. Harmless when called early.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.tasks.len() {
             let again = self.tasks.get_mut(place).and_then(|task| Some((task.number, task.time(now)?)));
-            if let Some((Some(number), (step, tag))) = again {
+            if let Some((Some(node), (step, tag))) = again {
                 self.repeated += 1;
-                self.request(place, Node::Cell(number), step, tag);
+                self.request(place, Node::Cell(node), step, tag);
             }
         }
         // Each turn is a phase that has nothing left to do.
@@ -266,7 +266,7 @@ impl Commission {
                     return None;
                 }
                 if !self.wish.dry_run {
-                    // Cells whose heartbeats were not heard.
+                    // For the heartbeats of cells that have not sent one yet.
                     self.outbox.push_back(Message::Sync);
                 }
                 Some(Phase::Find(now))
@@ -315,7 +315,7 @@ impl Commission {
         self.tasks.iter().any(|task| !task.is_done() && is(task.stage))
     }
 
-    /// Asks what can be asked now, of cells in such stages; whether any is left, or a cell that is about to settle.
+    /// Sends the requests that are possible now to cells in such stages; whether any cell remains, or is about to settle.
     fn works(&mut self, now: Micros, is: impl Fn(Stage) -> bool) -> bool {
         if self.call_everyone(now) {
             return true;
@@ -326,21 +326,21 @@ impl Commission {
                 break;
             }
             let Some(task) = self.tasks.get_mut(place).filter(|task| is(task.stage)) else { continue };
-            if let (Some(number), Some((step, tag))) = (task.number, task.step(now)) {
+            if let (Some(node), Some((step, tag))) = (task.number, task.step(now)) {
                 pending += 1;
-                self.request(place, Node::Cell(number), step, tag);
+                self.request(place, Node::Cell(node), step, tag);
             }
         }
         self.any(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
     }
 
-    /// Goes on with requests to everyone; whether one is under way.
+    /// Continues with requests to everyone; whether one is pending.
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = &mut self.call {
                 let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.step));
                 let first = waiting.next().map(|(place, _)| place);
-                // When most have not heard it, to say it again costs less than to ask each.
+                // When most cells did not answer, repeating it costs less than a request to each.
                 match first.map(|place| (place, call.attempt.turn(now))) {
                     Some((_, Turn::Wait)) => return true,
                     Some((place, Turn::Again)) if 2 * (waiting.count() + 1) > call.needed => {
@@ -354,7 +354,7 @@ impl Commission {
             }
             let Some(step) = self.calls.pop_front() else { return false };
             let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(step));
-            // What one cell needs is asked of that cell.
+            // What only one cell needs is a request to that cell.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
             let needed = needing.count() + 2;
             if !self.may_call(step) {
@@ -368,8 +368,8 @@ impl Commission {
         }
     }
 
-    /// Whether everyone may be asked this: all answers must find room, and nothing is written to cells that are
-    /// not the description's.
+    /// Whether this may be sent to everyone: there must be room for all answers, and nothing is written to cells that
+    /// are not described.
     fn may_call(&self, step: Step) -> bool {
         let fits = self.address_table.all().count() <= self.room;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
@@ -429,7 +429,7 @@ const fn is_failed(stage: Stage) -> bool {
     matches!(stage, Stage::Done(Outcome::Failed(_)))
 }
 
-/// Whether a write of this number changes what is kept, or is about to be.
+/// Whether a write of this parameter changes stored or staged parameters.
 fn is_stored(number: u8) -> bool {
     let parameter = Parameter::from_number(number);
     parameter.is_some_and(|it| it == Parameter::Commit || Parameter::STORED.contains(&it))

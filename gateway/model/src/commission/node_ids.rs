@@ -1,4 +1,4 @@
-//! A copy of a description with the numbers that cells have on their buses.
+//! A copy of a description with the node ids that cells have on their buses.
 
 use std::collections::BTreeMap;
 
@@ -11,12 +11,12 @@ use toml_edit::{DocumentMut, Item, Table, Value, value};
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NodeIdsError {
-    /// Not all cells of a bus have shown their numbers.
-    #[error("{missing} of the {cells} cells on {bus} were not heard, so their numbers are not known")]
+    /// Cells of a bus did not send a heartbeat.
+    #[error("{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are not known")]
     Missing {
         /// The bus.
         bus: String,
-        /// Cells that were not heard.
+        /// Cells without a heartbeat.
         missing: usize,
         /// Cells of the bus.
         cells: usize,
@@ -26,14 +26,14 @@ pub enum NodeIdsError {
     Text(String),
 }
 
-/// The numbers that cells have, by serial number; `None` of those that were not heard.
+/// The node ids of cells by serial number; `None` of cells without a heartbeat.
 pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 
-/// The text of a description with other numbers, and everything else as it was: comments, order, what is left out.
+/// The text of a description with other node ids, and everything else as it was: comments, order, omitted keys.
 /// Cells that `node_ids` does not have keep theirs. Neighbors are renumbered with the cells.
 ///
 /// # Errors
-/// When a number is not known, or the text is not the skin's.
+/// When a node id is not known, or the text is not the skin's.
 pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
         let here = || skin.cells_of(bus).filter_map(|cell| node_ids.get(&cell.serial));
@@ -47,7 +47,7 @@ pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String,
         }
     }
     let number = |serial: u32, own: CellId| node_ids.get(&serial).copied().flatten().unwrap_or(own);
-    // What each cell is called now, by its bus and its number in the file.
+    // The new node id of each cell, by its bus and its node id in the file.
     let renamed: BTreeMap<_, _> =
         skin.cells.iter().map(|cell| ((cell.bus, cell.node), number(cell.serial, cell.node))).collect();
     let not_the_text = |why: String| NodeIdsError::Text(why);
@@ -61,7 +61,7 @@ pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String,
     for (table, cell) in cells.iter_mut().zip(&skin.cells) {
         let new = number(cell.serial, cell.node);
         if new != cell.node {
-            // A serial number that is left out would follow the number.
+            // An omitted serial number would change with the node id.
             if !table.contains_key("serial") {
                 put_after_node(table, i64::from(cell.serial));
             }
@@ -80,7 +80,7 @@ pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String,
     Ok(document.to_string())
 }
 
-/// Puts a number in the place of another, with the white space and the comment that stand around that.
+/// Replaces a node id, and keeps the white space and the comment around it.
 fn set(item: Option<&mut Item>, number: CellId) {
     if let Some(old) = item.and_then(Item::as_value_mut) {
         *old = keep_decor(old, number);
@@ -93,7 +93,7 @@ fn keep_decor(old: &Value, number: CellId) -> Value {
     new
 }
 
-/// A serial number right after the node, where people look for it.
+/// Inserts a serial number right after the node id.
 fn put_after_node(table: &mut Table, serial: i64) {
     let keys: Vec<String> = table.iter().map(|(key, _)| key.to_owned()).collect();
     table.insert("serial", value(serial));
@@ -109,8 +109,8 @@ mod tests {
     use super::*;
     use crate::generate::{Target, generate};
 
-    fn cell(number: u8) -> CellId {
-        CellId::new(number.into()).unwrap()
+    fn cell(node: u8) -> CellId {
+        CellId::new(node.into()).unwrap()
     }
 
     /// Three cells in a row; the second one's serial number is left out, which makes it 2.
@@ -150,7 +150,7 @@ neighbors = [2, 0, 0, 0]
     }
 
     #[test]
-    fn numbers_and_neighbors_change_and_nothing_else_does() {
+    fn only_node_ids_and_neighbors_change() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = NodeIds::from([(7, Some(cell(2))), (2, Some(cell(50))), (9, Some(cell(3)))]);
@@ -174,7 +174,7 @@ neighbors = [2, 0, 0, 0]
     }
 
     #[test]
-    fn the_numbers_that_are_there_already_change_nothing() {
+    fn unchanged_node_ids_leave_the_text_as_it_is() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = skin.cells.iter().map(|cell| (cell.serial, Some(cell.node))).collect();
@@ -182,11 +182,11 @@ neighbors = [2, 0, 0, 0]
     }
 
     #[test]
-    fn a_cell_that_was_not_heard_has_no_number_to_be_written() {
+    fn a_cell_without_a_heartbeat_is_an_error() {
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = NodeIds::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
         let said = renumbered(&skin, &text, &node_ids).unwrap_err().to_string();
-        assert_eq!(said, "1 of the 3 cells on vcan0 were not heard, so their numbers are not known");
+        assert_eq!(said, "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are not known");
     }
 }

@@ -12,14 +12,14 @@ use thiserror::Error;
 
 use crate::decode::parameter::{Name, Words};
 
-/// What a cell is asked.
+/// A request to a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Step {
-    /// To stage a parameter.
+    /// Stage a parameter.
     Write(Parameter),
-    /// To take what is staged into flash and into use.
+    /// Store the staged parameters in flash, and use them.
     Commit,
-    /// To say a parameter that is in use.
+    /// Read a parameter that is in use.
     Read(Parameter),
 }
 
@@ -58,28 +58,28 @@ pub enum Outcome {
     /// It would be written, if this were no dry run.
     #[serde(rename = "would be written")]
     WouldWrite,
-    /// It could not be done; it computes with what it had before, or with all of the new.
+    /// It failed; the cell has either its old configuration or all of the new one.
     Failed(Reason),
 }
 
 /// Why a cell was not commissioned.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Reason {
-    /// It was not heard.
+    /// It sent no heartbeat.
     #[error("is not on the bus: switch it on, or look at its wires")]
     Missing,
-    /// It was heard, and then no more.
+    /// It sent heartbeats, and then no more.
     #[error("has gone from the bus")]
     Gone,
-    /// Two cells say that they are it.
-    #[error("is there twice, under the numbers {0} and {1}: give one of them another serial number")]
+    /// Two cells have its serial number.
+    #[error("is there twice, with the node ids {0} and {1}: give one of them another serial number")]
     Twins(CellId, CellId),
-    /// Its number is not its own.
-    #[error("shares the number {number} with the cell of serial number {other}: switch one of them off")]
+    /// Another cell uses its node id too.
+    #[error("shares node id {number} with the cell of serial number {other}: switch one of them off")]
     Shared {
-        /// The number.
+        /// The node id.
         number: CellId,
-        /// The other's serial number.
+        /// The serial number of the other cell.
         other: u32,
     },
     /// It speaks another version of the protocol.
@@ -88,38 +88,38 @@ pub enum Reason {
         /// Its version.
         got: u16,
     },
-    /// It said nothing to a request.
-    #[error("does not answer {step}, asked {tries} times")]
+    /// It did not answer a request.
+    #[error("does not answer {step}, sent {tries} times")]
     Silent {
-        /// What it was asked.
+        /// The request.
         step: Step,
         /// How often.
         tries: u8,
     },
-    /// It will not.
+    /// It refused a request.
     #[error("refuses {step}: {}", reason(i64::from(*.code)))]
     Refused {
-        /// What it was asked.
+        /// The request.
         step: Step,
         /// Its reason.
         code: i16,
     },
-    /// It says something else than what it was told.
+    /// Its answer differs from what was written.
     #[error(
         "answers {step} with {}, not {}",
         Words(.step.parameter().number(), *.got),
         Words(.step.parameter().number(), *.target)
     )]
     Differs {
-        /// What it was asked.
+        /// The request.
         step: Step,
         /// What should be there.
         target: [i16; WORDS],
-        /// What it says.
+        /// What it answered.
         got: [i16; WORDS],
     },
-    /// It says another hash than that of what it reads back.
-    #[error("says the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
+    /// The hash in its heartbeats is not that of the parameters it reads back.
+    #[error("sends the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
     Hash {
         /// That of the skin.
         target: u16,
@@ -127,7 +127,7 @@ pub enum Reason {
         got: u16,
     },
     /// It ended before its turn was over.
-    #[error("was not reached before the end; what it has is whole, the old or the new")]
+    #[error("was not reached before the end; its configuration is complete, either the old or the new one")]
     Stopped,
 }
 

@@ -1,4 +1,4 @@
-//! How far a commissioning is, and what it came to.
+//! Progress and result of a commissioning.
 
 use protocol::id::CellId;
 use serde::Serialize;
@@ -13,25 +13,25 @@ pub struct Progress {
     pub doing: &'static str,
     /// Cells of the description on this bus.
     pub cells: usize,
-    /// Of these, heard.
+    /// Of these, found on the bus.
     pub found: usize,
-    /// Of these, finished well.
+    /// Of these, done.
     pub done: usize,
-    /// Of these, given up.
+    /// Of these, failed.
     pub failed: usize,
 }
 
-/// What became of one cell.
+/// The result of one cell.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct CellReport {
-    /// Its number in the description.
+    /// Its node id in the description.
     pub described: CellId,
-    /// Its number on the bus, if it was heard.
+    /// Its node id on the bus, if it was found.
     #[serde(rename = "node")]
     pub number: Option<CellId>,
     /// Its serial number.
     pub serial: u32,
-    /// What became of it.
+    /// The result.
     #[serde(flatten)]
     pub outcome: Outcome,
 }
@@ -39,7 +39,7 @@ pub struct CellReport {
 /// A cell that the description does not have on this bus.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct UnknownNode {
-    /// Its number on the bus.
+    /// Its node id on the bus.
     #[serde(rename = "node")]
     pub number: CellId,
     /// Its serial number.
@@ -49,18 +49,18 @@ pub struct UnknownNode {
     pub belongs: Option<String>,
 }
 
-/// What became of one bus.
+/// The result of one bus.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// The described cells, in the file's order.
     pub cells: Vec<CellReport>,
-    /// The others, by number; they were left alone.
+    /// The others, by node id; nothing was written to them.
     pub unknown_nodes: Vec<UnknownNode>,
     /// Requests to one cell or to everyone.
     pub requests: u64,
-    /// Of these, said again because nobody answered.
+    /// Of these, repeated because no answer came.
     pub repeated: u64,
-    /// Why the bus was left alone from some moment on.
+    /// Why it stopped.
     pub trouble: Option<Trouble>,
 }
 
@@ -87,7 +87,7 @@ impl Commission {
         }
     }
 
-    /// What has become of everybody; of cells that are not done, as if it were stopped now.
+    /// The results so far; of cells that are not done, as if it were stopped now.
     #[must_use]
     pub fn report(&self) -> Report {
         let cell = |task: &Task| CellReport {

@@ -1,4 +1,4 @@
-//! What one cell still needs, and what it was asked last.
+//! The state of one cell: what it still needs, and its last request.
 
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, State, VERSION};
@@ -9,33 +9,33 @@ use protocol::time::{Micros, Span};
 use super::outcome::{Outcome, Reason, Step};
 use crate::repeat::{Attempt, Limits, Turn};
 
-/// How often a cell is asked the same before it is given up, and how long its answer may take.
+/// Retry limit and timeout of a request to one cell.
 const ANSWER: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
 /// A commit writes flash, which takes longer.
 const COMMIT: Limits = Limits { first: Span::from_millis(400), ..ANSWER };
-/// How often a cell is written anew, after it was switched off and on in the middle.
+/// How often a cell is written again from the beginning, after it was switched off and on in the middle.
 const ROUNDS: u8 = 6;
 /// How long a cell that has started or fallen out may take to settle.
 pub(super) const SETTLING: Span = Span::from_millis(3_000);
-/// How long a heartbeat with the right hash may be missing after everything was read back.
+/// Timeout of a heartbeat with the right hash, after everything was read back.
 const BEAT: Span = Span::from_millis(2_000);
 
 /// How far a cell is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Stage {
-    /// It was not heard yet.
+    /// It has sent no heartbeat yet.
     Missing,
     /// It needs some parameters, then a commit.
     Write,
-    /// It has committed, or had the right hash; what it has is to be compared.
+    /// It has committed, or had the right hash; its parameters are to be compared.
     Read,
-    /// A heartbeat is to bear the right hash; since when.
+    /// Waiting for a heartbeat with the right hash; since when.
     Beat(Micros),
     /// Nothing is left to do.
     Done(Outcome),
 }
 
-/// A request whose answer is awaited.
+/// A request without an answer yet.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     step: Step,
@@ -46,13 +46,13 @@ struct Pending {
 /// A cell of the description.
 #[derive(Debug)]
 pub(super) struct Task {
-    /// Its serial number, by which it is known.
+    /// Its serial number, which identifies it.
     pub(super) serial: u32,
-    /// Its number in the description.
+    /// Its node id in the description.
     pub(super) described: CellId,
-    /// Its number on the bus.
+    /// Its node id on the bus.
     pub(super) number: Option<CellId>,
-    /// How far it is.
+    /// Its stage.
     pub(super) stage: Stage,
     target: Parameters,
     hash: u16,
@@ -64,9 +64,9 @@ pub(super) struct Task {
     pending: Option<Pending>,
     tag: u8,
     rounds: u8,
-    /// The number that it had before this one.
+    /// Its node id before this one.
     before: Option<CellId>,
-    /// Since when it cannot be asked, because it claims its number or has lost it.
+    /// Since when no requests can be sent to it: it claims an address, or has lost its node id.
     pub(super) unsettled: Option<Micros>,
     said_hash: u16,
 }
@@ -132,7 +132,7 @@ impl Task {
         self.pending.is_some()
     }
 
-    /// Whether it waits for this of a request to everyone.
+    /// Whether it still needs this step of a request to everyone.
     pub(super) fn needs(&self, step: Step) -> bool {
         let missing = |mask| place(step.parameter()).is_some_and(|place| mask & bit(place) == 0);
         let can = self.number.is_some() && self.unsettled.is_none() && self.pending.is_none();
@@ -143,10 +143,10 @@ impl Task {
         }
     }
 
-    /// Takes a heartbeat that came under a number.
+    /// Takes a heartbeat of a node id.
     pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: Wish) {
         if let Some(old) = self.number.filter(|&old| old != number) {
-            // One change is a cell that was given another number; two cells come back.
+            // One change is a cell with a new node id; a change back means two cells.
             if self.before == Some(number) {
                 return self.fail(Reason::Twins(old.min(number), old.max(number)));
             }
@@ -171,8 +171,8 @@ impl Task {
         }
     }
 
-    /// It was switched on, or has another number now: what it had staged is gone, what it has in flash is seen
-    /// when it has settled.
+    /// It was switched on, or has another node id now: its staged parameters are gone, and the contents of its flash
+    /// are known when it has settled.
     fn restart(&mut self) {
         self.pending = None;
         (self.written, self.read) = (0, 0);
@@ -181,7 +181,7 @@ impl Task {
         }
     }
 
-    /// It is there and has settled: what does it need?
+    /// It has settled: decides what it needs.
     fn place(&mut self, wish: Wish) {
         let has_it = self.said_hash == self.hash;
         self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
@@ -192,7 +192,7 @@ impl Task {
         };
     }
 
-    /// Another cell has its number now.
+    /// Another cell has its node id now.
     pub(super) fn lose_node_id(&mut self, now: Micros) {
         self.number = None;
         self.unsettled.get_or_insert(now);
@@ -210,7 +210,7 @@ impl Task {
         self.stage = Stage::Done(if self.touched { Outcome::Written } else { Outcome::Verified });
     }
 
-    /// Asks the next thing, if there is one and nothing is asked; returns it with its tag.
+    /// Begins the next request, if there is one and none is pending; returns it with its tag.
     pub(super) fn step(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.pending.is_some() || self.unsettled.is_some() || self.number.is_none() {
             return None;
@@ -222,14 +222,14 @@ impl Task {
         };
         // The upper half of the tags is that of requests to everyone.
         self.tag = self.tag.wrapping_add(1) & 0x7F;
-        // What a commit that is not answered leads to is in use all the same.
+        // A commit may take effect without an answer.
         self.touched |= step == Step::Commit;
         let attempt = Attempt::new(now, if step == Step::Commit { COMMIT } else { ANSWER });
         self.pending = Some(Pending { step, tag: self.tag, attempt });
         Some((step, self.tag))
     }
 
-    /// Asks again what was not answered in time; gives up after some times, and what never settles too.
+    /// Handles timeouts: repeats the request, and fails at the retry limit, or when the cell does not settle.
     pub(super) fn time(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.unsettled.is_some_and(|since| now.since(since) >= SETTLING) && !self.is_done() {
             self.fail(Reason::Gone);
@@ -258,7 +258,7 @@ impl Task {
         [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
-    /// Takes an answer: to what it was asked itself, or to `call`, which everyone was asked with this tag.
+    /// Takes an answer: to its own request, or to `call`, the request to everyone with this tag.
     pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: Wish) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
@@ -269,7 +269,7 @@ impl Task {
             Answer::Refused { number, reason } if number == parameter.number() => {
                 self.pending = None;
                 if step == Step::Commit && reason == Answer::WRONG_HASH {
-                    // It was switched off and on in the middle, and nobody heard it.
+                    // It restarted in between, without a heartbeat that arrived.
                     return self.again(Reason::Refused { step, code: reason });
                 }
                 self.fail(Reason::Refused { step, code: reason });
@@ -305,7 +305,7 @@ impl Task {
                 self.read |= bit;
                 if self.read == ALL {
                     self.stage = Stage::Beat(now);
-                    // A heartbeat may have said it meanwhile.
+                    // A heartbeat may have had the hash meanwhile.
                     if self.said_hash == self.hash {
                         self.finish();
                     }
@@ -314,7 +314,7 @@ impl Task {
         }
     }
 
-    /// Begins at the beginning, unless it has too often.
+    /// Starts over, up to a limit.
     fn again(&mut self, why: Reason) {
         self.rounds += 1;
         if self.rounds > ROUNDS {

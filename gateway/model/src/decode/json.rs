@@ -1,4 +1,4 @@
-//! What frames say as JSON: one object a frame, the unit at the end of each key that has one.
+//! Frames as JSON: one object a frame, the unit at the end of each key that has one.
 
 use std::io::{self, Write};
 
@@ -14,7 +14,7 @@ use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 use super::text::{Bits, Name};
 use super::{Decoded, Foreign, wires};
 
-/// A frame and what it says.
+/// A frame and its meaning.
 #[derive(serde::Serialize)]
 struct Line<'a> {
     time_ns: u64,
@@ -39,15 +39,15 @@ struct Line<'a> {
     values: Option<Values>,
     #[serde(skip_serializing_if = "Option::is_none")]
     saturated: Option<bool>,
-    /// What the packet says.
+    /// As in the packet.
     #[serde(skip_serializing_if = "Option::is_none")]
     crc: Option<String>,
-    /// What its bytes give, when that is something else.
+    /// As computed from its bytes, when it differs.
     #[serde(skip_serializing_if = "Option::is_none")]
     crc_expected: Option<String>,
 }
 
-/// What the words say, by kind and page.
+/// The values of the words, by kind and page.
 struct Values {
     link_id: Option<LinkId>,
     end: &'static [Field],
@@ -234,7 +234,7 @@ fn word(word: u16) -> String {
 }
 
 impl Line<'_> {
-    /// Who speaks, and of what.
+    /// The kind and the node.
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
@@ -307,11 +307,7 @@ mod tests {
         assert_eq!(torque, expected);
         let raw = torque["raw"].as_str().unwrap();
         let (last, crc) = (&raw[raw.len() - 4..], torque["crc"].as_str().unwrap());
-        assert_eq!(
-            format!("{}{}", &last[2..], &last[..2]),
-            crc,
-            "the last two bytes, least significant first"
-        );
+        assert_eq!(format!("{}{}", &last[2..], &last[..2]), crc, "little-endian");
     }
 
     #[test]
@@ -379,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn wires_have_their_number_and_what_is_said_over_them() {
+    fn a_message_over_a_wire_has_the_number_of_the_wire() {
         let hello = object(WIRE, "hello wire=12 back=0 version=1 node_id=7 port=2 flags=hears+up label=3/1");
         assert_eq!((&hello["kind"], &hello["verdict"]), (&json!("wire"), &json!("ok")));
         assert_eq!((hello.get("node"), hello.get("epoch")), (None, None));
@@ -394,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_packet_says_why() {
+    fn a_frame_that_is_no_packet_has_an_error() {
         let wrong = object(BAD, "bad crc expected=9C2A got=E74B");
         assert_eq!((&wrong["verdict"], wrong.get("kind")), (&json!("foreign"), None));
         assert_eq!((&wrong["crc"], &wrong["crc_expected"]), (&json!("E74B"), &json!("9C2A")));
@@ -414,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn two_classic_frames_say_it_at_the_second() {
+    fn the_second_classic_frame_has_the_values() {
         let whole = objects(CLASSIC).into_iter().find(|(_, object)| object["verdict"] == "ok").unwrap().1;
         let raw = whole["raw"].as_str().unwrap();
         let crc = whole["crc"].as_str().unwrap();

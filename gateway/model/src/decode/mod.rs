@@ -1,14 +1,14 @@
-//! What frames mean, in words for people: `gateway dump` shows it beside the raw frame.
+//! What frames mean, as text: `gateway dump` shows it beside the raw frame.
 //!
 //! ```text
 //!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text
-//!                          └ for each identifier of each bus: a waiting half, and whether packets come under it
+//!                          └ for each identifier of each bus: a waiting segment, and whether packets use it
 //! ```
 //!
-//! A frame is ours as a whole packet with the right CRC, or as one of its two classic halves. Every other frame is
-//! foreign; one under an identifier that carries packets is damaged. Each line begins with a verdict of one word:
+//! A frame is ours as a whole packet with the right CRC, or as one of the two segments of a classic packet. Every other
+//! frame is foreign; with an identifier that carries packets it is damaged. Each line begins with a verdict of one word:
 //! `ok`, `segment` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
-//! that says nothing known: `meaning`.
+//! without a known meaning: `meaning`.
 
 pub mod json;
 pub mod parameter;
@@ -25,7 +25,7 @@ use protocol::time::Micros;
 use protocol::wire::{self, PortMessage};
 use thiserror::Error;
 
-/// Buses that are told apart at the same time: of more, the oldest is forgotten, or they are taken together.
+/// Buses that are distinguished at the same time: of more, the oldest is forgotten, or they are taken together.
 pub const BUSES: usize = 64;
 /// Identifiers of 11 bits.
 const IDS: usize = 0x800;
@@ -35,9 +35,9 @@ const IDS: usize = 0x800;
 pub enum Decoded {
     /// No frame of this protocol.
     Foreign(Foreign),
-    /// What a cell, or the gateway's side, says over a simulated wire. It is on no real bus.
+    /// A message of a cell, or of the gateway, over a simulated wire. It is on no real bus.
     Wire(wire::LinkId, PortMessage),
-    /// The first half of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
+    /// The first segment of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
     Segment {
         /// Its identifier.
         id: Id,
@@ -49,7 +49,7 @@ pub enum Decoded {
         /// Why it is no packet.
         fault: PacketError,
     },
-    /// A packet that says nothing this version knows.
+    /// A packet without a meaning in this version.
     Meaningless {
         /// The packet.
         packet: Packet,
@@ -95,7 +95,7 @@ impl Decoded {
     pub const fn verdict(&self) -> &'static str {
         match self {
             Self::Message(_) | Self::Wire(..) => "ok",
-            Self::Segment { .. } => "half",
+            Self::Segment { .. } => "segment",
             Self::Foreign(_) => "foreign",
             Self::Damaged { fault, .. } => fault.name(),
             Self::Meaningless { .. } => "meaning",
@@ -114,14 +114,14 @@ impl Decoded {
         self.message().and_then(Message::is_saturated).unwrap_or(false)
     }
 
-    /// Whether this tells of a touch.
+    /// Whether this shows a touch.
     #[must_use]
     pub fn is_contact(&self) -> bool {
         self.message().is_some_and(Message::is_contact)
     }
 }
 
-/// What a frame says over a simulated wire. One whose identifier or CRC says otherwise is anybody's: 29 bits are
+/// The message of a frame over a simulated wire. `None` if its identifier or CRC is not that of a wire: 29 bits are
 /// common on other buses.
 #[must_use]
 pub fn wired(frame: &Frame) -> Option<(wire::LinkId, PortMessage)> {
@@ -129,7 +129,7 @@ pub fn wired(frame: &Frame) -> Option<(wire::LinkId, PortMessage)> {
     Some((link_id, link_id.read(frame)?))
 }
 
-/// What has come under an identifier, and so whether it is one of ours.
+/// What came with an identifier, and so whether it is one of ours.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Traffic {
     packets: u64,
@@ -147,7 +147,7 @@ impl Traffic {
         self.packets += 1;
     }
 
-    /// A frame came that is no packet, nor half of one.
+    /// A frame came that is no packet and no segment.
     pub const fn other(&mut self) {
         self.others += 1;
     }
@@ -159,7 +159,7 @@ impl Traffic {
     }
 }
 
-/// Tells what frames are, pairing halves on the way.
+/// Classifies frames, and reassembles segments.
 #[derive(Debug)]
 pub struct Decoder {
     format: Option<Format>,
@@ -187,7 +187,7 @@ struct Slot {
 }
 
 impl Slot {
-    /// A frame that is no packet, nor half of one.
+    /// A frame that is no packet and no segment.
     const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
         self.traffic.other();
         if self.traffic.carries_packets() {
@@ -201,7 +201,7 @@ impl Slot {
 /// What came of a frame, and with it of the one that waited under its identifier.
 struct Taken {
     decoded: Decoded,
-    /// On which bus it waits for its other half.
+    /// On which bus it waits for its second segment.
     waits: Option<u64>,
     /// The number of a frame that waited, and what it was.
     older: Option<(u64, Decoded)>,
@@ -266,7 +266,7 @@ impl Decoder {
         Taken { decoded, waits: None, older }
     }
 
-    /// What a frame is whose other half does not come any more.
+    /// What a segment is when the second one does not come any more.
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
         let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));

@@ -9,7 +9,7 @@ use thiserror::Error;
 
 pub use super::text::{Name, Words};
 
-/// The greatest number that a parameter can have: the bit above it says that it is written.
+/// The largest number of a parameter: the bit above it means a write.
 const MAX: u8 = 127;
 
 /// Why text is no parameter, or no value of one.
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_says_what_can() {
+    fn errors_name_what_is_allowed() {
         assert_eq!(
             says("poes", &["1"]),
             "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_of_a_switch_is_told_again() {
+    fn the_words_of_a_switch_have_their_text() {
         for (parameter, values, text) in [
             ("reply", "torque", "torque"),
             ("reply", "sum 65535 253 0", "sum, slot 65535 us, deepest 253, no carry"),

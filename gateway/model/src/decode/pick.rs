@@ -9,18 +9,18 @@ use thiserror::Error;
 
 use super::Decoded;
 
-/// A kind of frame that is wanted.
+/// A kind of frame to show.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Selector {
     /// A kind of packet.
     Kind(Kind),
     /// One command.
     Command(Command),
-    /// What cells say over simulated wires.
+    /// Messages over simulated wires.
     Wire,
     /// What is not of this protocol, and what is damaged.
     Foreign,
-    /// What is no packet, under an identifier that carries packets.
+    /// What is no packet, with an identifier that carries packets.
     Damaged,
 }
 
@@ -51,7 +51,7 @@ impl FromStr for Selector {
     }
 }
 
-/// Whom a word names: `gateway`, `everyone`, or a cell's number.
+/// The node that a word names: `gateway`, `everyone`, or a node id.
 ///
 /// # Errors
 /// What it is and what would be right.
@@ -61,7 +61,7 @@ pub fn node(word: &str) -> Result<Node, String> {
         "everyone" => Ok(Node::Everyone),
         number => match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
             Some(cell) => Ok(Node::Cell(cell)),
-            None => Err(format!("{word:?} is no node: a cell's number, 1 to 254, gateway or everyone is")),
+            None => Err(format!("{word:?} is no node: node ids are 1 to 254, or gateway, or everyone")),
         },
     }
 }
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn kinds_and_nodes_are_told_by_the_identifier_of_a_packet() {
+    fn kinds_and_nodes_follow_from_the_identifier_of_a_packet() {
         let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x400, 0x1234 | EXTENDED];
         let taken = |kinds: &[&str], nodes: &[&str]| -> Vec<u32> {
             let pick = Pick {
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_no_packet_is_foreign_under_every_identifier_and_damaged_only_under_ours() {
+    fn a_frame_that_is_no_packet_is_foreign_with_every_identifier_and_damaged_only_with_ours() {
         let wrong = Frame::fd(0x20C, 0, &[1; 16]).unwrap();
         let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
         let mut decoder = Decoder::new(None);
@@ -179,7 +179,7 @@ mod tests {
         assert_eq!([0, 1].map(|_| taken(&frame(0x20C))), [[true, false, false]; 2]);
         assert_eq!(taken(&wrong), [true, true, true]);
         let cell = Pick { nodes: vec![node("12").unwrap()], ..Pick::default() };
-        assert!(!takes(&cell, &wrong), "of another bus nothing is known");
+        assert!(!takes(&cell, &wrong), "nothing is known of another bus");
     }
 
     #[test]
@@ -192,10 +192,10 @@ mod tests {
     }
 
     #[test]
-    fn words_that_are_none_say_which_are() {
+    fn unknown_words_are_errors_that_list_the_known_ones() {
         let kind = "torqe".parse::<Selector>().unwrap_err().to_string();
         assert!(kind.starts_with("\"torqe\" is no kind: command, sum, torque, "), "{kind}");
-        let expected = "\"255\" is no node: a cell's number, 1 to 254, gateway or everyone is";
+        let expected = "\"255\" is no node: node ids are 1 to 254, or gateway, or everyone";
         assert_eq!(node("255"), Err(expected.to_owned()));
     }
 }

@@ -1,12 +1,12 @@
-//! What frames are, told once that is certain, in the order in which they came.
+//! Classifies frames once that is certain, in the order in which they came.
 //!
 //! ```text
 //!   frames ──> Settler ──> the same frames in the same order, each with what it is
-//!                └ those since the oldest whose other half may still come
+//!                └ those since the oldest whose second segment may still come
 //! ```
 //!
-//! A classic frame is half of a packet or foreign; which of them it is comes out with the next frame under its
-//! identifier, or when its other half is not there in time. Until then it waits, and so do all that came after it.
+//! A classic frame is a segment of a packet or foreign. Which of them is known with the next frame of its identifier,
+//! or when the second segment times out. Until then it waits, and so do all frames that came after it.
 
 use std::collections::VecDeque;
 
@@ -17,13 +17,12 @@ use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
 
-/// Frames that wait at most; beyond them the oldest is told without its other half.
+/// Frames that wait at most; beyond them the oldest is given out without its second segment.
 const FRAMES: usize = 1 << 16;
-/// Later than the latest time for its other half by so much, a frame waits no more: frames of several buses come out
-/// of order by that.
+/// Added to the timeout of the second segment: frames of several buses may be out of order by that much.
 const SLACK: Span = Span::from_millis(100);
 
-/// Tells what frames are in the order in which they came; `T` comes back with each.
+/// Classifies frames in the order in which they came; `T` is given out with each.
 #[derive(Debug)]
 pub struct Settler<T> {
     decoder: Decoder,

@@ -238,7 +238,7 @@ fn every_other_kind_has_its_text() {
 }
 
 #[test]
-fn everything_that_can_be_said_is_ok() {
+fn every_message_of_the_protocol_is_ok() {
     let texts = decoded(FD, None);
     assert!(texts.len() > 80, "the log is there");
     for (comment, text) in texts {
@@ -247,7 +247,7 @@ fn everything_that_can_be_said_is_ok() {
 }
 
 #[test]
-fn what_is_no_packet_is_foreign_and_says_why() {
+fn what_is_no_packet_is_foreign_with_a_reason() {
     for (comment, text) in decoded(BAD, Some(Format::Fd)) {
         let words: Vec<_> = comment.split(' ').collect();
         let field = |name: &str| words.iter().find_map(|word| word.strip_prefix(name)).unwrap().to_owned();
@@ -268,7 +268,7 @@ fn what_is_no_packet_is_foreign_and_says_why() {
 }
 
 #[test]
-fn under_an_identifier_that_carries_packets_it_is_damaged() {
+fn with_an_identifier_that_carries_packets_it_is_damaged() {
     let text = |format, text| {
         let frame = candump::parse_frame(text).unwrap();
         knowing(format).decode(Micros(0), "vcan0", &frame).to_string()
@@ -285,7 +285,7 @@ fn under_an_identifier_that_carries_packets_it_is_damaged() {
     }
     settler.finish();
     let last = std::iter::from_fn(|| settler.pop()).last().unwrap().1;
-    assert_eq!(last.to_string(), "incomplete torque 12: no other half");
+    assert_eq!(last.to_string(), "incomplete torque 12: no other segment");
 }
 
 #[test]
@@ -303,13 +303,13 @@ fn chance_makes_no_identifier_ours() {
 }
 
 #[test]
-fn segments_meet_by_bus_and_identifier() {
+fn segments_are_reassembled_by_bus_and_identifier() {
     let all = decoded(CLASSIC, None);
     let (mut segments, mut packets) = (0, 0);
     for (comment, text) in &all {
-        segments += u32::from(text.starts_with("half    "));
+        segments += u32::from(text.starts_with("segment "));
         let expected: &[&str] = match comment.split(' ').next().unwrap() {
-            "waiting" | "incomplete" => &["half    ", "foreign no packet: no other half", "incomplete "],
+            "waiting" | "incomplete" => &["segment ", "foreign no packet: no other segment", "incomplete "],
             "whole" => {
                 packets += 1;
                 if comment.contains(" bad ") { &["meaning "] } else { &["ok      "] }
@@ -319,14 +319,14 @@ fn segments_meet_by_bus_and_identifier() {
         };
         assert!(expected.iter().any(|expected| text.starts_with(expected)), "{comment}: {text}");
     }
-    assert_eq!(segments, packets, "each packet has one first half: {all:#?}");
+    assert_eq!(segments, packets, "each packet has one first segment: {all:#?}");
     let mut decoder = Decoder::new(None);
     let [first, second] =
         ["20C#001000F801000000", "20C#00000000070175D6"].map(|text| candump::parse_frame(text).unwrap());
     let mut verdict = |bus: &str, frame| decoder.decode(Micros(0), bus, frame).verdict();
     assert_eq!(
         [verdict("a", &first), verdict("b", &second), verdict("a", &second), verdict("b", &first)],
-        ["half", "half", "ok", "half"]
+        ["segment", "segment", "ok", "segment"]
     );
 }
 
@@ -340,7 +340,7 @@ fn on_a_bus_of_one_format_the_other_is_refused() {
 }
 
 #[test]
-fn what_is_said_over_wires_has_its_text() {
+fn messages_over_wires_have_their_text() {
     let expected = [
         "wire 12 ->: hello, no node id, port 2, a node id is missing, unreachable",
         "wire 12 <-: hello, no node id, uplink, hears, round 3 depth 0",
@@ -370,7 +370,7 @@ fn what_is_said_over_wires_has_its_text() {
 }
 
 #[test]
-fn foreign_frames_say_what_they_are() {
+fn foreign_frames_have_a_reason() {
     assert_eq!(text("1F334455#11"), "foreign 29-bit identifier");
     assert_eq!(text("20C#R8"), "foreign remote frame");
     assert_eq!(text("20000004#0001000000000000"), "foreign error frame of the driver");
@@ -391,8 +391,8 @@ fn saturation_is_noticed() {
 }
 
 #[test]
-fn contact_is_what_tells_of_a_touch() {
-    // A torque and the zeros that end a contact; a stimulus and the one that lets go; halt.
+fn contact_is_a_frame_that_shows_a_touch() {
+    // A torque and the zeros that end a contact; a stimulus and the one that releases it; halt.
     let frames = [
         ("20C##1CDFB7B0C000000000000000007014157", true),
         ("20C##100000000000000000000000008010C2F", false),

@@ -25,7 +25,7 @@ impl Display for Decoded {
     }
 }
 
-/// What an identifier speaks of: `torque 12`, `halt`, `command 9`.
+/// What an identifier is about: `torque 12`, `halt`, `command 9`.
 struct Subject(Id);
 
 impl Display for Subject {
@@ -93,7 +93,7 @@ impl Display for Name {
     }
 }
 
-/// What a layout's fields say in these bytes.
+/// The text of a layout's fields in these bytes.
 pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw(bytes, 0));
     fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), bytes, &|_, name| {

@@ -1,4 +1,4 @@
-//! What is said over wires between ports, and what ports lead to.
+//! The text of messages over wires, and of what ports lead to.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -9,7 +9,7 @@ use protocol::wire::{Hello, LinkId, PortMessage, Rank, UPLINK, Walk};
 
 use super::text;
 
-/// The bytes of a message over a wire, and what stands in them.
+/// The bytes of a message over a wire, and their layout.
 pub(super) fn said(message: PortMessage) -> ([u8; BYTES], &'static Layout) {
     let mut bytes = [0; BYTES];
     let body = message.encode();
@@ -22,7 +22,7 @@ pub(super) fn said(message: PortMessage) -> ([u8; BYTES], &'static Layout) {
     )
 }
 
-/// The epoch that a message speaks of, if it does.
+/// The epoch of a message, if it has one.
 pub(super) const fn epoch(message: PortMessage) -> Option<u8> {
     if let PortMessage::State(epoch) | PortMessage::Nack(epoch) = message { Some(epoch.0) } else { None }
 }
@@ -68,7 +68,7 @@ fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
     write!(f, ", {}", Far(rank))
 }
 
-/// How far somebody is from the gateway.
+/// The rank of a cell.
 struct Far(Option<Rank>);
 
 impl Display for Far {

@@ -45,7 +45,7 @@ pub(super) struct Limb {
     middle: [f64; 2],
     /// How much of its length the skin may cover, in m.
     length: f64,
-    /// The least distance of a cell from the limb's own axis, in m.
+    /// The minimum distance of a cell from the limb's own axis, in m.
     radius: f64,
 }
 

@@ -62,16 +62,16 @@ pub enum Reply {
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum GenerateError {
-    /// More cells than the buses have numbers for.
+    /// More cells than the buses have node ids for.
     #[error(
-        "{cells} cells do not fit on {}: a bus has numbers for {most}; say --buses {needed}",
+        "{cells} cells do not fit on {}: a bus has {most} node ids; use --buses {needed}",
         if *.buses == 1 { "one bus".to_owned() } else { format!("{buses} buses") },
         most = CellId::COUNT
     )]
     TooMany {
-        /// Wanted cells.
+        /// Requested cells.
         cells: usize,
-        /// Wanted buses.
+        /// Requested buses.
         buses: usize,
         /// Buses that this takes.
         needed: usize,
@@ -79,17 +79,17 @@ pub enum GenerateError {
     /// Fewer cells than buses, or none.
     #[error("{cells} cells on {buses} buses: every bus needs at least one")]
     TooFew {
-        /// Wanted cells.
+        /// Requested cells.
         cells: usize,
-        /// Wanted buses.
+        /// Requested buses.
         buses: usize,
     },
     /// More cells than there is room for.
     #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart")]
     NoRoom {
-        /// Wanted cells.
+        /// Requested cells.
         cells: usize,
-        /// The least distance in mm.
+        /// The minimum distance in mm.
         min_mm: usize,
     },
     /// What came out is no skin: a number that was asked for cannot be.
@@ -97,7 +97,7 @@ pub enum GenerateError {
     Skin(#[from] DocumentError),
 }
 
-/// The text of a `skin.toml`; the same for the same wish.
+/// The text of a `skin.toml`; the same for the same target.
 ///
 /// # Errors
 /// When the cells do not fit on the buses or on the arm, or a number that was asked for cannot be.

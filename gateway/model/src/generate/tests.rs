@@ -24,7 +24,7 @@ fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
 fn the_example_is_what_its_first_line_makes() {
     let example = include_str!("../../../examples/ur5-253.toml");
     assert!(example.starts_with("# gateway skin generate --robot ur5 --cells 253\n"));
-    assert!(generate(&Target::default()).unwrap() == example, "make it anew with that command");
+    assert!(generate(&Target::default()).unwrap() == example, "generate it again with that command");
 }
 
 #[test]
@@ -104,7 +104,7 @@ fn more_cells_than_the_arm_has_room_for_lie_closer() {
 }
 
 #[test]
-fn the_reply_and_the_format_are_the_wanted_ones() {
+fn the_reply_and_the_format_are_the_requested_ones() {
     let target = Target {
         reply: Reply::Sum,
         format: Format::Classic,
@@ -129,15 +129,15 @@ fn the_reply_and_the_format_are_the_wanted_ones() {
 }
 
 #[test]
-fn what_cannot_be_says_what_can() {
+fn errors_name_what_is_allowed() {
     let says = |target: Target| generate(&target).unwrap_err().to_string();
     assert_eq!(
         says(target(255, 1)),
-        "255 cells do not fit on one bus: a bus has numbers for 254; say --buses 2"
+        "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2"
     );
     assert_eq!(
         says(target(1_000, 3)),
-        "1000 cells do not fit on 3 buses: a bus has numbers for 254; say --buses 4"
+        "1000 cells do not fit on 3 buses: a bus has 254 node ids; use --buses 4"
     );
     assert_eq!(says(target(0, 1)), "0 cells on 1 buses: every bus needs at least one");
     assert_eq!(says(target(100_000, 400)), "100000 cells do not fit on the arm, not even 3 mm apart");

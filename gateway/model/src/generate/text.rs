@@ -20,7 +20,7 @@ pub(super) fn toml(target: &Target, arm: &Covered) -> String {
         (*format == Format::Classic, " --format classic".to_owned()),
     ];
     let options: String =
-        options.into_iter().filter_map(|(requested, option)| requested.then_some(option)).collect();
+        options.into_iter().filter_map(|(is_unusual, option)| is_unusual.then_some(option)).collect();
     let is_joined = arm.buses.len() == 1 && on_upper > 0 && on_lower > 0;
     let cable = format!("# A cable leads from node {on_upper} over the elbow to node {}.\n", on_upper + 1);
     let cable = if is_joined { &cable } else { "" };

@@ -1,7 +1,6 @@
-//! What is wrong with a network of cells: what they report, compared with how they are described.
+//! What is wrong with a network of cells: their reports, compared with the description.
 //!
-//! Every difference is named once, by what is at its root: of a cell that is missing nobody is told that its wires do
-//! not work.
+//! Every difference is named once, by its cause: the wires of a missing cell are not named.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -17,19 +16,19 @@ use super::tree::{Places, places};
 /// What is known of one cell.
 #[derive(Clone, Copy, Debug)]
 pub struct Seen {
-    /// Its number.
+    /// Its node id.
     pub node: CellId,
-    /// The serial number that the cell of this number is described with; `None` of a number that is not described.
+    /// The serial number that is described with this node id; `None` if the node id is not described.
     pub serial: Option<u32>,
     /// The hash that its configuration must have.
     pub configuration: u16,
     /// Its last heartbeat.
     pub heartbeat: Option<Heartbeat>,
-    /// Whether it speaks now.
+    /// Whether it sends now.
     pub alive: bool,
-    /// Its place in the tree, as it says.
+    /// Its place in the tree, as it reports.
     pub tree: Option<Tree>,
-    /// What its ports lead to, as it says.
+    /// What its ports lead to, as it reports.
     pub ports: Option<Ports>,
 }
 
@@ -51,7 +50,7 @@ impl fmt::Display for End {
 /// In which direction a wire carries something.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub enum Carries {
-    /// In neither, or nobody says in which.
+    /// In neither, or it is not known in which.
     Nothing,
     /// From the first end to the second.
     There,
@@ -73,38 +72,38 @@ impl Carries {
 /// One difference between a network and its description.
 #[derive(Clone, Debug, Eq, Error, Ord, PartialEq, PartialOrd)]
 pub enum Difference {
-    /// A described cell does not speak.
-    #[error("cell {0} does not speak: start it, or take it out of the description")]
+    /// A described cell does not send.
+    #[error("cell {0} is missing: start it, or take it out of the description")]
     MissingCell(CellId),
-    /// A cell speaks that is not described.
+    /// A cell sends that is not described.
     #[error("cell {cell} with serial number {serial} is not described: describe it, or take it off the bus")]
     ExtraCell {
-        /// Its number.
+        /// Its node id.
         cell: CellId,
         /// Its serial number.
         serial: u32,
     },
-    /// A cell of another serial number than described has a number.
+    /// A cell of another serial number than described has a node id.
     #[error("{}", other_cell(*cell, *serial, *described, *belongs))]
     OtherCell {
-        /// The number.
+        /// The node id.
         cell: CellId,
-        /// The serial number of who has it.
+        /// The serial number of its owner.
         serial: u32,
         /// The one that is described.
         described: u32,
-        /// The number with which the one who has it is described, if it is.
+        /// The node id with which the owner is described, if it is.
         belongs: Option<CellId>,
     },
-    /// Two cells have a number.
-    #[error("two cells have number {0}: stop one of the two")]
+    /// Two cells have one node id.
+    #[error("two cells have node id {0}: stop one of the two")]
     Duplicate(CellId),
-    /// A cell speaks another version of the protocol.
+    /// A cell has another version of the protocol.
     #[error("cell {cell} speaks {}", other_version(*version))]
     Version {
         /// The cell.
         cell: CellId,
-        /// Its version; `None` when only its neighbours say that it is another one.
+        /// Its version; `None` when only its neighbours report that it differs.
         version: Option<u16>,
     },
     /// A cell computes with other parameters than the skin's.
@@ -113,7 +112,7 @@ pub enum Difference {
     /// A described wire does not work.
     #[error("the wire from {first} to {second} {}: look at its plugs", carries.between(first.cell, second.cell))]
     MissingWire {
-        /// The end with the lesser number.
+        /// The end with the smaller node id.
         first: End,
         /// The other end.
         second: End,
@@ -135,15 +134,15 @@ pub enum Difference {
         /// Where it should lead.
         described: End,
     },
-    /// A cell without a number is at a port.
-    #[error("a cell without a number is at {0}: it gets one from the network, unless all are used")]
+    /// A cell without a node id is at a port.
+    #[error("a cell without a node id is at {0}: it gets one from the network, unless all are used")]
     Unnumbered(End),
     /// Cells that are each other's parents, in order.
-    #[error("{} are each other's parents, in a circle that would count twice: start them anew", names(.0))]
+    #[error("{} are each other's parents, a circle that would count cells twice: restart them", names(.0))]
     Circle(Vec<CellId>),
-    /// Cells without a way to the gateway's side.
+    /// Cells without a route to a root.
     #[error(
-        "{} {} no way to a root: no sum holds what they feel; look at their wires",
+        "{} {} no route to a root: their torques are in no sum; look at their wires",
         names(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]
@@ -153,7 +152,7 @@ pub enum Difference {
 fn other_cell(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
     match belongs {
         Some(belongs) => format!(
-            "number {cell} is that of the cell with serial number {serial}, which is described as cell {belongs}; \
+            "node id {cell} is used by the cell with serial number {serial}, which is described as cell {belongs}; \
              {described} is described there: exchange the cells, or their serial numbers in the description"
         ),
         None => format!(
@@ -245,7 +244,7 @@ fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
     found
 }
 
-/// The cells that speak another version, by themselves or by their neighbours' word.
+/// The cells with another version, by their own or by their neighbours' reports.
 fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
@@ -255,15 +254,15 @@ fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>
             versions.insert(cell.node, Some(version));
         }
     }
-    let mut told = BTreeSet::new();
+    let mut reported = BTreeSet::new();
     for cell in alive().filter(|cell| !versions.contains_key(&cell.node)) {
         let ports = cell.ports.iter().flat_map(|ports| ports.ports.iter().enumerate());
         for (port, state) in ports.filter(|(_, state)| state.other_version) {
             let number = CellId::new(state.number.into()).ok();
-            told.extend(number.or_else(|| Some(wires.other_end(cell.node, port)?.0)));
+            reported.extend(number.or_else(|| Some(wires.other_end(cell.node, port)?.0)));
         }
     }
-    for cell in told {
+    for cell in reported {
         versions.entry(cell).or_insert(None);
     }
     versions
@@ -272,7 +271,7 @@ fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>
 /// What ports lead to.
 struct Network<'a> {
     wires: &'a Wires,
-    /// The cells whose ports can be judged: there, with one number each, and of this version.
+    /// The cells whose ports can be compared: present, with one node id each, and of this version.
     sound: BTreeMap<CellId, &'a Ports>,
 }
 
@@ -295,7 +294,7 @@ impl<'a> Network<'a> {
         self.sound.get(&end.cell)?.ports.get(end.port).copied()
     }
 
-    /// Where a port leads, as far as its cell hears.
+    /// Where a port leads, if its cell receives anything there.
     fn leads(&self, end: End) -> Option<End> {
         let state = self.state(end).filter(|state| state.hears)?;
         let cell = CellId::new(state.number.into()).ok()?;
@@ -317,7 +316,7 @@ impl<'a> Network<'a> {
                 elsewhere.insert(end);
                 continue;
             }
-            // Of a cell that cannot be judged, its ends are not judged by others either.
+            // The far ends of a cell that cannot be compared are skipped too.
             let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else {
                 continue;
             };
@@ -350,7 +349,7 @@ impl<'a> Network<'a> {
     }
 }
 
-/// Whether a page says that a cell is wired to the gateway's side and uses it.
+/// Whether a page is of a cell that is wired to the gateway and uses that wire.
 pub(super) fn is_root(tree: &Tree) -> bool {
     tree.parent == Some(0) && usize::from(tree.up) == UPLINK
 }

@@ -1,4 +1,4 @@
-//! The tree that cells say they are: who is how deep, who has no way, and who goes in a circle.
+//! The tree by the reports of the cells: their depths, unreachable cells, and circles.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,11 +10,11 @@ use super::check::is_root;
 /// Where cells are in their tree.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Places {
-    /// Wires to the root of each cell that has a way: 0 is a root.
+    /// Wires from each reachable cell to its root: 0 is a root.
     pub depths: BTreeMap<CellId, u8>,
-    /// Whether each of them says the same of itself.
+    /// Whether each of them reports the same depth.
     pub agree: bool,
-    /// Cells that speak and have no way, those of circles among them.
+    /// Cells that send and have no route to a root, those of circles among them.
     pub unreachable: Vec<CellId>,
     /// Parents in a circle.
     pub circles: Vec<Vec<CellId>>,
@@ -28,7 +28,7 @@ impl Places {
     }
 }
 
-/// The places of cells, of which each is known by its number, whether it speaks, and what it says.
+/// The places of cells, given their node ids, whether they send, and their reports.
 pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Places {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
@@ -44,7 +44,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
             if route.contains(&at) {
                 let circle: Vec<_> = route.iter().copied().skip_while(|&cell| cell != at).collect();
                 if circle.iter().all(|&cell| circling.insert(cell)) {
-                    places.circles.push(from_the_least(circle));
+                    places.circles.push(from_the_smallest(circle));
                 }
                 break places.unreachable.push(node);
             }
@@ -64,7 +64,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
     places
 }
 
-fn from_the_least(mut circle: Vec<CellId>) -> Vec<CellId> {
+fn from_the_smallest(mut circle: Vec<CellId>) -> Vec<CellId> {
     let min = circle.iter().enumerate().min_by_key(|(_, cell)| **cell).map_or(0, |(place, _)| place);
     circle.rotate_left(min);
     circle
@@ -74,8 +74,8 @@ fn from_the_least(mut circle: Vec<CellId>) -> Vec<CellId> {
 mod tests {
     use super::*;
 
-    fn cell(number: i64) -> CellId {
-        CellId::new(number).unwrap()
+    fn cell(node: i64) -> CellId {
+        CellId::new(node).unwrap()
     }
 
     fn says(node: i64, parent: Option<u8>, up: u8, depth: u8) -> (CellId, bool, Option<Tree>) {
@@ -88,13 +88,13 @@ mod tests {
         let found = places(cells.into_iter());
         assert_eq!((found.deepest(), found.agree), (Some(2), true));
         assert_eq!((found.unreachable, found.circles), (vec![], vec![]));
-        // One that says another depth has old news.
+        // One that reports another depth is out of date.
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
         assert!(!places(cells.into_iter()).agree);
     }
 
     #[test]
-    fn who_has_no_parent_or_one_that_does_not_speak_or_a_circle_above_it_is_unreachable() {
+    fn a_cell_without_a_parent_or_below_a_silent_one_or_a_circle_is_unreachable() {
         let cells = [
             says(1, Some(0), 4, 0),
             says(2, None, 0, 0),

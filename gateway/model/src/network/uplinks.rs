@@ -1,9 +1,9 @@
-//! The gateway's end of the wires to the roots: where every way up ends, and numbers come from.
+//! The gateway's end of the wires to the roots: the end of all routes, and the source of node ids.
 //!
 //! ```text
-//!   message of a root ─> handle ──────┐             ┌─> poll_transmit ─> message for a root
-//!                now ──> handle_time ─┼─ [Uplinks] ─┘
-//!   number that is used ─> claimed ───┘
+//!    message of a root ─> handle ──────┐             ┌─> poll_transmit ─> message for a root
+//!                 now ──> handle_time ─┼─ [Uplinks] ─┘
+//!   node id that is used ─> claimed ───┘
 //! ```
 
 use std::collections::{BTreeSet, VecDeque};
@@ -15,9 +15,9 @@ use protocol::wire::{Hello, PortMessage, Rank, Walk};
 
 /// From one hello to the next.
 const HELLO: Span = Span::from_millis(250);
-/// A root from which nothing came for so long is not heard any more.
+/// Timeout of a root's hellos.
 const SILENT: Span = Span::from_millis(600);
-/// A walk from which nothing came back for so long is lost.
+/// Timeout of a walk.
 const LOST: Span = Span::from_millis(400);
 /// The port of the gateway's side, in its hellos.
 const PORT: u8 = 0;
@@ -31,7 +31,7 @@ struct Wire {
     is_child: bool,
 }
 
-/// A walk that gives numbers below one root.
+/// A walk that assigns node ids below one root.
 #[derive(Clone, Copy, Debug)]
 struct Walking {
     root: usize,
@@ -47,14 +47,14 @@ pub struct Uplinks {
     used: BTreeSet<u8>,
     walks: u8,
     walking: Option<Walking>,
-    /// Not before this a walk begins: who was given a number by a lost one has to claim it first.
+    /// No walk begins before this: cells with a node id of a lost walk have to claim it first.
     wait: Micros,
     next_hello: Micros,
     outbox: VecDeque<(usize, PortMessage)>,
 }
 
 impl Uplinks {
-    /// Wires to so many roots; the first walk has the number `walk`, another one than that of an earlier gateway.
+    /// Wires to so many roots; the first walk has the number `walk`, which must differ from that of an earlier gateway.
     #[must_use]
     pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
         let wire = |root| Wire { root, heard: None, is_child: false };
@@ -70,7 +70,7 @@ impl Uplinks {
         }
     }
 
-    /// A cell with this number is on the bus.
+    /// A cell with this node id is on the bus.
     pub fn claimed(&mut self, cell: CellId) {
         self.used.insert(cell.get());
     }
@@ -84,7 +84,7 @@ impl Uplinks {
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let lost = self.walking.map(|walking| walking.since + LOST);
-        let waits = Some(self.wait).filter(|_| self.walking.is_none() && self.wants_numbers().is_some());
+        let waits = Some(self.wait).filter(|_| self.walking.is_none() && self.needs_node_ids().is_some());
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
@@ -100,19 +100,19 @@ impl Uplinks {
         self.round
     }
 
-    /// Takes what a root said over its wire.
+    /// Takes a message of a root over its wire.
     pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
         let rank = Rank { round: self.round, depth: 0 };
         let Some(wire) = self.wires.get_mut(root) else { return };
         match message {
             PortMessage::Hello(hello) => {
-                let restarted = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
+                let is_new = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
                 wire.heard = Some((hello, now));
-                // Only the root knows whether a grant came, and whether it is still where an earlier gateway let it in.
+                // Only the root knows whether a grant came, and whether one of an earlier gateway is still valid.
                 wire.is_child = hello.up;
                 if hello.up && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
                     self.renew(now, hello.rank.map_or(self.round, |own| own.round));
-                } else if restarted || !hello.hears {
+                } else if is_new || !hello.hears {
                     self.hello(now, root);
                 }
             }
@@ -134,7 +134,7 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// A round later than this one begins, unless it has already.
+    /// Begins a round later than this one, unless it has begun already.
     fn renew(&mut self, now: Micros, round: u8) {
         if self.round.wrapping_sub(round).cast_signed() <= 0 {
             self.round = round.wrapping_add(1);
@@ -162,11 +162,11 @@ impl Uplinks {
         }
     }
 
-    /// Takes in that time has passed.
+    /// Handles timeouts.
     pub fn handle_time(&mut self, now: Micros) {
         if now >= self.next_hello {
-            let nack = now.since(self.next_hello).0 / HELLO.0;
-            self.next_hello = self.next_hello + Span((nack + 1) * HELLO.0);
+            let skipped = now.since(self.next_hello).0 / HELLO.0;
+            self.next_hello = self.next_hello + Span((skipped + 1) * HELLO.0);
             for wire in &mut self.wires {
                 wire.is_child &= wire.heard.is_some_and(|(_, at)| now.since(at) <= SILENT);
             }
@@ -179,39 +179,40 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// A root with a cell below it that has no number.
-    fn wants_numbers(&self) -> Option<usize> {
-        let wants = |wire: &&Wire| wire.is_child && wire.heard.is_some_and(|(hello, _)| hello.unnumbered);
-        self.wires.iter().find(wants).map(|wire| wire.root)
+    /// A root with a cell below it that has no node id.
+    fn needs_node_ids(&self) -> Option<usize> {
+        let needs = |wire: &&Wire| wire.is_child && wire.heard.is_some_and(|(hello, _)| hello.unnumbered);
+        self.wires.iter().find(needs).map(|wire| wire.root)
     }
 
-    /// Sends a walk to a root that wants one, with the first free numbers.
+    /// Sends a walk to a root that needs one, with the first free node ids.
     fn walk(&mut self, now: Micros) {
         if self.walking.is_some() || now < self.wait {
             return;
         }
-        let Some((root, (first, last))) = self.wants_numbers().zip(self.free()) else { return };
+        let Some((root, (first, last))) = self.needs_node_ids().zip(self.free()) else { return };
         self.walks = self.walks.wrapping_add(1);
         let walk = Walk { walk: self.walks, first, last };
         self.walking = Some(Walking { root, walk, since: now });
         self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
 
-    /// The first numbers in a row that nobody has.
+    /// The first range of free node ids.
     fn free(&self) -> Option<(u8, u8)> {
         let first = (1..=CellId::MAX.get()).find(|number| !self.used.contains(number))?;
         let last = (first..=CellId::MAX.get()).take_while(|number| !self.used.contains(number)).last()?;
         Some((first, last))
     }
 
-    fn end_walk(&mut self, now: Micros, root: usize, left: Walk) {
-        let Some(walking) = self.walking.filter(|it| it.root == root && it.walk.walk == left.walk) else {
+    fn end_walk(&mut self, now: Micros, root: usize, remaining: Walk) {
+        let Some(walking) = self.walking.filter(|it| it.root == root && it.walk.walk == remaining.walk)
+        else {
             return;
         };
-        self.used.extend(walking.walk.first..left.first.min(walking.walk.last.saturating_add(1)));
+        self.used.extend(walking.walk.first..remaining.first.min(walking.walk.last.saturating_add(1)));
         self.walking = None;
-        if left.first == walking.walk.first {
-            // It gave none: what it knows of those below it is not yet what they are.
+        if remaining.first == walking.walk.first {
+            // It assigned none: it does not know its children yet.
             self.wait = now + Span::from_millis(20);
         }
     }

@@ -1,4 +1,4 @@
-//! From what a scenario's file says to what it means for one skin.
+//! Checks a scenario's file against one skin.
 
 use core::f64::consts::TAU;
 use std::collections::HashMap;
@@ -146,7 +146,7 @@ fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touc
 
 fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
     if !(0.0..=MAX_FORCE_N).contains(&raw.force_n) {
-        let why = format!("0 to {MAX_FORCE_N:.3} N are possible, what three contact words can say");
+        let why = format!("0 to {MAX_FORCE_N:.3} N are possible, the range of three contact words");
         return Err(at.key("force_n").fault(raw.force_n, why));
     }
     if !(0.0..=1.0).contains(&raw.proximity) {
@@ -178,7 +178,7 @@ fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<
 }
 
 /// Whether the last of these touches, with those before it in the file, presses no cell with more than
-/// it can say. The greatest force is there when one of the touches begins.
+/// its words can hold. The force is largest when one of the touches begins.
 fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
     for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
@@ -192,7 +192,7 @@ fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
             if force > MAX_FORCE_N {
                 let why = format!(
                     "with the touches before it that makes {force} N on {}, more than the \
-                     {MAX_FORCE_N:.3} N that three contact words can say",
+                     {MAX_FORCE_N:.3} N of three contact words",
                     names.name(*cell)
                 );
                 return Err(at.fault(last.force_n, why));

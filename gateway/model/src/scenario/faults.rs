@@ -1,4 +1,4 @@
-//! From what a scenario's file says of faults to what it means.
+//! Checks the faults of a scenario's file.
 
 use protocol::document::Place;
 use protocol::time::Span;
@@ -6,8 +6,8 @@ use protocol::time::Span;
 use super::check::{Checked, EndS, Names, length};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
-const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"cut\", \"mend\"; of sensors \"stuck\", \
-     \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
+const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
+     \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// The faults, in the order of time.
 pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
@@ -38,8 +38,9 @@ impl Entry<'_> {
             "stop" => self.process(ProcessAction::Stop)?,
             "continue" => self.process(ProcessAction::Continue)?,
             "restart" => self.process(ProcessAction::Restart)?,
-            "cut" => self.wire(true, &["for_s", "one_way"])?,
-            "mend" => self.wire(false, &["one_way"])?,
+            // The second names are former ones.
+            "link_down" | "cut" => self.wire(true, &["for_s", "one_way"])?,
+            "link_up" | "mend" => self.wire(false, &["one_way"])?,
             "stuck" => self.sensor(SensorFault::Stuck, &["for_s"])?,
             "drift" => {
                 let n_per_s = self.given("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
@@ -81,7 +82,7 @@ impl Entry<'_> {
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
-    /// A cut that lasts for some time ends with a mend.
+    /// A link that is down for some time comes up again.
     fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
         let FaultKind::Wire { link_down: true, from, to, both_ways } = fault.kind else { return Ok(None) };
         if self.raw.for_s.is_none() {

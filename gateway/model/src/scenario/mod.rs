@@ -1,4 +1,4 @@
-//! The description of a run: where the robot goes, who touches it, and what breaks.
+//! The description of a run: the robot's motion, touches, and faults.
 //!
 //! A [`Scenario`] exists only when everything in its file has been checked against the skin. Every
 //! error names the line, the key, the value and what is allowed, in one line. Cells are named by their
@@ -29,22 +29,22 @@ pub struct Scenario {
     pub duration: Span,
     /// What random faults are drawn from.
     pub seed: u64,
-    /// Where the robot goes.
+    /// The motion of the robot.
     pub motion: Motion,
     /// What the gateway computes, in the order of time; before the first it compares.
     pub modes: Vec<ModeChange>,
-    /// Who touches the skin, in the file's order.
+    /// The touches, in the file's order.
     pub touches: Vec<Touch>,
-    /// What breaks, in the order of time.
+    /// The faults, in the order of time.
     pub faults: Vec<Fault>,
 }
 
-/// Where the robot goes.
+/// The motion of the robot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// Where it begins, in rad.
     pub start_rad: [f64; MAX_JOINTS],
-    /// And then.
+    /// How it moves from there.
     pub kind: MotionKind,
 }
 
@@ -92,7 +92,7 @@ pub struct Touch {
     pub length: Span,
     /// What it touches, in the skin's order.
     pub cells: Vec<usize>,
-    /// The greatest force on each of the cells, in N.
+    /// The maximum force on each of the cells, in N.
     pub force_n: f64,
     /// How the force comes and goes.
     pub profile: Profile,
@@ -125,7 +125,7 @@ impl Profile {
     }
 }
 
-/// Something breaks, or is mended.
+/// A fault, or its repair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
     /// When.
@@ -134,14 +134,14 @@ pub struct Fault {
     pub kind: FaultKind,
 }
 
-/// What breaks.
+/// What happens.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FaultKind {
     /// Something is done to the processes of cells.
     Process {
         /// What.
         action: ProcessAction,
-        /// To whom.
+        /// To which cells.
         cells: Vec<usize>,
     },
     /// Cells measure wrongly; [`Touches`] does it.
@@ -155,13 +155,13 @@ pub enum FaultKind {
     },
     /// Something is done to the wires between two cells.
     Wire {
-        /// Whether they are cut; else they work again.
+        /// Whether they stop working; else they work again.
         link_down: bool,
-        /// The cell that is not heard any more.
+        /// The sender.
         from: usize,
-        /// The cell that does not hear it.
+        /// The receiver.
         to: usize,
-        /// Whether that goes for the other way too.
+        /// Whether it applies to the other direction too.
         both_ways: bool,
     },
     /// A bus carries frames wrongly.
@@ -186,14 +186,14 @@ pub enum ProcessAction {
     Stop,
     /// `continue`: it goes on after a stop.
     Continue,
-    /// `restart`: it is started anew, ended before if need be.
+    /// `restart`: it is restarted, or started if it has ended.
     Restart,
 }
 
 /// How a cell measures wrongly.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SensorFault {
-    /// `stuck`: it goes on to say what it felt when the fault began.
+    /// `stuck`: it keeps the value from when the fault began.
     Stuck,
     /// `drift`: its contact force moves away from the true one.
     Drift {
@@ -232,7 +232,7 @@ pub enum BusFault {
         /// 0 to 1.
         probability: f64,
     },
-    /// `babble`: somebody sends frames that nobody asked for.
+    /// `babble`: an unknown sender sends frames all the time.
     Babble {
         /// How many.
         frames_per_s: f64,
@@ -260,7 +260,7 @@ impl Scenario {
             .map_err(|error: DocumentError| error.or_mistaken(text, KEYS, &[], what))
     }
 
-    /// Nobody touches the skin, nothing breaks, and the skin's controller moves the robot from zero.
+    /// No touches, no faults, and the skin's controller moves the robot from zero.
     #[must_use]
     pub const fn idle(duration: Span) -> Self {
         let motion = Motion { start_rad: [0.0; MAX_JOINTS], kind: MotionKind::Kinesthetic };

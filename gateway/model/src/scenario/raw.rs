@@ -1,4 +1,4 @@
-//! What a scenario's file says, before anybody asked whether it can be.
+//! A scenario's file as it is read, before it is checked.
 
 use serde::Deserialize;
 

@@ -93,7 +93,7 @@ fn a_good_scenario_is_read() {
 }
 
 #[test]
-fn little_needs_to_be_said() {
+fn most_keys_have_defaults() {
     let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &skin()).unwrap();
     assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
     assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
@@ -174,7 +174,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
-        "s.toml:23: touch[0].force_n = 96: 0 to 95.997 N are possible, what three contact words can say"
+        "s.toml:23: touch[0].force_n = 96: 0 to 95.997 N are possible, the range of three contact words"
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),
@@ -187,7 +187,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(
         says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
         "s.toml:30: touch[1].force_n = 94: with the touches before it that makes 97 N on cell 1 of \
-         \"vcan0\", more than the 95.997 N that three contact words can say"
+         \"vcan0\", more than the 95.997 N of three contact words"
     );
     assert_eq!(
         says("probability = 0.25", "probability = 25"),
@@ -231,7 +231,7 @@ fn with_several_buses_the_bus_must_be_named() {
     );
 }
 
-/// The force in N that the words of a cell say in an epoch.
+/// The force in N of a cell's words in an epoch.
 fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
     touches.sensors(cell, epoch).contact.iter().map(|word| word.to_f64()).sum()
 }
@@ -317,9 +317,9 @@ proptest! {
         let _ = contact_words(force_n);
     }
 
-    /// Whoever takes every change knows what every cell feels, also when epochs were skipped.
+    /// All changes together give the words of every cell, also when epochs were skipped.
     #[test]
-    fn changes_add_up_to_what_every_cell_feels(steps in proptest::collection::vec(1_u64..40, 1..60)) {
+    fn changes_add_up_to_the_words_of_every_cell(steps in proptest::collection::vec(1_u64..40, 1..60)) {
         let faults = "[[fault]]\nat_s = 2.5\nkind = \"stuck\"\nfor_s = 0.3\ncells = [1]\n\
                       [[fault]]\nat_s = 2.0\nkind = \"drift\"\nfor_s = 2.0\ncells = [3]\nn_per_s = -0.5\n";
         let scenario = Scenario::parse("s.toml", &format!("{GOOD}{faults}"), &three()).unwrap();
@@ -340,14 +340,14 @@ proptest! {
 }
 
 #[test]
-fn words_saturate_beyond_what_they_can_say() {
+fn words_saturate_outside_their_range() {
     assert_eq!(contact_words(200.0).map(|word| word.to_bits()), [i16::MAX; 3]);
     assert_eq!(contact_words(-200.0).map(|word| word.to_bits()), [i16::MIN; 3]);
     assert_eq!(contact_words(1.0).map(|word| word.to_bits()), [342, 341, 341]);
 }
 
 #[test]
-fn a_wire_is_link_down_between_two_cells_that_it_leads_between_and_repaired_in_time() {
+fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
     let cell = cell.split("[[cell]]").nth(1).unwrap();
     let described = |reply: &str, neighbors: [&str; 3]| {
@@ -369,27 +369,37 @@ fn a_wire_is_link_down_between_two_cells_that_it_leads_between_and_repaired_in_t
         kind: FaultKind::Wire { link_down, from, to, both_ways },
     };
     assert_eq!(
-        fault(&sums, "kind = \"cut\"\ncells = [3, 2]\none_way = true\nfor_s = 1.0").unwrap(),
+        fault(&sums, "kind = \"link_down\"\ncells = [3, 2]\none_way = true\nfor_s = 1.0").unwrap(),
         [wire(500_000, true, 2, 1, false), wire(1_500_000, false, 2, 1, false)]
     );
-    assert_eq!(fault(&sums, "kind = \"cut\"\ncells = [1, 2]").unwrap(), [wire(500_000, true, 0, 1, true)]);
-    assert_eq!(fault(&sums, "kind = \"mend\"\ncells = [1, 2]").unwrap(), [wire(500_000, false, 0, 1, true)]);
+    assert_eq!(
+        fault(&sums, "kind = \"link_down\"\ncells = [1, 2]").unwrap(),
+        [wire(500_000, true, 0, 1, true)]
+    );
+    assert_eq!(
+        fault(&sums, "kind = \"link_up\"\ncells = [1, 2]").unwrap(),
+        [wire(500_000, false, 0, 1, true)]
+    );
+    for names in [("link_down", "cut"), ("link_up", "mend")] {
+        let read = |kind| fault(&sums, &format!("kind = {kind:?}\ncells = [1, 2]")).unwrap();
+        assert_eq!(read(names.0), read(names.1), "former names are read too");
+    }
     let wrong = |skin, text| fault(skin, text).unwrap_err();
     assert_eq!(
-        wrong(&sums, "kind = \"cut\"\ncells = [3, 1]"),
+        wrong(&sums, "kind = \"link_down\"\ncells = [3, 1]"),
         "s.toml:6: fault[0].cells = [3, 1]: no wire is between them"
     );
     assert_eq!(
-        wrong(&sums, "kind = \"cut\"\ncells = [1]"),
+        wrong(&sums, "kind = \"link_down\"\ncells = [1]"),
         "s.toml:6: fault[0].cells = 1 cells: a wire is between two"
     );
     assert_eq!(
-        wrong(&sums, "kind = \"mend\"\nfor_s = 1.0\ncells = [1, 2]"),
-        "s.toml:6: fault[0].for_s: means nothing with kind = \"mend\""
+        wrong(&sums, "kind = \"link_up\"\nfor_s = 1.0\ncells = [1, 2]"),
+        "s.toml:6: fault[0].for_s: means nothing with kind = \"link_up\""
     );
     let torques = described("reply = \"torque\"", line);
     assert_eq!(
-        wrong(&torques, "kind = \"cut\"\ncells = [1, 2]"),
+        wrong(&torques, "kind = \"link_down\"\ncells = [1, 2]"),
         "s.toml:6: fault[0].cells: wires are used on a bus with reply = \"sum\" only"
     );
 }

@@ -1,7 +1,7 @@
-//! What every cell feels in every epoch: the touches' forces and the sensors' faults, as words.
+//! The sensor words of every cell in every epoch, from touches and sensor faults.
 //!
 //! A pure function of the scenario and the epoch: epoch 0 is the scenario's beginning, epoch k comes k
-//! broadcast periods later. What holds at that moment is what the cell feels when it hears those joints.
+//! broadcast periods later. The words at that moment are those with which the cell answers these joints.
 
 use core::f64::consts::PI;
 
@@ -13,21 +13,21 @@ use protocol::time::{Micros, Span};
 
 use super::{FaultKind, Profile, Scenario, SensorFault, Touch};
 
-/// What a cell shall feel from an epoch on.
+/// The sensor words of a cell from an epoch on.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stimulus {
     /// The cell, as an index into [`Skin::cells`].
     pub cell: usize,
     /// Its bus, as an index into [`Skin::buses`].
     pub bus: usize,
-    /// Its number there.
+    /// Its node id there.
     pub node: CellId,
-    /// What it feels.
+    /// Its sensor words.
     pub sensors: SkinSensors,
 }
 
-/// The touches of a scenario, cell by cell. A cell that nothing touches feels
-/// [`SkinSensors::default`], which is also what every cell feels before the first epoch.
+/// The touches of a scenario, cell by cell. A cell without a touch has [`SkinSensors::default`], as every cell has
+/// before the first epoch.
 #[derive(Clone, Debug)]
 pub struct Touches {
     /// From one epoch to the next, in µs.
@@ -124,7 +124,7 @@ impl Touches {
         self.cells.iter().map(|touched| touched.cell)
     }
 
-    /// What a cell feels in an epoch: for one that was started anew.
+    /// The words of a cell in an epoch: for one that has restarted.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
         match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
@@ -159,10 +159,10 @@ impl Touches {
         Some([before, now])
     }
 
-    /// What a cell says at a time, with its faults.
+    /// The words of a cell at a time, with its faults.
     fn words_at(&self, touched: &Touched, time: Micros) -> SkinSensors {
         let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
-        // A stuck sensor says what it felt when it got stuck.
+        // A stuck sensor keeps the value from when it got stuck.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
         let drift = touched.faults.iter().map(|wrong| match wrong.fault {
@@ -174,7 +174,7 @@ impl Touches {
         self.words(levels, drift.sum())
     }
 
-    /// Forces add up; the nearest thing is felt; the last touch in the file tells the temperature.
+    /// Forces add up; the nearest thing gives the proximity; the last touch in the file gives the temperature.
     fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SkinSensors {
         let mut sensors = SkinSensors::default();
         for (index, level) in levels {
@@ -213,11 +213,11 @@ impl Touch {
     }
 }
 
-/// The greatest force that three contact words can say together, in N.
+/// The maximum force of three contact words together, in N.
 pub(super) const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
 
 /// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
-/// rounded to a word's step. Beyond what three words can say they saturate.
+/// rounded to a word's step. Outside of their range they saturate.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
 pub fn contact_words(force_n: f64) -> [Q5_10; 3] {

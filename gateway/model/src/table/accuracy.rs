@@ -1,4 +1,4 @@
-//! How far distributed torques are from central ones.
+//! The errors of distributed torques against central ones.
 
 use protocol::packet::WORDS;
 use serde::ser::{Serialize, SerializeStruct, Serializer};
@@ -10,7 +10,7 @@ use super::root_totals;
 /// Epochs over which errors of sums are averaged.
 const AVERAGED: u32 = 32;
 
-/// Mean and greatest of some absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
+/// Mean and maximum of some absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
     sum: f64,
@@ -48,7 +48,7 @@ impl Errors {
         (self.count > 0).then(|| self.sum / self.count as f64)
     }
 
-    /// The greatest absolute error in Nm.
+    /// The maximum absolute error in Nm.
     #[must_use]
     pub const fn max(&self) -> f64 {
         self.max
@@ -68,12 +68,12 @@ pub struct Accuracy {
     pub single: Errors,
     /// Single cells, against the central computation on unrounded angles, lengths and poses.
     pub unquantised: Errors,
-    /// The whole skin's torque in epochs that everybody answered in time, all joints.
+    /// The whole skin's torque in epochs that all cells answered in time, all joints.
     pub whole: Errors,
     /// The whole bus' torque as sums along a tree brought it, in epochs whose sums were complete in time, over
     /// the joints that some cell in them loads.
     pub sums: Errors,
-    /// The same, each error averaged over 32 such epochs in a row in which every cell felt the same.
+    /// The same, each error averaged over 32 such epochs in a row with the same contact state of every cell.
     pub sums_averaged: Errors,
     /// Words that were left out because they were saturated.
     pub saturated: u64,
@@ -180,7 +180,7 @@ impl SumError {
         }
     }
 
-    /// The next epoch does not go on with what was.
+    /// The next epoch begins a new average.
     pub(super) const fn interrupt(&mut self) {
         (self.epochs, self.sum) = (0, [0.0; WORDS]);
     }

@@ -1,4 +1,4 @@
-//! One cell, as the gateway sees it.
+//! The gateway's state of one cell.
 
 use protocol::id::CellId;
 use protocol::message::{Answer, From, Heard, Heartbeat, SensorPage, SkinSensors, State};
@@ -9,22 +9,22 @@ use protocol::time::Micros;
 
 use super::accuracy::Errors;
 use super::held::{Change, Held};
-use super::replies::{Owed, Replies};
+use super::replies::{Outstanding, Replies};
 use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
-/// How a cell is.
+/// The status of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Status {
-    /// Never heard.
+    /// Nothing came from it yet.
     Unknown,
     /// Alive and not in contact.
     Quiet,
     /// In contact, and answered the last epoch that had time for it.
     Active,
-    /// In contact, and missed an epoch.
+    /// In contact, and did not answer an epoch.
     Stale,
     /// Silent for too long.
     Dead,
@@ -44,7 +44,7 @@ impl Status {
     }
 }
 
-/// What a cell has said since it was asked.
+/// What a cell has sent since it was requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Said {
     /// A heartbeat since the last sync.
@@ -53,10 +53,10 @@ pub struct Said {
     pub counters: bool,
 }
 
-/// Joints that a cell was sent, to be compared with those of which it says that it heard them.
+/// Joints that were sent to a cell, to be compared with the number that it reports as received.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sent {
-    /// The first page of what it heard since it started or we did.
+    /// Its first page of receive counters since it started or we did.
     first: Option<Heard>,
     /// Broadcasts since that page.
     joints: u64,
@@ -65,7 +65,7 @@ struct Sent {
 /// Whether a cell is halted.
 #[derive(Clone, Copy, Debug, Default)]
 struct Halt {
-    /// By its last heartbeat, or a command that the bus carried since.
+    /// By its last heartbeat, or a later command on the bus.
     halted: bool,
     /// Whether the bus carried a halt or a resume since its last heartbeat.
     commanded: bool,
@@ -74,40 +74,40 @@ struct Halt {
 /// One cell.
 #[derive(Debug)]
 pub struct Cell {
-    /// Its number.
+    /// Its node id.
     pub node: CellId,
     /// Its serial number, as described.
     pub serial: u32,
-    /// Whether it is wired to the gateway's side.
+    /// Whether it is wired to the gateway.
     pub root: bool,
     /// The joint that moves it, from 1.
     pub(super) joint: usize,
     /// The hash that its configuration must have.
     pub configuration: u16,
-    /// The joints that it had taken last when it said so.
+    /// The epoch of its last heartbeat.
     pub last_joints: Epoch,
-    /// What it answers joints with, as it said last since it started.
+    /// What it answers joints with, as it confirmed last since it started.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports that hear nothing because it was told so, a bit each.
+    /// Ports whose links are down by its parameter, a bit each.
     pub deaf: u8,
-    /// Replies due and come.
+    /// Replies due and received.
     pub replies: Replies,
-    /// What it told of what it feels.
+    /// Its sensors frames.
     pub sensed: Sensed,
     pub(super) tracked: Tracked,
-    /// Whether it has said a heartbeat since the last sync, and its counters since the last report.
+    /// Whether it has sent a heartbeat since the last sync, and its counters since the last report.
     pub(super) said: Said,
-    /// What it feels, as far as the bus tells.
+    /// Its contact state, as far as it is known from the bus.
     contact: Contact<()>,
-    /// What it shall be switched to, and has confirmed.
+    /// The switches that it should have, and those that it has confirmed.
     switched: Switched,
     halt: Halt,
     sent: Sent,
-    pub(super) owed: Owed,
+    pub(super) outstanding: Outstanding,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
     held: Held,
-    /// Its torque comes in sums: what it has said as a root.
+    /// Its sums as a root, where torques come in sums.
     pub(super) sums: Option<RootSums>,
 }
 
@@ -135,7 +135,7 @@ impl Cell {
             switched,
             halt: Halt::default(),
             sent: Sent::default(),
-            owed: Owed::default(),
+            outstanding: Outstanding::default(),
             answered: None,
             held: Held::default(),
             sums: summed.then(|| RootSums::new(described.root)),
@@ -148,7 +148,7 @@ impl Cell {
         self.tracked.claim().heartbeat()
     }
 
-    /// The last page of each kind that it said since it started.
+    /// The last page of each kind since it started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         self.tracked.pages()
@@ -172,29 +172,29 @@ impl Cell {
         self.tracked.account.uplink()
     }
 
-    /// What has come so far is from before, and counts for nothing.
+    /// Begins new accounts: what has come so far does not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
-        (self.replies, self.sensed, self.owed) = Default::default();
+        (self.replies, self.sensed, self.outstanding) = Default::default();
         self.sent.joints = 0;
     }
 
-    /// It has said what it heard, and so many joints passed the page on its way; the first one since a start is what
-    /// later ones are compared with.
+    /// Its receive counters came, and so many joints passed the page on its way; later pages are compared with the
+    /// first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
         if self.sent.first.is_none() {
             self.sent = Sent { first: self.pages().heard, joints: passed };
         }
     }
 
-    /// Takes its heartbeat, which was taken for this.
+    /// Takes its heartbeat, with what that means.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
-        // Of a claimant: it is not this number's cell, and may never be.
+        // Of a claimant: it does not have the node id, and may never have it.
         let Some(word) = update.word.filter(|word| *word != Word::Claimant) else { return Change::default() };
         let started = matches!(word, Word::Started { .. } | Word::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != Word::Overtaken {
-            // The first one after a halt or a resume may have been said before it.
+            // The first one after a halt or a resume may have been sent before it.
             let old = core::mem::take(&mut self.halt.commanded) && !started;
             if !old {
                 self.halt.halted = heartbeat.state.has(State::HALTED);
@@ -204,7 +204,7 @@ impl Cell {
             self.contact.reset();
         }
         if word == Word::First && self.tracked.claim().previous().is_some() {
-            // Who claimed the number before that counted something else.
+            // An earlier claimant had counters of its own.
             self.sent = Sent::default();
         }
         if started {
@@ -214,17 +214,17 @@ impl Cell {
             self.switched.restart();
             self.doubt();
             (self.reply, self.deaf) = (None, 0);
-            // It counts from zero; what we did not hear from the beginning we compare from the next page on.
+            // It counts from zero; without its first heartbeat, we compare from the next page on.
             self.sent = Sent { first: (heartbeat.sent == 0).then(Heard::default), joints: 0 };
         }
-        // Of a sum it says nothing: what is in it others may feel.
+        // It does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
             return Change::default();
         }
-        self.released()
+        self.release()
     }
 
-    /// What it has said since it was asked.
+    /// What it has sent since it was requested.
     #[must_use]
     pub const fn said(&self) -> Said {
         self.said
@@ -238,12 +238,12 @@ impl Cell {
     }
 
     /// A stimulus was sent; `last` is the epoch of the last joints.
-    pub(super) fn feel(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
+    pub(super) fn stimulate(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
 
-    /// The cell said what it feels.
-    pub(super) fn tells(&mut self, at: Micros, page: &SensorPage, events: &Events) {
+    /// A sensors frame of the cell came.
+    pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.sensed.hear(at, page, events);
         self.contact.learn(*page, ());
     }
@@ -259,34 +259,34 @@ impl Cell {
         }
     }
 
-    /// What it is to be switched to and has not confirmed.
+    /// The switches that it should have and has not confirmed.
     #[must_use]
     pub fn lacks(&self) -> [Option<Switch>; SWITCHES] {
         self.switched.lacks()
     }
 
-    /// What it feels; `None` where only the cell knows, because it measures or nobody knows whether it is on the bus.
-    pub(super) fn contact_state(&self) -> Option<SkinSensors> {
+    /// Its sensors; `None` where they are unknown, because it measures or may not be on the bus.
+    pub(super) fn sensors(&self) -> Option<SkinSensors> {
         let obeys = self.tracked.claim().says(State::TEST_MODE) && !self.tracked.account.is_interrupted();
         self.contact.skin().filter(|_| obeys).map(|(skin, ())| *skin)
     }
 
-    /// What the cell feels from the joints of this epoch on; `None` where only the cell knows.
+    /// Its sensors from the joints of this epoch on; `None` where they are unknown.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         self.contact.latch(epoch, |()| {});
-        self.contact_state()
+        self.sensors()
     }
 
-    /// A new broadcast: what was not answered in three epochs is missing, and what is held grows old.
-    /// Returns the change of the sum and how many epochs the held torque has missed.
+    /// A new broadcast: a reply that did not come in three epochs is missing, and the held torque decays.
+    /// Returns the change of the sum and for how many epochs the held torque was not renewed.
     pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
         self.sent.joints += 1;
         let due = in_contact && self.is_ready();
         if let Some(sums) = &mut self.sums {
-            self.owed.open_only(due);
+            self.outstanding.open_only(due);
             sums.open();
         } else {
-            if self.owed.open(due) {
+            if self.outstanding.open(due) {
                 self.replies.miss(1, self.tracked.is_dead());
             }
             self.replies.due += u64::from(due);
@@ -296,10 +296,10 @@ impl Cell {
         }
         let answered = self.answered.unwrap_or(number);
         let unanswered = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
-        (self.held.grow_old(unanswered, safety, self.sums.is_some()), unanswered)
+        (self.held.decay(unanswered, safety, self.sums.is_some()), unanswered)
     }
 
-    /// The last broadcast came again: the cell hears and drops it, and owes nothing for it.
+    /// The last broadcast came again: the cell receives and drops it, and no reply is due.
     pub(super) const fn hear_again(&mut self) {
         self.sent.joints += 1;
     }
@@ -309,15 +309,15 @@ impl Cell {
         self.held.contributes()
     }
 
-    /// Whether it is in contact, as it says itself where nobody else knows.
-    fn feels_something(&self) -> bool {
-        self.owed.is_due() || self.contact_state().is_none() && self.tracked.claim().says(State::ACTIVE)
+    /// Whether it is in contact, by its own report where its sensors are unknown.
+    fn is_in_contact(&self) -> bool {
+        self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().says(State::ACTIVE)
     }
 
     /// A torque answers the broadcast `number`, `lag` before the newest. Returns whether it was due.
     pub(super) const fn answer(&mut self, number: u64, lag: usize) -> bool {
         self.answered = Some(number);
-        let was_due = self.owed.answer(lag);
+        let was_due = self.outstanding.answer(lag);
         let replies = &mut self.replies;
         match (was_due, lag) {
             (true, 0) => replies.in_time += 1,
@@ -337,12 +337,12 @@ impl Cell {
         self.held.hold_sum(words, count)
     }
 
-    /// Whether what it holds is older than of the broadcast before `number`.
+    /// Whether its held torque is older than the broadcast before `number`.
     pub(super) fn is_behind(&self, number: u64) -> bool {
         self.held.is_some() && self.answered.is_some_and(|last| last + 1 < number)
     }
 
-    /// Cells that what is held is of.
+    /// Cells in the held torque.
     pub(super) fn held_cells(&self) -> u32 {
         self.held.cells()
     }
@@ -352,15 +352,15 @@ impl Cell {
         self.held.hold(words)
     }
 
-    /// Lets go of a held torque.
-    pub(super) fn released(&mut self) -> Change {
-        self.held.released()
+    /// Releases a held torque.
+    pub(super) fn release(&mut self) -> Change {
+        self.held.release()
     }
 
     /// The bus carried a halt: it stops answering.
     pub(super) fn halt(&mut self) -> Change {
         self.halt = Halt { halted: true, commanded: true };
-        self.released()
+        self.release()
     }
 
     /// The bus carried a resume: it answers the next broadcast.
@@ -368,8 +368,8 @@ impl Cell {
         self.halt = Halt { halted: false, commanded: true };
     }
 
-    /// Joints that the cell itself says it skipped because they were old, and joints that it was sent and
-    /// does not say it heard; of a cell that has reported.
+    /// Joints that the cell reports as skipped because they were old, and joints that were sent to it and that it
+    /// does not report as received; of a cell that has reported.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
         let first = self.sent.first?;
@@ -377,37 +377,36 @@ impl Cell {
         let since = |count: fn(&Heard) -> u16| count(&last).wrapping_sub(count(&first));
         let skipped = since(|heard| heard.joints_late);
         let heard = since(|heard| heard.joints).wrapping_add(since(|heard| heard.joints_repeated));
-        // The cell counts modulo 2^16, so no more can be said than that of the difference. A page may have
-        // passed some joints on the way.
+        // The cell counts modulo 2^16, so only the difference modulo 2^16 is known. A page may have passed some joints
+        // on the way.
         let [low, high, ..] = self.sent.joints.to_le_bytes();
         let unheard = u16::from_le_bytes([low, high]).wrapping_sub(heard.wrapping_add(skipped));
         Some((skipped.into(), if unheard > u16::MAX - 64 { 0 } else { unheard.into() }))
     }
 
-    /// The bus is lost: what is still due may have been said and not carried.
+    /// The bus is lost: due replies may have been sent and lost.
     pub(super) fn interrupt(&mut self) {
-        let due = self.owed.forgive();
-        // What it owes to a sum is missing there.
+        let due = self.outstanding.clear();
+        // A due contribution to a sum is missing there.
         self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
         self.tracked.account.interrupt();
         self.contact.reset();
     }
 
-    /// Nothing more will come: what is still due is missing.
+    /// Nothing more will come: outstanding replies are missing.
     pub(super) fn settle(&mut self) {
         self.tracked.account.finish();
         if self.sums.is_none() {
-            let due = self.owed.forgive();
+            let due = self.outstanding.clear();
             self.replies.miss(due, self.tracked.is_dead());
         }
     }
 
-    /// It started anew: what it still owed, it will never send; and why it owed what is missing, its
-    /// counters can no longer say.
+    /// It restarted: outstanding replies will never come, and its counters can no longer explain missing ones.
     fn doubt(&mut self) {
-        let due = self.owed.forgive();
+        let due = self.outstanding.clear();
         if self.sums.is_some() {
-            // What it owed is missing in a sum, and what its own sum held grows old.
+            // Its contribution is missing in a sum, and its own held sum decays.
             return;
         }
         self.replies.miss(due, false);
@@ -416,14 +415,14 @@ impl Cell {
     }
 
     pub(super) fn status(&self, now: Micros, newest: Option<u64>) -> Status {
-        if self.tracked.last_word().is_none() {
+        if self.tracked.last_packet().is_none() {
             return Status::Unknown;
         }
         if self.tracked.is_dead() || self.tracked.is_silent(now) {
             return Status::Dead;
         }
         match (self.answered, newest) {
-            _ if !self.held.is_some() && self.sums.is_some() && self.feels_something() => Status::Active,
+            _ if !self.held.is_some() && self.sums.is_some() && self.is_in_contact() => Status::Active,
             _ if !self.held.is_some() => Status::Quiet,
             (Some(answered), Some(newest)) if answered + 1 < newest => Status::Stale,
             _ => Status::Active,
@@ -438,7 +437,7 @@ mod tests {
     use protocol::message::{Message, NetworkPage};
 
     #[test]
-    fn a_heartbeat_that_was_said_before_a_halt_does_not_end_it() {
+    fn a_heartbeat_from_before_a_halt_does_not_end_it() {
         let skin = crate::testing::skin();
         let described = skin.cells.first().unwrap();
         let switched = Switched::new(skin.events, Default::default());
@@ -454,13 +453,13 @@ mod tests {
         assert!(cell.is_ready());
         cell.halt();
         says(&mut cell, 2, State::CONFIGURED);
-        assert!(!cell.is_ready(), "an old word");
+        assert!(!cell.is_ready(), "sent before the halt");
         says(&mut cell, 3, State::CONFIGURED);
-        assert!(cell.is_ready(), "it has not heard the halt");
+        assert!(cell.is_ready(), "it did not receive the halt");
         cell.resume();
         says(&mut cell, 4, State::CONFIGURED.with(State::HALTED, true));
-        assert!(cell.is_ready(), "an old word again");
+        assert!(cell.is_ready(), "sent before the resume");
         says(&mut cell, 5, State::CONFIGURED.with(State::HALTED, true));
-        assert!(!cell.is_ready(), "it has not heard the resume");
+        assert!(!cell.is_ready(), "it did not receive the resume");
     }
 }

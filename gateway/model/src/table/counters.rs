@@ -1,8 +1,8 @@
-//! Frames by kind, and what became of those that could not be used.
+//! Frames by kind, and why frames could not be used.
 
 use protocol::id::Kind;
 
-/// What can be odd about a frame; each has a counter and a reason that people read.
+/// What can be unusual about a frame; each has a counter and a name.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(usize)]
 pub enum Event {
@@ -12,9 +12,9 @@ pub enum Event {
     Crc,
     /// A kind, page, command or count that does not exist.
     Meaning,
-    /// A classic first half without its second.
+    /// The first segment of a classic packet without its second.
     Incomplete,
-    /// A remote frame, a 29-bit identifier, or no packet under an identifier that nobody uses.
+    /// A remote frame, a 29-bit identifier, or no packet with an unused identifier.
     Foreign,
     /// The driver's report of an error on the bus.
     ErrorFrame,
@@ -26,7 +26,7 @@ pub enum Event {
     RepeatedTorque,
     /// A torque with a saturated word; it is used.
     Saturated,
-    /// A cell heard another one under its number.
+    /// A cell received a packet of another one with its node id.
     Duplicate,
     /// Another gateway.
     OtherGateway,
@@ -56,7 +56,7 @@ impl Event {
             Self::Length => "wrong length",
             Self::Crc => "wrong CRC",
             Self::Meaning => "no meaning",
-            Self::Incomplete => "incomplete pair",
+            Self::Incomplete => "incomplete packet",
             Self::Foreign => "foreign",
             Self::ErrorFrame => "error frame",
             Self::UnknownNode => "unknown node",

@@ -1,4 +1,4 @@
-//! The joints that cells are answering: who has to, and what becomes of an epoch when the next one begins.
+//! The epoch that cells are answering: which replies are due, and how it ends when the next one begins.
 
 use protocol::fixed::Q1_14;
 use protocol::message::Joints;
@@ -30,9 +30,9 @@ pub(super) struct Broadcast {
 }
 
 impl Broadcast {
-    /// Broadcasts after those of which a cell had heard when it wrote a page; more than a few are not looked for.
+    /// Broadcasts after the last one that a cell had received when it sent a page; only a few are searched.
     pub(super) fn since(&self, heard: Epoch) -> u64 {
-        // It has heard of none, where none but these has been.
+        // It has received none, if these are all.
         let recent = || self.recent.iter().flatten().count();
         let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent());
         self.lag(heard).or_else(all).map_or(0, |passed| passed as u64)
@@ -49,14 +49,14 @@ impl Broadcast {
         (self.number, self.epoch, self.at)
     }
 
-    /// What was due and came so far counts for nothing.
+    /// What was due and came so far does not count.
     pub(super) const fn begin_accounts(&mut self) {
         (self.due, self.in_time, self.last_reply) = (0, 0, None);
     }
 }
 
 impl Table {
-    /// New joints stand on the bus: closes the epoch before, and works out who has to answer this one.
+    /// New joints are on the bus: closes the epoch before, and computes which cells have to answer this one.
     pub(super) fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
         if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
             // Repeated on the way: cells drop it.
@@ -69,7 +69,7 @@ impl Table {
             *newest = Some(epoch);
         }
         self.close_epoch();
-        self.release_what_is_over(epoch);
+        self.release_decayed(epoch);
         let frames = self.comparing.then(|| {
             let q = q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians));
             (self.central.frames(&joints.positions), self.unquantised.frames_at(&q))
@@ -82,7 +82,7 @@ impl Table {
             let force = skin.map_or(0.0, |skin| self.central.force(place, &skin));
             known &= skin.is_some() || !cell.is_ready();
             let (change, unanswered) = cell.open_epoch(number, force > 0.0, &self.safety);
-            due += u32::from(cell.owed.is_due());
+            due += u32::from(cell.outstanding.is_due());
             stale += if unanswered > 0 { cell.held_cells() } else { 0 };
             age = age.max(if cell.contributes() { unanswered } else { 0 });
             if let (Some((frames, exact)), Some(whole), Some(skin)) = (&frames, &mut whole, skin) {
@@ -90,12 +90,12 @@ impl Table {
                     let quantised = self.central.torque(place, frames, force);
                     let plain = self.unquantised.force(place, &skin);
                     let unquantised = self.unquantised.torque(place, exact, plain);
-                    cell.owed.expect(Reply { number, quantised, unquantised });
-                } else if cell.owed.is_due() {
+                    cell.outstanding.expect(Reply { number, quantised, unquantised });
+                } else if cell.outstanding.is_due() {
                     whole.add(self.central.torque(place, frames, force), cell.joint);
                 }
-                if let Some(reference_torque) = self.snapshot.reference_torque.get_mut(place) {
-                    whole.constant &= core::mem::replace(reference_torque, skin) == skin;
+                if let Some(sensors) = self.snapshot.sensors.get_mut(place) {
+                    whole.constant &= core::mem::replace(sensors, skin) == skin;
                 }
             }
             self.apply(change);
@@ -126,14 +126,14 @@ impl Table {
         }
     }
 
-    /// What the loop has let go while the bus carried no joints does not come back with the next ones that it carries.
-    fn release_what_is_over(&mut self, epoch: Epoch) {
+    /// Releases torques that have decayed in the loop while no joints were on the bus, so that they do not come back.
+    fn release_decayed(&mut self, epoch: Epoch) {
         // Broadcasts may change places on the way back: the newest is not always the last that came.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
         let gap = recent.map(|before| epoch.since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
-            self.each_cell(Cell::released);
+            self.each_cell(Cell::release);
         }
     }
 }

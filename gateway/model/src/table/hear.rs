@@ -1,4 +1,4 @@
-//! What the bus carries, and what follows from it.
+//! Frames on the bus, and their effects on the table.
 
 use protocol::fixed::Q;
 use protocol::id::{Id, Node};
@@ -13,12 +13,12 @@ use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, Word};
 
 impl Table {
-    /// A frame of this gateway's, as it stood on the bus.
+    /// A frame of this gateway, read back from the bus.
     pub(super) fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
         if let Message::Joints { epoch, joints } = *message {
             self.open_epoch(at, epoch, &joints, positions(epoch));
         } else if let Message::Stimulus { to, from, page } = *message {
-            self.feel(to, from, page);
+            self.stimulate(to, from, page);
         } else if *message == Message::Halt {
             self.each_cell(Cell::halt);
         } else if *message == Message::Sync {
@@ -28,9 +28,9 @@ impl Table {
         }
     }
 
-    /// A frame of somebody else's.
+    /// A frame of another sender.
     pub(super) fn hear(&mut self, at: Micros, id: Id, message: &Message) {
-        // What the gateway's side sends may also come from somebody at a shell.
+        // Messages of a gateway may also come from a command line.
         match *message {
             Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
                 self.counters.count(Event::OtherGateway);
@@ -45,7 +45,7 @@ impl Table {
                 self.snapshot.sums.resumes += 1;
                 self.cells.iter_mut().for_each(Cell::resume);
             }
-            Message::Stimulus { to, from, page } => self.feel(to, from, page),
+            Message::Stimulus { to, from, page } => self.stimulate(to, from, page),
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
             | Message::Torque { .. }
@@ -55,10 +55,10 @@ impl Table {
         }
     }
 
-    fn feel(&mut self, to: Node, from: From, page: SensorPage) {
+    fn stimulate(&mut self, to: Node, from: From, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
         for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
-            cell.feel(from, page, last);
+            cell.stimulate(from, page, last);
         }
     }
 
@@ -89,7 +89,7 @@ impl Table {
                 NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
             }
         } else if let Message::Sensors { page, .. } = *message {
-            cell.tells(at, &page, &self.events);
+            cell.take_sensors(at, &page, &self.events);
         } else if let Message::Configured { answer, .. } = *message {
             cell.answers(&answer);
         } else if let Message::Torque { epoch, torque, .. } = *message {
@@ -111,8 +111,8 @@ impl Table {
         if update.returned {
             self.notices.push_back(Notice::Returned(cell.node));
         }
-        let released = cell.take_heartbeat(update, heartbeat, epoch);
-        self.apply(released);
+        let change = cell.take_heartbeat(update, heartbeat, epoch);
+        self.apply(change);
     }
 
     fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
@@ -143,8 +143,8 @@ impl Table {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(was_due);
         }
-        if let Some(expected) = cell.owed.expected(number) {
-            let error = self.accuracy.compare(cell.joint, &words, &expected, &mut cell.owed.errors);
+        if let Some(expected) = cell.outstanding.expected(number) {
+            let error = self.accuracy.compare(cell.joint, &words, &expected, &mut cell.outstanding.errors);
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;
@@ -166,13 +166,13 @@ impl Table {
         };
         let found = self.broadcast.as_mut().and_then(|broadcast| {
             let lag = broadcast.lag(epoch)?;
-            Some((lag, sums.said.get_mut(lag)?, broadcast))
+            Some((lag, sums.epochs.get_mut(lag)?, broadcast))
         });
-        let Some((lag, said, broadcast)) = found else {
+        let Some((lag, best, broadcast)) = found else {
             root_totals.counts.stale += 1;
             return;
         };
-        if root_totals.take(lag, said, sum) == Taken::Resent {
+        if root_totals.take(lag, best, sum) == Taken::Resent {
             return;
         }
         if lag == 0 {
@@ -185,14 +185,14 @@ impl Table {
         // Q7.8 in steps of Q3.12, of which the running sum is made.
         let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
         self.apply(change);
-        self.release_what_moved(number);
+        self.release_moved(number);
     }
 
-    /// Cells whose root fell silent find another one: then they are in its sum and not in what was held.
-    fn release_what_moved(&mut self, number: u64) {
+    /// Releases the held sum of a silent root when its cells are in another root's sum.
+    fn release_moved(&mut self, number: u64) {
         let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
         if self.snapshot.sums.contributing > due {
-            self.each_cell(|cell| if cell.is_behind(number) { cell.released() } else { Change::default() });
+            self.each_cell(|cell| if cell.is_behind(number) { cell.release() } else { Change::default() });
         }
     }
 }

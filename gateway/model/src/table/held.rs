@@ -13,7 +13,7 @@ pub(super) struct Change {
 /// What is held of a cell.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Held {
-    /// The last torque, in steps of Q3.12, and the cells that it is of: of a root, those in its sum.
+    /// The last torque, in steps of Q3.12, and its number of cells: of a root, those in its sum.
     torque: Option<([i32; WORDS], u8)>,
     /// What of it is in the running sum.
     contribution: [i32; WORDS],
@@ -30,23 +30,23 @@ impl Held {
 
     /// The same of a sum of so many cells; one of no cell ends all contacts.
     pub(super) fn hold_sum(&mut self, words: [i32; WORDS], count: u8) -> Change {
-        // Of what some cells feel, all words may be rounded to 0.
+        // Even with cells in contact all words may be rounded to 0.
         self.torque = (count > 0).then_some((words, count));
         self.contribute(words, count)
     }
 
-    /// Lets go of it.
-    pub(super) fn released(&mut self) -> Change {
+    /// Releases it.
+    pub(super) fn release(&mut self) -> Change {
         self.torque = None;
         self.contribute([0; WORDS], 0)
     }
 
-    /// What is held has missed so many epochs, and grows old.
-    pub(super) fn grow_old(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
+    /// Holds or decays it after so many unanswered epochs.
+    pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
         let Some((held, cells)) = self.torque else { return Change::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
-            // Nothing of it counts any more; yet the cell has not said that its contact is over.
+            // Its contribution has decayed to zero; yet the cell has not reported the end of its contact.
             return self.contribute([0; WORDS], 0);
         }
         let decay = safety.decay_epochs.max(1);
@@ -67,7 +67,7 @@ impl Held {
         Change { torque, contributing: i32::from(cells) - i32::from(counted) }
     }
 
-    /// Cells that what is held is of; none when nothing is held.
+    /// Cells in the held torque; none when nothing is held.
     pub(super) fn cells(&self) -> u32 {
         self.torque.map_or(0, |(_, cells)| cells.into())
     }

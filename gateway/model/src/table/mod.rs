@@ -1,12 +1,12 @@
-//! What a gateway knows of one bus: the latest of every cell, and the running sum of their torques.
+//! A gateway's state of one bus: the latest of every cell, and the running sum of their torques.
 //!
 //! ```text
-//!   frame, time, own ─> handle_frame ─┐           ┌─> Snapshot (what a tick needs, whatever the cells' number)
-//!               time ─> handle_time ──┴─ [Table] ─┴─> counters, ledgers, accuracy (what the end's table needs)
+//!   frame, time, own ─> handle_frame ─┐           ┌─> Snapshot (for a tick; of constant size)
+//!               time ─> handle_time ──┴─ [Table] ─┴─> counters, accounts, accuracy (for the table at the end)
 //! ```
 //!
-//! Own frames are read back from the bus: the joints that open an epoch do so where they stand among the
-//! others' frames, with the kernel's time stamp. Every frame costs bounded work; a new epoch and the
+//! Own frames are read back from the bus: joints open an epoch at their place among the other frames, with the
+//! kernel's time stamp. Every frame costs bounded work; a new epoch and the
 //! passing of time cost work for each cell, but in the thread that receives, not in the tick.
 
 mod accuracy;
@@ -51,66 +51,66 @@ pub use switched::{SWITCHES, Switch};
 
 pub use crate::tracker::Uplink;
 
-/// What a tick needs to know of a bus: the same few words whatever the cells' number.
+/// What a tick needs to know of a bus: of the same size for any number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sums {
     /// The sum of all held torques in Nm.
     pub torque: [f64; WORDS],
     /// Cells in it.
     pub contributing: u32,
-    /// Epochs that the oldest of them has missed.
+    /// Unanswered epochs of the oldest of them.
     pub age: u32,
-    /// Cells in contact that missed the last epoch.
+    /// Cells in contact that did not answer the last epoch.
     pub stale: u32,
-    /// Cells that have fallen silent.
+    /// Silent cells.
     pub dead: u32,
     /// The last broadcast of this gateway that was read back from the bus.
     pub read_back: Option<Epoch>,
-    /// Halts heard that this gateway did not send.
+    /// Halts on the bus that this gateway did not send.
     pub halts: u32,
-    /// Resumes heard that this gateway did not send.
+    /// Resumes on the bus that this gateway did not send.
     pub resumes: u32,
     /// Frames of another gateway.
     pub other_gateways: u32,
 }
 
-/// What a receiver leaves for the loop: the sums, and what a central computation beside them needs.
+/// What a receiver provides for the loop: the sums, and the input of a central computation.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
     /// What a tick needs.
     pub sums: Sums,
-    /// What each cell feels, in the order of the bus' cells; only kept up to date while comparing.
-    pub reference_torque: Vec<SkinSensors>,
+    /// The sensors of each cell, in the order of the bus' cells; only kept up to date while comparing.
+    pub sensors: Vec<SkinSensors>,
 }
 
 impl Snapshot {
-    /// Takes over another one without allocating; what cells feel only if `reference_torque`.
-    pub fn take(&mut self, other: &Self, reference_torque: bool) {
+    /// Takes over another one without allocating; the sensors only if `sensors`.
+    pub fn take(&mut self, other: &Self, sensors: bool) {
         self.sums = other.sums;
-        if reference_torque {
-            self.reference_torque.clone_from(&other.reference_torque);
+        if sensors {
+            self.sensors.clone_from(&other.sensors);
         }
     }
 }
 
-/// Something that people should know at once.
+/// An event to be reported at once.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Notice {
-    /// A cell has fallen silent.
+    /// A cell is silent.
     Dead(CellId),
-    /// A cell that was thought dead speaks again.
+    /// A dead cell sends again.
     Back(CellId),
-    /// A cell started anew: nothing touches it until it is told so again.
+    /// A cell restarted: it is not in contact until its stimuli are sent again.
     Restarted(CellId),
-    /// A cell heard another one under its number.
+    /// A cell received a packet of another one with its node id.
     Duplicate(CellId),
-    /// A cell is heard for the first time since its bus was lost: nobody knows what it has not heard.
+    /// The first heartbeat of a cell since its bus was lost: it is not known which frames it has lost.
     Returned(CellId),
-    /// Another gateway speaks on this bus.
+    /// Another gateway sends on this bus.
     OtherGateway,
 }
 
-/// All that is known of one bus.
+/// The state of one bus.
 #[derive(Debug)]
 pub struct Table {
     format: Format,
@@ -130,7 +130,7 @@ pub struct Table {
     unknown_nodes: BTreeMap<CellId, Heartbeat>,
     /// The bus was lost since the last broadcast.
     interrupted: bool,
-    /// Twice, four times ... a torque is a whole number of these, so that the sum never drifts.
+    /// In whole steps, so that the sum never drifts.
     sum: [i64; WORDS],
     snapshot: Snapshot,
     counters: Counters,
@@ -140,7 +140,7 @@ pub struct Table {
 }
 
 impl Table {
-    /// Nothing heard yet on one of a skin's buses.
+    /// The table of one of a skin's buses, before any frame.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
         let part = skin.part_on(bus);
@@ -155,8 +155,7 @@ impl Table {
             let switched = Switched::new(skin.events, sensing);
             cells.push(Cell::new(described, &part.parameters(described), summed, switched));
         }
-        let snapshot =
-            Snapshot { sums: Sums::default(), reference_torque: vec![SkinSensors::default(); cells.len()] };
+        let snapshot = Snapshot { sums: Sums::default(), sensors: vec![SkinSensors::default(); cells.len()] };
         Self {
             format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
             safety: skin.safety,
@@ -180,19 +179,19 @@ impl Table {
         }
     }
 
-    /// Only the sums of roots are taken from the bus: others' packets then cannot be counted one by one.
+    /// Only the sums of roots are received: sums of other cells then cannot be counted one by one.
     pub fn hear_sums_of_roots_only(&mut self) {
         self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.without_sums());
     }
 
-    /// Whether the sums of a root are for the gateway. When they are not any more they come in another one's: what was
-    /// held of it would count twice.
+    /// Whether the sums of a root are for the gateway. If not, they are in another root's sum, and the held one is
+    /// released so that it does not count twice.
     pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
         let Some(cell) = self.cell_mut(root) else { return };
         let Some(sums) = &mut cell.sums else { return };
         sums.feeds = feeds;
         if !feeds {
-            let change = cell.released();
+            let change = cell.release();
             self.apply(change);
         }
     }
@@ -220,7 +219,7 @@ impl Table {
         &self.cells
     }
 
-    /// Frames by kind and what became of them.
+    /// Frames by kind and event.
     #[must_use]
     pub const fn counters(&self) -> &Counters {
         &self.counters
@@ -239,19 +238,19 @@ impl Table {
         }
     }
 
-    /// What became of sums, and of the cells that were to be in them; `None` where cells answer themselves.
+    /// Counts of sums, and of the cells due in them; `None` where cells answer with torques.
     #[must_use]
     pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
         self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
-    /// How often parents of cells changed, by the cells' own count.
+    /// How often parents of cells changed, by the cells' own counters.
     #[must_use]
     pub fn parent_changes(&self) -> u64 {
         self.cells.iter().filter_map(|cell| cell.pages().ports).map(|ports| u64::from(ports.changes)).sum()
     }
 
-    /// Nodes that speak and that the skin does not have, each with its last heartbeat.
+    /// Nodes that send and that the skin does not have, each with its last heartbeat.
     pub fn unknown_nodes(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
         self.unknown_nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
@@ -262,12 +261,12 @@ impl Table {
         &self.last_reply
     }
 
-    /// What people should know, oldest first, each once.
+    /// The notices, oldest first, each once.
     pub fn notices(&mut self) -> impl Iterator<Item = Notice> {
         self.notices.drain(..)
     }
 
-    /// Takes a frame that stood on the bus at `at`; `own` if this gateway sent it. `positions` is asked for
+    /// Takes a frame that was on the bus at `at`; `own` if this gateway sent it. `positions` is asked for
     /// the positions in rad that an own broadcast's words were rounded from, if they are known.
     pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
         let Ok(id) = packet::data_id(frame) else {
@@ -291,7 +290,7 @@ impl Table {
         }
     }
 
-    /// The packet that a frame is or completes; `None` for half of one.
+    /// The packet that a frame is or completes; `None` for a segment.
     fn packet(&mut self, at: Micros, id: Id, frame: &Frame) -> Result<Option<Packet>, Event> {
         let event = |error| match error {
             PacketError::Length { .. } => Event::Length,
@@ -310,7 +309,7 @@ impl Table {
         let waited = segment.is_waiting();
         match segment.push(at, id, frame.data()).map_err(event)? {
             Reassembly::Complete(packet) => Ok(Some(packet)),
-            // Foreign frames are counted each, and not as packets that have lost a half.
+            // Foreign frames are counted each, and not as incomplete packets.
             Reassembly::Waiting | Reassembly::Incomplete if waited && !is_used => Err(Event::Foreign),
             Reassembly::Waiting => Ok(None),
             Reassembly::Incomplete => Err(Event::Incomplete),
@@ -347,7 +346,7 @@ impl Table {
         self.cells.get_mut(place)
     }
 
-    /// What was taken so far is from before: it says what holds, and counts for nothing.
+    /// Begins new accounts: what came so far gives the state, and does not count.
     pub fn begin_accounts(&mut self) {
         self.cells.iter_mut().for_each(Cell::begin_accounts);
         if let Some(broadcast) = &mut self.broadcast {
@@ -361,26 +360,26 @@ impl Table {
         self.notices.clear();
     }
 
-    /// The bus is lost: what was on its way is in doubt. The torques stay as they are, and the loop lets them go.
+    /// The bus is lost: packets on their way are in doubt. The torques stay as they are, and decay in the loop.
     pub fn interrupt(&mut self) {
         self.interrupted = true;
         self.cells.iter_mut().for_each(Cell::interrupt);
     }
 
-    /// Lets time pass: who has been silent for too long is dead.
+    /// Handles timeouts: cells that were silent for too long are dead.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             if cell.tracked.falls_silent(now) {
                 self.snapshot.sums.dead += 1;
                 self.notices.push_back(Notice::Dead(cell.node));
-                let change = cell.released();
+                let change = cell.release();
                 self.apply(change);
             }
         }
     }
 
-    /// No more broadcasts follow: closes the last epoch and settles who never answered.
+    /// No more broadcasts follow: closes the last epoch and the accounts.
     pub fn finish(&mut self) {
         self.close_epoch();
         self.broadcast = None;
@@ -412,7 +411,7 @@ impl Table {
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
     }
 
-    /// What is known of the network's cells, in the skin's order, and of those that it does not describe.
+    /// The network's cells, in the skin's order, and those that it does not describe.
     pub fn network(&self, now: Micros) -> impl Iterator<Item = Seen> {
         let described = self.statuses(now).map(|(cell, status)| Seen {
             node: cell.node,
@@ -441,9 +440,9 @@ impl Table {
         self.broadcast.as_ref().map(Broadcast::joints)
     }
 
-    /// What each cell has felt since those joints, as far as anybody knows, and its status now.
-    pub fn reference_torque(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
-        self.statuses(now).map(|(cell, status)| (cell.contact_state(), status))
+    /// The sensors of each cell since those joints, as far as they are known, and its status now.
+    pub fn sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
+        self.statuses(now).map(|(cell, status)| (cell.sensors(), status))
     }
 
     /// The cells' statuses now.

@@ -1,4 +1,4 @@
-//! Replies due against replies that came.
+//! Replies due, compared with replies that came.
 
 use derive_more::{Add, Sum};
 use protocol::packet::WORDS;
@@ -8,10 +8,10 @@ use crate::tracker::LATEST;
 
 /// Replies of one cell: due = in time + late + missing.
 ///
-/// A reply is due when the cell is configured, awake, and feels a force by Algorithm 1.
+/// A reply is due when the cell is configured, awake, and in contact by Algorithm 1.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
 pub struct Replies {
-    /// Epochs that the cell had to answer.
+    /// Epochs with a due reply.
     pub due: u64,
     /// Answered before the next broadcast.
     pub in_time: u64,
@@ -19,9 +19,9 @@ pub struct Replies {
     pub late: u64,
     /// Not answered.
     pub missing: u64,
-    /// Of the missing ones, those of a cell that was dead or started anew, or whose bus was lost.
+    /// Of the missing ones, those of a cell that was dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
-    /// Torques that nobody was waiting for: ends of contacts, and cells whose sensors are unknown.
+    /// Torques that were not due: ends of contacts, and cells whose sensors are unknown.
     pub unasked: u64,
     /// Torques that came when their epoch, or a later one of the same cell, was over, and were dropped.
     pub too_late: u64,
@@ -48,9 +48,9 @@ pub(super) struct Expected {
     pub(super) unquantised: [f64; WORDS],
 }
 
-/// What a cell owes for the newest epochs.
+/// The outstanding replies of a cell for the newest epochs.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Owed {
+pub(super) struct Outstanding {
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
     due: u8,
     expected: [Option<Expected>; LATEST + 1],
@@ -58,7 +58,7 @@ pub(super) struct Owed {
     pub(super) errors: Errors,
 }
 
-impl Owed {
+impl Outstanding {
     /// A new broadcast, to be answered if `due`; whether the oldest one was not answered and no longer can be.
     pub(super) fn open(&mut self, due: bool) -> bool {
         let oldest = 1 << LATEST;
@@ -84,8 +84,8 @@ impl Owed {
         was_due
     }
 
-    /// Nothing is owed any more; how many answers were.
-    pub(super) const fn forgive(&mut self) -> u32 {
+    /// Clears the outstanding replies; how many there were.
+    pub(super) const fn clear(&mut self) -> u32 {
         let due = self.due.count_ones();
         self.due = 0;
         due

@@ -1,4 +1,4 @@
-//! Sums along the cells' tree: what the roots say in each epoch, and what should come of it.
+//! Sums along the cells' tree: the roots' sums of each epoch, compared with what is expected.
 
 use protocol::packet::WORDS;
 use serde::Serialize;
@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::accuracy::SumError;
 use crate::tracker::LATEST;
 
-/// What became of sums.
+/// Counts of sums.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct SumCounts {
     /// Sums that came, of all cells.
@@ -23,8 +23,8 @@ pub struct SumCounts {
 
 /// Cells that are to be in an epoch's sums: due = in time + late + missing.
 ///
-/// Due are the cells that feel a force by Algorithm 1 and can be expected to answer. A cell that only passes on
-/// what others feel is not.
+/// Due are the cells that are in contact by Algorithm 1 and can be expected to answer, but no cell that only forwards
+/// the sums of others.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Contributions {
     /// Cells that were to be in it, all epochs together.
@@ -35,7 +35,7 @@ pub struct Contributions {
     pub late: u64,
     /// Never in it.
     pub missing: u64,
-    /// In it and not due: cells whose sensors nobody knows.
+    /// In it and not due: cells whose sensors are unknown.
     pub unasked: u64,
 }
 
@@ -54,24 +54,24 @@ impl Sum {
     }
 }
 
-/// What a cell has said as a root.
+/// The sums of a root.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RootSums {
     /// Whether its sums are for the gateway; else another cell takes them.
     pub(super) feeds: bool,
-    /// For the newest epochs.
-    pub(super) said: [Option<Sum>; LATEST + 1],
+    /// The best one of each of the newest epochs.
+    pub(super) epochs: [Option<Sum>; LATEST + 1],
 }
 
 impl RootSums {
     pub(super) const fn new(feeds: bool) -> Self {
-        Self { feeds, said: [None; LATEST + 1] }
+        Self { feeds, epochs: [None; LATEST + 1] }
     }
 
     /// A new epoch.
     pub(super) fn open(&mut self) {
-        self.said.rotate_right(1);
-        if let Some(newest) = self.said.first_mut() {
+        self.epochs.rotate_right(1);
+        if let Some(newest) = self.epochs.first_mut() {
             *newest = None;
         }
     }
@@ -81,7 +81,7 @@ impl RootSums {
 #[derive(Clone, Copy, Debug)]
 struct Open {
     due: u32,
-    /// Nobody else can be in it.
+    /// No other cell can be in it.
     known: bool,
     came: u32,
     /// What had come before the next joints.
@@ -92,19 +92,19 @@ struct Open {
     expected: Option<Expected>,
 }
 
-/// What should come, in Nm, by the central computation.
+/// What is expected, in Nm, by the central computation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Expected {
     /// The whole bus' torque.
     pub(super) torque: [f64; WORDS],
     /// Joints that some cell of it loads, from the first.
     pub(super) joints: usize,
-    /// Every cell feels what it felt in the epoch before.
+    /// Every cell has the same sensors as in the epoch before.
     pub(super) constant: bool,
 }
 
 impl Expected {
-    /// Adds what a cell on this joint makes.
+    /// Adds the torque of a cell on this joint.
     pub(super) fn add(&mut self, torque: [f64; WORDS], joint: usize) {
         for (sum, torque) in self.torque.iter_mut().zip(torque) {
             *sum += torque;
@@ -123,7 +123,7 @@ pub(super) struct RootTotals {
     pub(super) error: SumError,
 }
 
-/// What became of one sum.
+/// How one sum was taken.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Taken {
     /// It is the root's best for its epoch.
@@ -133,9 +133,9 @@ pub(super) enum Taken {
 }
 
 impl RootTotals {
-    /// Takes a root's sum for the epoch `lag` before the newest; `said` is what it has said for it so far.
-    pub(super) fn take(&mut self, lag: usize, said: &mut Option<Sum>, sum: Sum) -> Taken {
-        let before = *said;
+    /// Takes a root's sum for the epoch `lag` before the newest; `best` is its best one for that epoch so far.
+    pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> Taken {
+        let before = *best;
         match before {
             Some(_) => self.counts.resent += 1,
             None => self.counts.first += 1,
@@ -143,7 +143,7 @@ impl RootTotals {
         if before.is_some_and(|before| sum.count <= before.count) {
             return Taken::Resent;
         }
-        *said = Some(sum);
+        *best = Some(sum);
         if let Some(Some(open)) = self.epochs.get_mut(lag) {
             let (count, words) = before.map_or((0, [0; WORDS]), |before| (before.count, before.words));
             open.came += u32::from(sum.count) - u32::from(count);
@@ -155,12 +155,12 @@ impl RootTotals {
         Taken::Best
     }
 
-    /// Cells that are to be in the newest epoch's sum; `None` where of some only they themselves know.
+    /// Cells due in the newest epoch's sum; `None` where the sensors of some are unknown.
     pub(super) fn due(&self) -> Option<u32> {
         self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
     }
 
-    /// New joints: `due` cells are to be in their sum, and nobody else if that is `known`. What was open for longest is settled.
+    /// New joints: `due` cells should be in their sum, and no others if `known`. Settles the oldest epoch.
     pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {

@@ -1,6 +1,6 @@
-//! What a cell tells of what it feels: how often, and which touches and releases are in it.
+//! Sensors frames of a cell: their rate, and the touches and releases in them.
 //!
-//! Nothing here reaches the torques that the table expects: those follow from stimuli.
+//! Nothing here affects the torques that the table expects: those follow from stimuli.
 
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
@@ -12,9 +12,9 @@ use protocol::touch::{Touch, contact};
 pub struct Sensed {
     /// How many came.
     pub frames: u64,
-    /// Touches told: contact came to its threshold.
+    /// Touches: contact rose to its threshold.
     pub touches: u64,
-    /// Releases told: contact fell below what hysteresis leaves of it.
+    /// Releases: contact fell below the threshold less hysteresis.
     pub releases: u64,
     contact: Touch,
     /// When the first and the last came.
@@ -34,7 +34,7 @@ impl Sensed {
         self.releases += u64::from(before == Touch::Touched && self.contact != Touch::Touched);
     }
 
-    /// The cell started anew: nothing touches it, and nobody saw a release.
+    /// The cell restarted: it is not in contact, and no release is counted.
     pub(super) const fn restart(&mut self) {
         self.contact = Touch::Free;
     }
@@ -55,7 +55,7 @@ mod tests {
     use protocol::fixed::{Q3_12, Q5_10};
     use protocol::message::SkinSensors;
 
-    fn told(steps: &[i16]) -> Sensed {
+    fn sensed(steps: &[i16]) -> Sensed {
         let mut sensed = Sensed::default();
         for (&bits, ms) in steps.iter().zip(0..) {
             let contact = [Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO];
@@ -66,18 +66,18 @@ mod tests {
     }
 
     #[test]
-    fn touches_and_releases_are_turns_and_no_counts_of_frames() {
-        let sensed = told(&[0, 101, 102, 300, 60, 51, 50, 30, 0, 200, 0]);
+    fn touches_and_releases_are_edges_and_not_frames() {
+        let sensed = sensed(&[0, 101, 102, 300, 60, 51, 50, 30, 0, 200, 0]);
         assert_eq!((sensed.touches, sensed.releases, sensed.frames), (2, 2, 11));
-        let mut sensed = told(&[500]);
+        let mut sensed = sensed(&[500]);
         sensed.restart();
-        assert_eq!((sensed.touches, sensed.releases), (1, 0), "nobody saw it let go");
+        assert_eq!((sensed.touches, sensed.releases), (1, 0), "no release was reported");
     }
 
     #[test]
     fn a_rate_needs_two_frames_and_pages_of_either_kind_count() {
-        assert_eq!(told(&[]).rate_hz(), None);
-        let mut sensed = told(&[0]);
+        assert_eq!(sensed(&[]).rate_hz(), None);
+        let mut sensed = sensed(&[0]);
         assert_eq!(sensed.rate_hz(), None);
         sensed.hear(Micros(4_000), &SensorPage::Acceleration([Q3_12::ZERO; 3]), &Events::default());
         assert!(sensed.rate_hz().is_some_and(|hz| (hz - 250.0).abs() < 1e-9));

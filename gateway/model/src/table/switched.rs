@@ -1,13 +1,13 @@
-//! What a cell shall be switched to and forgets when it starts anew: events and sensing, parameters 8 and 7.
+//! Switches of a cell, which a restart resets: events and sensing, parameters 8 and 7.
 //!
-//! What it should be is what the skin says, until the cell confirms something else, which somebody at a shell
-//! asked for. What it has not confirmed it is told until it does.
+//! Their target is the skin's, until the cell confirms another value, which was written from a command line. They
+//! are written to the cell until it confirms them.
 
 use protocol::message::Answer;
 use protocol::packet::WORDS;
 use protocol::parameters::{Events, Parameter, Sensing};
 
-/// A parameter's number and the words that it shall have.
+/// A parameter's number and its target words.
 pub type Switch = (u8, [i16; WORDS]);
 
 /// How many there are.
@@ -21,7 +21,7 @@ pub(super) struct Switched {
 }
 
 impl Switched {
-    /// A cell that has just started, and shall be as a skin says.
+    /// A cell that has just started, with the skin's targets.
     pub(super) fn new(events: Events, sensing: Sensing) -> Self {
         let target =
             [(Parameter::Events.number(), events.words()), (Parameter::Sensing.number(), sensing.words())];
@@ -30,7 +30,7 @@ impl Switched {
         switched
     }
 
-    /// The cell started anew: it is as every cell is at its start.
+    /// The cell restarted: its switches are as at every start.
     pub(super) fn restart(&mut self) {
         let start = [Events::default().words(), Sensing::default().words()];
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
@@ -38,7 +38,7 @@ impl Switched {
         }
     }
 
-    /// The cell answered a write. What it refuses it is not told again.
+    /// The cell answered a write. A refused one is not repeated.
     pub(super) fn answered(&mut self, answer: &Answer) {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
@@ -52,7 +52,7 @@ impl Switched {
         }
     }
 
-    /// What it is to be told.
+    /// What is to be written to it.
     pub(super) fn lacks(&self) -> [Option<Switch>; SWITCHES] {
         let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_is_told_what_differs_from_its_start_until_it_confirms() {
+    fn a_cell_lacks_what_differs_from_its_start_until_it_confirms() {
         let plain = Switched::new(Events::default(), Sensing::Off);
         assert_eq!(lacks(&plain), [0_u8; 0]);
         let finer = Events { contact: protocol::fixed::Q5_10::from_bits(5), ..Events::default() };
@@ -85,13 +85,13 @@ mod tests {
         switched.answered(&Answer::Value { number, written: true, words });
         assert_eq!(lacks(&switched), [8]);
         switched.answered(&Answer::Refused { number: 8, reason: Answer::UNKNOWN });
-        assert_eq!(lacks(&switched), [0_u8; 0], "it does not know it");
+        assert_eq!(lacks(&switched), [0_u8; 0], "an unknown parameter");
         switched.restart();
         assert_eq!(lacks(&switched), [8, MODE]);
     }
 
     #[test]
-    fn what_somebody_else_switched_it_to_is_what_it_gets_back() {
+    fn another_confirmed_value_becomes_the_target() {
         let mut switched = Switched::new(Events::default(), Sensing::Off);
         let words = Sensing::Continuous { period_ms: 16 }.words();
         switched.answered(&Answer::Value { number: MODE, written: true, words });

@@ -4,7 +4,7 @@ use super::*;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Heard, Joints, NetworkPage, SensorPage, State};
 
-/// A table that heard these, in the frames of the bus, the gateway's own or a cell's.
+/// A table that received these, in the frames of the bus, the gateway's own or a cell's.
 fn table(heard: &[(bool, Message)]) -> Table {
     let mut table = Table::new(&crate::testing::skin(), 0);
     for (own, message) in heard {
@@ -17,7 +17,7 @@ fn table(heard: &[(bool, Message)]) -> Table {
 }
 
 #[test]
-fn what_is_no_packet_is_rejected_under_a_cells_identifier_and_foreign_under_one_that_nobody_uses() {
+fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unused_one() {
     let mut skin = crate::testing::skin();
     for format in [Format::Fd, Format::Classic] {
         skin.buses[0].format = format;
@@ -36,7 +36,7 @@ fn what_is_no_packet_is_rejected_under_a_cells_identifier_and_foreign_under_one_
         }
         let of = |event| table.counters().events(event);
         let events = [Event::Foreign, Event::Crc, Event::Incomplete].map(of);
-        // Halves: eight of nine were dropped under each; a packet that has lost one is counted once.
+        // Segments: eight of nine were dropped of each; an incomplete packet is counted once.
         assert_eq!(events, if format == Format::Fd { [18, 18, 0] } else { [16, 0, 8] }, "{format:?}");
     }
 }
@@ -60,7 +60,7 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
         assert_eq!(table.snapshot().sums.contributing, 1);
         if interrupted {
             table.interrupt();
-            assert_eq!(table.snapshot().sums.contributing, 1, "the loop lets it go");
+            assert_eq!(table.snapshot().sums.contributing, 1, "the loop lets it decay");
         }
         let after = hear(&mut table, true, joints(next));
         assert_eq!(after, contributing, "{interrupted}, joints {next} after joints 1");
@@ -69,7 +69,7 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
 }
 
 #[test]
-fn a_cell_that_was_away_owes_nothing_before_it_is_heard_and_told_what_it_feels() {
+fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
     let cell = CellId::new(1).unwrap();
     let positions = [Q1_14::ZERO; WORDS];
     let joints =
@@ -94,19 +94,19 @@ fn a_cell_that_was_away_owes_nothing_before_it_is_heard_and_told_what_it_feels()
     let mut table = table(&[]);
     assert_eq!(hear(&mut table, &[heartbeat(1), press, joints(1), joints(2)]), (2, 0, 0));
     table.interrupt();
-    // It may not be back when the bus is, and so may not have heard this.
+    // It may come back later than the bus, and so may not have received this.
     assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
     assert_eq!(table.notices().count(), 0);
-    assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "nobody knows what it feels");
+    assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "its sensors are unknown");
     assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
     assert_eq!(hear(&mut table, &[press, joints(6), heartbeat(10), joints(7)]), (4, 2, 2));
-    assert_eq!(table.notices().count(), 0, "said once");
+    assert_eq!(table.notices().count(), 0, "reported once");
     let uplink = table.cells().first().unwrap().uplink();
     assert_eq!((uplink.lost, uplink.outage), (7, 7));
 }
 
 #[test]
-fn joints_that_passed_a_report_on_its_way_count_as_not_heard_when_they_were_not() {
+fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
     let joints = |epoch| {
         (
             true,
@@ -121,17 +121,17 @@ fn joints_that_passed_a_report_on_its_way_count_as_not_heard_when_they_were_not(
         (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
     };
     let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
-    // It has not heard the first; nor, when it began, one that came before its report.
+    // It did not receive the first; nor, when it began, one that came before its report.
     assert_eq!(unanswered(&[report(0, 0), joints(1), joints(2), report(2, 1)]), Some((0, 1)));
     assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 1)]), Some((0, 1)));
     assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 2)]), Some((0, 0)));
     assert_eq!(unanswered(&[joints(1), report(1, 1), joints(2), report(2, 2)]), Some((0, 0)));
-    // Who was long there, and before this gateway, has counted on.
+    // A cell that was there before this gateway has larger counters.
     assert_eq!(unanswered(&[joints(8), joints(9), report(8, 70), joints(10), report(10, 72)]), Some((0, 0)));
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_changes_nothing_of_its_cell() {
+fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
     let (cell, contact) = (CellId::new(1).unwrap(), [protocol::fixed::Q5_10::nearest(2.0); 3]);
     let says = |serial, sent, state| {
         let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
@@ -144,19 +144,19 @@ fn a_claim_of_a_number_that_is_taken_changes_nothing_of_its_cell() {
         let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
         (true, Message::Joints { epoch: Epoch(epoch), joints })
     };
-    let told = |intruded| {
+    let result = |intruded| {
         let mut said =
             vec![says(7, 40, settled), (true, press), joints(1), joints(2), says(7, 44, settled), joints(3)];
         if intruded {
             said.insert(3, says(9, 0, State::CLAIMING));
         }
         let mut table = table(&said);
-        assert_eq!(table.notices().count(), 0, "nobody started");
+        assert_eq!(table.notices().count(), 0, "no restart");
         let cell = table.cells().first().unwrap();
         let uplink = cell.uplink();
         (
             cell.heartbeat(),
-            cell.contact_state(),
+            cell.sensors(),
             cell.replies,
             cell.is_ready(),
             uplink.sent,
@@ -164,6 +164,6 @@ fn a_claim_of_a_number_that_is_taken_changes_nothing_of_its_cell() {
             uplink.restarts,
         )
     };
-    assert_eq!(told(true), told(false));
-    assert_eq!((told(true).2.due, told(true).5, told(true).6), (3, 3, 0));
+    assert_eq!(result(true), result(false));
+    assert_eq!((result(true).2.due, result(true).5, result(true).6), (3, 3, 0));
 }

@@ -93,7 +93,7 @@ fn first(sums: &Sums) -> (f64, u32) {
 }
 
 #[test]
-fn the_torque_is_what_the_roots_say_and_the_sum_with_the_most_cells_counts() {
+fn the_torque_is_the_total_of_the_roots_and_the_sum_with_the_most_cells_counts() {
     let mut bench = Bench::new(&[1, 2, 3, 4]);
     bench.joints(7);
     assert_eq!(first(&bench.sum(1, 7, 1, 10)), (10.0, 1));
@@ -110,7 +110,7 @@ fn the_torque_is_what_the_roots_say_and_the_sum_with_the_most_cells_counts() {
 }
 
 #[test]
-fn who_was_due_and_came_in_time_late_or_not_adds_up() {
+fn contributions_in_time_late_and_missing_add_up_to_those_due() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 2, 20);
@@ -144,9 +144,9 @@ fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it(
     bench.sum(2, 0, 0, 0);
     assert_eq!(first(&bench.table.snapshot().sums), (164.0, 3), "no cell is no more than one");
     bench.joints(1);
-    assert_eq!(first(&bench.sum(2, 1, 0, 0)), (64.0, 2), "a sum of nobody lets go");
+    assert_eq!(first(&bench.sum(2, 1, 0, 0)), (64.0, 2), "a sum of no cell ends the contacts");
     for epoch in 2..=1 + hold_epochs {
-        // It feels nothing itself; its children may.
+        // It is not in contact itself; its children may be.
         bench.heartbeat(1, u16::try_from(epoch).unwrap(), State::default());
         let sums = bench.joints(u8::try_from(epoch).unwrap());
         assert_eq!((first(&sums), sums.age, sums.stale), ((64.0, 2), epoch - 1, 2));
@@ -162,7 +162,7 @@ fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it(
 }
 
 #[test]
-fn a_root_that_restarts_does_not_take_its_childrens_torque_with_it() {
+fn a_restarted_root_keeps_its_childrens_torque() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 64);
@@ -172,15 +172,15 @@ fn a_root_that_restarts_does_not_take_its_childrens_torque_with_it() {
     let all = skin().safety;
     let last =
         (1..=1 + all.hold_epochs + all.decay_epochs).map(|epoch| bench.joints(u8::try_from(epoch).unwrap()));
-    assert_eq!(first(&last.last().unwrap()), (0.0, 0), "yet it grows old");
+    assert_eq!(first(&last.last().unwrap()), (0.0, 0), "yet it decays");
     assert_eq!(first(&bench.sum(1, bench.table.newest().unwrap().1.0, 1, 9)), (9.0, 1));
-    // A root that has fallen silent is let go at once.
+    // The sum of a silent root is released at once.
     bench.table.handle_time(Micros(bench.at) + DEAD_AFTER + Span(1));
     assert_eq!(first(&bench.table.snapshot().sums), (0.0, 0));
 }
 
 #[test]
-fn what_moved_to_another_root_is_not_counted_twice_while_the_old_one_is_held() {
+fn cells_that_moved_to_another_root_do_not_count_twice() {
     let mut bench = Bench::new(&[1, 2, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 30);
@@ -192,7 +192,7 @@ fn what_moved_to_another_root_is_not_counted_twice_while_the_old_one_is_held() {
     assert_eq!(first(&bench.sum(2, 2, 3, 29)), (29.0, 3), "two of its cells have come to the other one");
     bench.joints(3);
     bench.sum(2, 3, 3, 29);
-    assert_eq!(first(&bench.sum(1, 3, 1, 11)), (40.0, 4), "it speaks again");
+    assert_eq!(first(&bench.sum(1, 3, 1, 11)), (40.0, 4), "it sends again");
 }
 
 #[test]
@@ -214,7 +214,7 @@ fn a_root_below_another_cell_is_in_that_ones_sum() {
 }
 
 #[test]
-fn a_halt_releases_sums_and_nobody_is_due() {
+fn a_halt_releases_sums_and_no_cell_is_due() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 64);
@@ -253,7 +253,7 @@ fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32
 }
 
 #[test]
-fn packets_that_the_gateway_does_not_take_are_explained_by_their_senders_own_count() {
+fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
     let mut bench = Bench::new(&[3]);
     bench.table.hear_sums_of_roots_only();
     let tree = |sent| NetworkPage::Tree(Tree { sent, ..Tree::default() });

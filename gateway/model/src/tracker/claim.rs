@@ -1,11 +1,11 @@
-//! Who has a node id, and whether a heartbeat is of a cell that has started again.
+//! Which cell has a node id, and whether a heartbeat is of a cell that has restarted.
 
 use protocol::message::{Heartbeat, State};
 
-/// What a heartbeat is under its node id.
+/// What a heartbeat of a node id means.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Word {
-    /// The first one that is heard of the cell that has the id; when it started is not known.
+    /// The first one of the cell that has the id; when it started is not known.
     First,
     /// A further one of the cell that has the id.
     Known,
@@ -13,22 +13,22 @@ pub enum Word {
     Overtaken,
     /// The first one since the cell started.
     Started {
-        /// Whether the cell, or another one that had the id before, was heard before that.
+        /// Whether the cell, or another one that had the id before, sent something before that.
         again: bool,
     },
-    /// Of the cell that had the id before, which did not claim it again: two cells speak under it in turn.
+    /// Of the cell that had the id before, which did not claim it again: two cells use it in turn.
     Shared,
-    /// Another cell claims the id, and will give way.
+    /// Another cell claims the id, and will give up the claim.
     Claimant,
 }
 
-/// A count that falls back by more than this is that of a cell that has started again, and no overtaken heartbeat.
+/// A counter that falls back by more than this is of a cell that has restarted, not of an overtaken heartbeat.
 const OVERTAKES: u16 = 128;
 
 /// The address claim of one node id: which cell has it.
 ///
-/// A cell is known by its serial number. While it claims the id it gives way to a cell that has it already, so a claim
-/// under a settled cell's id says nothing of that cell.
+/// A cell is identified by its serial number. While it claims the id it yields to a cell that has it already, so a
+/// claim of a settled cell's id does not change that cell's state.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Claim {
     owner: Option<Heartbeat>,
@@ -37,7 +37,7 @@ pub struct Claim {
 }
 
 impl Claim {
-    /// Takes a heartbeat of this node id. This is the one place that tells a restart.
+    /// Takes a heartbeat of this node id. This is the one place that detects a restart.
     pub fn hear(&mut self, heartbeat: &Heartbeat) -> Word {
         let word = self.word(heartbeat);
         if !matches!(word, Word::Overtaken | Word::Claimant) {
@@ -58,7 +58,7 @@ impl Claim {
                 (_, true) => Word::Claimant,
                 (true, false) if self.had_it_before(heartbeat.serial) => Word::Shared,
                 (true, false) => Word::Started { again: true },
-                // Who claimed the id did not get it.
+                // The claimant did not get the id.
                 (false, false) => Word::First,
             };
         }
@@ -96,7 +96,7 @@ impl Claim {
         self.previous.is_some_and(|owner| owner.serial == serial && !owner.state.has(State::CLAIMING))
     }
 
-    /// Whether that cell says that something is so.
+    /// Whether that cell reports this state.
     #[must_use]
     pub fn says(&self, state: State) -> bool {
         self.owner.is_some_and(|owner| owner.state.has(state))
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_life_begins_with_a_claim_or_a_count_that_falls_back() {
+    fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
         let (claims, settled) = (State::CLAIMING, State::default());
         let life = [(7, 0, claims), (7, 1, settled), (7, 65_535, settled), (7, 2, settled)];
         let started = Word::Started { again: false };
@@ -134,21 +134,25 @@ mod tests {
         assert_eq!(words(&[(7, 900, settled), (7, 1, settled)]), [Word::First, AGAIN], "its claim was lost");
         assert_eq!(words(&[(7, 900, settled), (7, 771, settled)]), [Word::First, AGAIN]);
         assert_eq!(words(&[(7, 900, settled), (7, 772, settled)]), [Word::First, Word::Overtaken]);
-        // A cell that stays when two claim at once says so, still claiming.
+        // A cell that wins when two claim at once sends a heartbeat, still claiming.
         assert_eq!(words(&[(7, 0, claims), (7, 1, claims)]), [started, Word::Known]);
     }
 
     #[test]
-    fn who_claims_an_id_that_is_taken_is_not_its_cell_until_it_settles() {
+    fn a_claimed_id_keeps_its_owner_until_the_claimant_settles() {
         let (claims, settled) = (State::CLAIMING, State::default());
         let said = [(7, 9, settled), (8, 0, claims), (7, 10, settled), (8, 1, settled), (8, 2, settled)];
         assert_eq!(words(&said), [Word::First, Word::Claimant, Word::Known, AGAIN, Word::Known]);
         let said = [(8, 0, claims), (7, 10, settled), (7, 11, settled)];
-        assert_eq!(words(&said), [Word::Started { again: false }, Word::First, Word::Known], "it gave way");
+        assert_eq!(
+            words(&said),
+            [Word::Started { again: false }, Word::First, Word::Known],
+            "it gave up the claim"
+        );
     }
 
     #[test]
-    fn two_cells_that_speak_under_one_id_in_turn_do_not_restart_each_time() {
+    fn two_cells_that_use_one_id_in_turn_do_not_restart_each_time() {
         let settled = State::default();
         let said = [(7, 90, settled), (9, 40, settled), (7, 91, settled), (9, 41, settled), (9, 42, settled)];
         assert_eq!(words(&said), [Word::First, AGAIN, Word::Shared, Word::Shared, Word::Known]);

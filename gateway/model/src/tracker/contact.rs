@@ -1,14 +1,14 @@
-//! What a cell in test mode feels, by the protocol's rules: stimuli that wait for their epochs, and those that are
-//! latched. It is written apart from the cells' code, so that each is an oracle of the other.
+//! The contact state of a cell in test mode, by the protocol's rules: stimuli that wait for their epochs, and latched
+//! ones. It is independent of the cells' code, so that each is an oracle of the other.
 
 use protocol::fixed::Q3_12;
 use protocol::message::{From, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
-/// As many stimuli as a cell lets wait.
+/// How many stimuli may wait in a cell.
 pub const PENDING: usize = 8;
 
-/// What one cell feels. With each stimulus the reader keeps a `T`: when it came, or in which frames.
+/// The contact state of one cell. With each stimulus the reader keeps a `T`: when it came, or in which frames.
 #[derive(Clone, Debug)]
 pub struct Contact<T> {
     waiting: Vec<(From, SensorPage, T)>,
@@ -31,7 +31,7 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Latches what holds from the joints of this epoch on; the newest of each page counts. Each is shown to `latched`.
+    /// Latches the stimuli for the joints of this epoch; the newest of each page counts. Each is passed to `latched`.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         let is_due = move |(from, _, _): &mut (From, SensorPage, T)| match from {
             From::Next => true,
@@ -46,8 +46,8 @@ impl<T> Contact<T> {
         }
     }
 
-    /// What the cell says itself that it feels: news only while nothing else is known of that, because its word may be
-    /// older than the joints at which it latched the next stimulus.
+    /// Takes the cell's own sensors page. It counts only while nothing else is known, because it may be older than the
+    /// joints at which the cell latched the next stimulus.
     pub fn learn(&mut self, page: SensorPage, tag: T) {
         match page {
             SensorPage::Skin(skin) => _ = self.skin.get_or_insert((skin, tag)),
@@ -57,31 +57,31 @@ impl<T> Contact<T> {
         }
     }
 
-    /// What touches it, once something is known of that.
+    /// Its skin sensors, once they are known.
     #[must_use]
     pub const fn skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref()
     }
 
-    /// All that is latched and known.
+    /// All pages that are latched or known.
     pub fn latched(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
         skin.chain(self.acceleration.iter().map(|(xyz, tag)| (SensorPage::Acceleration(*xyz), tag)))
     }
 
-    /// The stimuli that wait, in their order, each with the joints from which on it holds.
+    /// The waiting stimuli in their order, each with the joints from which on it applies.
     #[must_use]
     pub fn waiting(&self) -> &[(From, SensorPage, T)] {
         &self.waiting
     }
 
-    /// Forgets what it feels and what waits: the cell has started, or its mode was written.
+    /// Clears the contact state and what waits: the cell has started, or its mode was written.
     pub fn reset(&mut self) {
         self.waiting.clear();
         (self.skin, self.acceleration) = (None, None);
     }
 
-    /// Whether the cell obeys stimuli; `None` while nobody knows, and then it is taken to.
+    /// Whether the cell obeys stimuli; `None` while that is not known, and then it is assumed.
     #[must_use]
     pub const fn obeys(&self) -> Option<bool> {
         self.obeys
@@ -93,8 +93,8 @@ impl<T> Contact<T> {
     }
 }
 
-/// Whether the joints from which a stimulus was to hold have been: then it holds from the next ones on. `last` is the
-/// epoch of the last joints.
+/// Whether the joints from which a stimulus should apply have passed: then it applies from the next ones on. `last` is
+/// the epoch of the last joints.
 #[must_use]
 pub fn is_late(from: From, last: Option<Epoch>) -> bool {
     matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0)
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn stimuli_wait_for_their_epoch_and_late_ones_for_the_next() {
         let mut contact = Contact::default();
-        assert_eq!(latch(&mut contact, 253), None, "nobody knows");
+        assert_eq!(latch(&mut contact, 253), None, "not known");
         contact.push(From::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
         contact.push(From::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
         assert_eq!(latch(&mut contact, 254), Some((1.0, 6)), "late, so from the next on");
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ninth_that_waits_is_refused_whatever_its_page() {
+    fn the_ninth_waiting_stimulus_is_refused_whatever_its_page() {
         let mut contact = Contact::default();
         for _ in 0..PENDING {
             contact.push(From::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
@@ -140,14 +140,14 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cell_says_counts_only_while_nothing_else_is_known() {
+    fn the_cells_own_page_counts_only_while_nothing_else_is_known() {
         let mut contact = Contact::default();
         contact.learn(press(3.0), 1);
         assert_eq!(latch(&mut contact, 0), Some((3.0, 1)));
         contact.push(From::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 1), Some((1.0, 2)));
         contact.learn(press(3.0), 3);
-        assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old word");
+        assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
     }
 
     #[test]

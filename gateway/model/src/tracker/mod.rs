@@ -1,11 +1,11 @@
-//! What is known of cells by what the bus carries: worked out here once, for whoever follows cells.
+//! The state of cells, derived from the traffic on the bus: in this one place, for all that follow cells.
 //!
 //! ```text
-//!                                ┌─ Claim    who has the node id, and when it started again
-//!   a cell's packets ─> Tracked ─┼─ Account  what it sent, and what of that is lost
-//!                                ├─ Pages    what it said last since it started
+//!                                ┌─ Claim    which cell has the node id, and its restarts
+//!   a cell's packets ─> Tracked ─┼─ Account  packets sent and lost
+//!                                ├─ Pages    its last pages since it started
 //!                                └─          alive or silent
-//!   stimuli, joints ──> Contact ────────────> what it feels, and what waits for its epoch
+//!   stimuli, joints ──> Contact ────────────> contact state, and waiting stimuli
 //! ```
 //!
 //! Live tables, statistics, explanations, replays, the recorder and listings read these; each adds what is its own.
@@ -24,19 +24,19 @@ pub use contact::{Contact, PENDING, is_late};
 pub use per_cell::PerCell;
 pub use uplink::{Account, Uplink};
 
-/// A cell that has said nothing for so long is dead: two heartbeats, and the jitter of a busy machine,
-/// so that one lost frame kills nobody.
+/// A cell that is silent for so long is dead: two heartbeats, and the jitter of a busy machine, so that one lost frame
+/// is tolerated.
 pub const DEAD_AFTER: Span = Span::from_millis(600);
 
-/// An answer may be of the newest joints, or of those so many before them; later ones are of no use.
+/// An answer may be to the newest joints, or to those up to so many before them; later ones are dropped.
 pub const LATEST: usize = 3;
 
-/// The last page of each kind that a cell has said since it started.
+/// The last page of each kind since a cell started.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pages {
-    /// What became of what it heard.
+    /// Counters of what it received.
     pub heard: Option<Heard>,
-    /// What it refused.
+    /// Counters of what it refused.
     pub refused: Option<Refused>,
     /// Its place in the tree.
     pub tree: Option<Tree>,
@@ -57,32 +57,32 @@ impl Pages {
     }
 }
 
-/// What a packet of a cell tells beside what it says.
+/// What a packet of a cell changes in its state.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Update {
-    /// What its heartbeat is, if it is one.
+    /// What it means as a heartbeat, if it is one.
     pub word: Option<Word>,
-    /// The cell was thought dead.
+    /// The cell was dead before.
     pub revived: bool,
     /// It is the cell's first heartbeat since the bus was lost, and it has not started since.
     pub returned: bool,
 }
 
-/// One cell, by what comes under its node id.
+/// One cell, by the packets of its node id.
 #[derive(Clone, Debug, Default)]
 pub struct Tracked {
     /// Packets sent and arrived.
     pub account: Account,
     claim: Claim,
     pages: Pages,
-    last_word: Option<Micros>,
+    last_packet: Option<Micros>,
     dead: bool,
 }
 
 impl Tracked {
     /// Takes a packet that came at `at`; `joints` is the number of the newest joints.
     pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
-        let is_first = self.last_word.replace(at).is_none();
+        let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
         self.account.arrive();
         let Message::Network { page, .. } = message else { return Update { revived, ..Update::default() } };
@@ -113,13 +113,13 @@ impl Tracked {
         Update { word: Some(word), revived, returned }
     }
 
-    /// Who has the node id, and what its last heartbeat said.
+    /// The owner of the node id, and its last heartbeat.
     #[must_use]
     pub const fn claim(&self) -> &Claim {
         &self.claim
     }
 
-    /// What it has said since it started.
+    /// Its last pages since it started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         &self.pages
@@ -127,11 +127,11 @@ impl Tracked {
 
     /// When its last packet came.
     #[must_use]
-    pub const fn last_word(&self) -> Option<Micros> {
-        self.last_word
+    pub const fn last_packet(&self) -> Option<Micros> {
+        self.last_packet
     }
 
-    /// Takes in what time it is; whether the cell has just been silent for too long.
+    /// Handles the timeout of a silent cell; whether it has just passed.
     pub fn falls_silent(&mut self, now: Micros) -> bool {
         let silent = self.is_silent(now);
         let falls = silent && !self.dead;
@@ -139,15 +139,15 @@ impl Tracked {
         falls
     }
 
-    /// Whether it has been found dead, and not been heard since.
+    /// Whether it was found dead, and has sent nothing since.
     #[must_use]
     pub const fn is_dead(&self) -> bool {
         self.dead
     }
 
-    /// Whether it was heard, and has then been silent for too long.
+    /// Whether it has sent something, and then been silent for too long.
     #[must_use]
     pub fn is_silent(&self, now: Micros) -> bool {
-        self.last_word.is_some_and(|last| now.since(last) > DEAD_AFTER)
+        self.last_packet.is_some_and(|last| now.since(last) > DEAD_AFTER)
     }
 }

@@ -24,7 +24,7 @@ impl<T> PerCell<T> {
         self.0.get_mut(cell.index())
     }
 
-    /// Those of the cells that an addressee names, by number.
+    /// Those of the cells that an addressee names, by node id.
     pub fn named(&mut self, to: Node) -> &mut [T] {
         let places = match to {
             Node::Gateway => 0..0,
@@ -34,12 +34,12 @@ impl<T> PerCell<T> {
         self.0.get_mut(places).unwrap_or_default()
     }
 
-    /// All of them, by number.
+    /// All of them, by node id.
     pub fn iter(&self) -> impl Iterator<Item = (CellId, &T)> {
         CellId::all().zip(&self.0)
     }
 
-    /// All of them, by number, to be changed.
+    /// All of them, by node id, to be changed.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = (CellId, &mut T)> {
         CellId::all().zip(&mut self.0)
     }

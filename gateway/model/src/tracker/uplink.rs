@@ -1,4 +1,4 @@
-//! Packets that a cell sent against packets that arrived, by the cell's own count.
+//! Packets that a cell sent, by its own counter, compared with packets that arrived.
 
 use derive_more::{Add, Sum};
 
@@ -15,14 +15,14 @@ pub struct Uplink {
     pub lost: u64,
     /// Of the lost ones, those of a time in which the bus was lost.
     pub outage: u64,
-    /// Arrived more often than sent: repeated on the way, or sent by somebody else under this name.
+    /// Arrived more often than sent: repeated on the way, or sent by another cell with this node id.
     pub surplus: u64,
     /// Arrived with nothing to compare it with: before a cell's first heartbeat, and between its last one
-    /// and a restart. How many more it sent then, nobody knows.
+    /// and a restart. How many more it sent then is not known.
     pub in_doubt: u64,
-    /// Times that the cell started anew.
+    /// Restarts of the cell.
     pub restarts: u32,
-    /// Of those that never arrived, sums for another cell, which the gateway did not listen to.
+    /// Of those that never arrived, sums for another cell, which the gateway did not receive.
     pub unheard: u64,
     /// Arrived since the last heartbeat: of a dead cell, all that is known of its end.
     pub unsettled: u64,
@@ -30,13 +30,13 @@ pub struct Uplink {
 
 /// Works out a cell's [`Uplink`].
 ///
-/// A heartbeat says how many packets the cell sent before it. A bus keeps each sender's order, so what
+/// A heartbeat has the number of packets that the cell sent before it. A bus keeps each sender's order, so what
 /// has not arrived by then never will.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Account {
     total: Uplink,
     /// What the cell had sent with its last heartbeat, modulo 2^16.
-    said: Option<u16>,
+    reported: Option<u16>,
     /// Arrived since then, and of these refused.
     arrived: u64,
     rejected: u64,
@@ -49,12 +49,12 @@ pub struct Account {
 #[derive(Clone, Copy, Debug, Default)]
 struct Sums {
     /// By its last page, modulo 2^16.
-    said: Option<u16>,
+    reported: Option<u16>,
     /// Since the account began.
     count: u64,
     /// Of these, found missing.
     found: u64,
-    /// The joints of its last page, and of its last heartbeat: what it has said in between nobody has counted.
+    /// The joints of its last page, and of its last heartbeat: sums in between are not counted yet.
     page_at: Option<u64>,
     heartbeat_at: Option<u64>,
 }
@@ -66,12 +66,12 @@ impl Account {
         Uplink { unsettled: self.arrived, ..self.total }
     }
 
-    /// The bus is lost: what the cell sends until it is heard again does not arrive.
+    /// The bus is lost: packets of the cell do not arrive until its next heartbeat.
     pub const fn interrupt(&mut self) {
         self.interrupted = true;
     }
 
-    /// Whether the bus was lost since the cell's last heartbeat: nobody knows whether it is back on it.
+    /// Whether the bus was lost since the cell's last heartbeat: it is not known whether the cell is back on it.
     #[must_use]
     pub const fn is_interrupted(&self) -> bool {
         self.interrupted
@@ -93,25 +93,25 @@ impl Account {
         self.sums.get_or_insert_default();
     }
 
-    /// The cell says how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
-    pub(super) fn sums_sent(&mut self, said: u16, joints: Option<u64>) {
+    /// The cell reports how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
+    pub(super) fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
         let Some(sums) = &mut self.sums else { return };
-        let before = sums.said.replace(said).unwrap_or(said);
-        sums.count += u64::from(said.wrapping_sub(before));
+        let before = sums.reported.replace(reported).unwrap_or(reported);
+        sums.count += u64::from(reported.wrapping_sub(before));
         sums.page_at = joints;
     }
 
-    /// Its heartbeat was said after the joints of this number; the account is settled already.
+    /// Its heartbeat came after the joints of this number; the account is settled already.
     pub(super) const fn heartbeat_at(&mut self, joints: Option<u64>) {
         if let Some(sums) = &mut self.sums {
             sums.heartbeat_at = joints;
         }
     }
 
-    /// No more comes: what is missing and was a sum that the gateway does not take is explained.
+    /// No more comes: accounts for missing packets that were sums which the gateway does not take.
     pub fn finish(&mut self) {
         let Some(sums) = &mut self.sums else { return };
-        // With joints between its page and its heartbeat, it may have said more of them than the page counts.
+        // With joints between its page and its heartbeat, it may have sent more sums than the page counts.
         let at_most = if sums.page_at == sums.heartbeat_at { sums.count - sums.found } else { u64::MAX };
         let found = (self.total.lost - self.total.outage).min(at_most);
         self.total.lost -= found;
@@ -120,18 +120,18 @@ impl Account {
         sums.count = sums.count.max(sums.found);
     }
 
-    /// A heartbeat, which has arrived, is the first one that is heard of a cell's life, and says that the cell had sent
-    /// `sent` packets before it, modulo 2^16; `again` if the cell was heard before.
+    /// The first heartbeat of a cell since it started has arrived; the cell had sent `sent` packets before it, modulo
+    /// 2^16. `again` if the cell was there before.
     pub(super) fn begin(&mut self, sent: u16, again: bool) {
         if again {
             self.total.restarts += 1;
             self.finish();
             if let Some(sums) = &mut self.sums {
                 // It counts from zero.
-                *sums = Sums { said: Some(0), ..Sums::default() };
+                *sums = Sums { reported: Some(0), ..Sums::default() };
             }
         }
-        self.said = Some(sent.wrapping_add(1));
+        self.reported = Some(sent.wrapping_add(1));
         self.interrupted = false;
         self.total.sent += 1;
         self.total.delivered += 1;
@@ -139,12 +139,12 @@ impl Account {
         self.rejected = 0;
     }
 
-    /// A further heartbeat, which has arrived, says that the cell had sent `sent` packets before it, modulo 2^16.
+    /// A further heartbeat has arrived; the cell had sent `sent` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, sent: u16) {
-        let Some(before) = self.said else { return self.begin(sent, false) };
-        let said = sent.wrapping_add(1);
+        let Some(before) = self.reported else { return self.begin(sent, false) };
+        let reported = sent.wrapping_add(1);
         let (arrived, rejected) = (core::mem::take(&mut self.arrived), core::mem::take(&mut self.rejected));
-        let sent = u64::from(said.wrapping_sub(before));
+        let sent = u64::from(reported.wrapping_sub(before));
         let lost = sent.saturating_sub(arrived);
         let total = &mut self.total;
         total.sent += sent;
@@ -153,10 +153,10 @@ impl Account {
         total.lost += lost;
         total.outage += if core::mem::take(&mut self.interrupted) { lost } else { 0 };
         total.surplus += arrived.saturating_sub(sent);
-        self.said = Some(said);
+        self.reported = Some(reported);
     }
 
-    /// The packet that has just arrived is another cell's, which claims this one's node id.
+    /// The packet that has just arrived is of another cell, which claims this one's node id.
     pub(super) const fn intrude(&mut self) {
         self.arrived -= 1;
         self.total.delivered += 1;
@@ -170,7 +170,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn what_did_not_arrive_by_the_next_heartbeat_is_lost() {
+    fn packets_that_did_not_arrive_by_the_next_heartbeat_are_lost() {
         let mut account = Account::default();
         account.arrive();
         account.begin(65_534, false);
@@ -182,9 +182,9 @@ mod tests {
         account.settle(3); // four were sent in between, and this one
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (6, 4, 1, 2));
-        assert_eq!(uplink.surplus, 1, "the claim of somebody else");
-        account.arrive(); // a last word
-        account.arrive(); // the claim of its next life
+        assert_eq!(uplink.surplus, 1, "the claim of another cell");
+        account.arrive(); // a last packet
+        account.arrive(); // the claim after its restart
         account.begin(0, true);
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.lost, uplink.in_doubt), (7, 2, 1));
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_did_not_arrive_while_the_bus_was_lost_is_known_to_be_so() {
+    fn packets_lost_in_an_outage_are_counted_as_such() {
         let mut account = Account::default();
         account.begin(0, false);
         account.interrupt();
@@ -208,7 +208,7 @@ mod tests {
         account.begin(0, true);
         account.arrive();
         account.settle(2);
-        assert_eq!(lost(&account), (12, 7, 4), "a new life has an account of its own");
+        assert_eq!(lost(&account), (12, 7, 4), "a restart begins a new account");
     }
 
     proptest! {

@@ -63,15 +63,15 @@ impl Case {
     }
 
     /// The words of sensors page 0.
-    pub(crate) fn contact_state(&self) -> [i16; WORDS] {
+    pub(crate) fn sensors(&self) -> [i16; WORDS] {
         packet::words(self.contact.map(Q::to_bits))
     }
 
     /// J and the torques, as the cell computes them.
     pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [Q3_12; MAX_JOINTS]) {
-        let contact_state = SkinSensors { contact: self.contact, ..SkinSensors::default() };
+        let sensors = SkinSensors { contact: self.contact, ..SkinSensors::default() };
         let cell = Reference::new(&self.parameters);
-        (cell.jacobian(&self.q), cell.torque(&self.q, &contact_state))
+        (cell.jacobian(&self.q), cell.torque(&self.q, &sensors))
     }
 
     /// J in double precision, rounded once.

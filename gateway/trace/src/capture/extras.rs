@@ -1,16 +1,16 @@
-//! What a recording has beside frames and notes.
+//! The contents of a recording beside frames and notes.
 
 use protocol::can::Frame;
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use serde::Serialize;
 
-/// What an MCAP recording has beside frames and notes, as far as it has been read.
+/// The contents of an MCAP recording beside frames and notes, as far as it has been read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Extras {
     /// Topics that are no frames and no notes, in the order in which they came.
     pub topics: Vec<Topic>,
-    /// Frames of before, that are in force when the recording begins.
+    /// Earlier frames that are latched when the recording begins.
     pub latched: Vec<Latched>,
     /// Attachments by name; the largest without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
@@ -51,12 +51,12 @@ impl Extras {
     }
 }
 
-/// A frame that was on a bus before a recording began, and still says what holds.
+/// A frame that was on a bus before a recording began, and is still latched.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Latched {
     /// Its bus.
     pub bus: String,
-    /// Whether whoever recorded it had sent it.
+    /// Whether the recorder had sent it.
     pub own: bool,
     /// What it is.
     pub frame: Frame,

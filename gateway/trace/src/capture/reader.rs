@@ -68,7 +68,7 @@ pub struct Reader {
     /// The file that is being read.
     file: String,
     source: Source,
-    /// Whether messages of all topics are wanted.
+    /// Whether messages of all topics are requested.
     others: bool,
     entries: u64,
     /// Parts that follow.
@@ -253,7 +253,7 @@ impl Reader {
         })
     }
 
-    /// The next entry, or message of another topic where these are wanted, in the order of the file; `None` after the
+    /// The next entry, or message of another topic where these are requested, in the order of the file; `None` after the
     /// last one. Never panics.
     ///
     /// # Errors

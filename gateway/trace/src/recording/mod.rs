@@ -11,7 +11,7 @@ pub mod sink;
 
 /// What topics of frames begin with; the bus' name follows.
 pub const TOPIC_OF_BUS: &str = "/can/";
-/// What topics of frames begin with that were in force before the file began.
+/// What topics of frames begin with that were latched before the file began.
 pub const TOPIC_OF_STATE: &str = "/state/";
 /// What stands between frames.
 pub const NOTES: &str = "/can/notes";

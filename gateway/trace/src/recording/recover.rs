@@ -3,11 +3,11 @@
 //! ```text
 //!   magic │ head │ chunk │ index │ chunk │ index │ chu        a file whose writer was killed
 //!   ──────┴──────┴───────┴───────┴───────┴───────┼────
-//!            kept, message by message            └ said: so many bytes of something unfinished
+//!            kept, message by message            └ reported: bytes of an incomplete record
 //! ```
 //!
-//! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and said; what
-//! follows it is kept.
+//! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and reported;
+//! what follows it is kept.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -34,7 +34,7 @@ pub struct Recovered {
     pub messages: u64,
     /// Of these, frames of buses.
     pub frames: u64,
-    /// The greatest time of a message, in ns since 1970; 0 of none.
+    /// The latest time of a message, in ns since 1970; 0 of none.
     pub last_nanos: u64,
     /// Bytes at the end that are no whole record.
     pub unfinished: u64,
@@ -127,7 +127,7 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
                 break;
             }
             Framed::Record(op::DATA_END) => {
-                // What follows is made anew.
+                // What follows is generated again.
                 copy.recovered.whole = ends_well(&mut source).map_err(RecoverError::Read)?;
                 break;
             }
@@ -259,7 +259,7 @@ impl<W: Write> Copy<W> {
             Record::Metadata { name, facts } => {
                 writer.write_metadata(&Metadata { name: name.to_owned(), metadata: facts.into() })?;
             }
-            // Made anew, or of no file of ours.
+            // Generated again, or of no file of ours.
             Record::Header { .. } | Record::DataEnd { .. } | Record::Other => {}
         }
         Ok(())

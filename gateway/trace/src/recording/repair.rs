@@ -1,4 +1,4 @@
-//! Files whose writers are gone: found, made whole, said.
+//! Files whose writers are gone: finds, repairs and reports them.
 
 use std::fs::{File, Permissions};
 use std::io::{self, BufReader, BufWriter, Seek};
@@ -23,8 +23,8 @@ pub struct Repaired {
     pub new: Option<(PathBuf, u64)>,
 }
 
-/// Makes a whole file of one that broke off, and takes the latter away. `goal` names the new one, at each attempt anew;
-/// it takes another file's place only when `force` says so.
+/// Makes a complete file of one that broke off, and removes the latter. `goal` gives a name for the new one at each
+/// attempt; it replaces another file only with `force`.
 ///
 /// # Errors
 /// When nothing can be recovered or written; the file stays as it is.
@@ -72,7 +72,7 @@ fn copy(
     from: &File,
     to: &Path,
     force: bool,
-    target: impl FnOnce(&Recovered) -> bool,
+    is_worth_it: impl FnOnce(&Recovered) -> bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     as_private(from, &file).map_err(RecoverError::Write)?;
@@ -81,7 +81,7 @@ fn copy(
     // A pipe is where it is.
     let _ = from.rewind();
     let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
-    if !target(&recovered) {
+    if !is_worth_it(&recovered) {
         return Ok((recovered, None));
     }
     let finish = || -> io::Result<u64> {
@@ -106,7 +106,7 @@ fn as_private(from: &File, copy: &File) -> io::Result<()> {
     copy.set_permissions(Permissions::from_mode(mode))
 }
 
-/// Repairs what runs that were killed left in a recording's folder, and says each in a line; also what is not theirs.
+/// Repairs the files of killed runs in a recording's folder, and reports each in a line; also files of others.
 pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
     // A folder that cannot be read says so when the recording itself is begun.
     for (part, found) in names::parts(path).unwrap_or_default() {

@@ -1,7 +1,7 @@
 //! A recording's MCAP files, one after the other: each is begun with what makes it readable by itself, flushed,
 //! ended when it is large or old enough, and given its name when it is whole.
 //!
-//! After an error the file takes nothing more. It is kept, mended at the end, and another one is tried every few
+//! After an error the file takes nothing more. It is kept, repaired at the end, and another one is tried every few
 //! seconds; what comes meanwhile is counted.
 
 use std::collections::BTreeMap;
@@ -25,7 +25,7 @@ use crate::files::folder_of;
 const BUFFER: usize = 64 << 10;
 /// Between an error and another attempt.
 const RETRY: Duration = Duration::from_secs(5);
-/// A file that is to end waits so long at most for what holds it: any traffic may look like half of a packet.
+/// A file that is to end waits so long at most for what holds it: any traffic may look like a segment.
 const HOLD: Duration = Duration::from_millis(500);
 /// Room on a disk that was full before it is tried again.
 const ROOM: u64 = 64 << 20;
@@ -85,7 +85,7 @@ impl Head {
     }
 }
 
-/// Something that people should know.
+/// An event to be reported.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Said {
     /// A file takes nothing more; the run goes on.
@@ -134,7 +134,7 @@ struct Open<T> {
     pending: Count,
 }
 
-/// A file that broke off, held until it is mended.
+/// A file that broke off, held until it is repaired.
 #[derive(Debug)]
 struct Broken {
     part: Part,
@@ -365,7 +365,7 @@ impl<T> Series<T> {
     fn break_off(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.pending);
-        // What is buffered is a part of something; the file stays held until it is mended.
+        // What is buffered is a part of something; the file stays held until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });
         self.fail(error);
@@ -403,8 +403,9 @@ impl<T> Series<T> {
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
                     let path = part.path.display();
-                    self.said
-                        .push(Said::Else(format!("{path}: {error}; mend it with `gateway recover {path}`")));
+                    self.said.push(Said::Else(format!(
+                        "{path}: {error}; repair it with `gateway recover {path}`"
+                    )));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));
                 }

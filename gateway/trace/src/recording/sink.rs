@@ -63,7 +63,7 @@ impl Gauge {
         }
     }
 
-    /// Lets go of the room; whether there was any.
+    /// Releases the reserved room; whether there was any.
     fn use_reserve(&self) -> bool {
         self.full.store(true, Ordering::Relaxed);
         self.reserve.lock().unwrap_or_else(PoisonError::into_inner).take().is_some()

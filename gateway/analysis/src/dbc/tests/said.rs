@@ -1,4 +1,4 @@
-//! What a packet says, by the protocol's own types and the names of a DBC.
+//! A packet's values, by the protocol's own types and the names of a DBC.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use protocol::message::{Answer, From, Message, NetworkPage, Request, SensorPage,
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 
-/// What a message says, by names and in units, as the protocol's own types have it.
+/// A message's values by name and in units, from the protocol's own types.
 #[derive(Default)]
 struct Said(BTreeMap<String, f64>);
 
@@ -114,7 +114,7 @@ impl Said {
     }
 }
 
-/// The name of a message and what it says; `None` for values that no encoding has.
+/// The name of a message and its values; `None` for values that no encoding has.
 pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
     let mut said = Said::default();
     let crc = u16::from_le_bytes(packet.encode()[14..].try_into().unwrap());

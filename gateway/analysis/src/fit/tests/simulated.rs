@@ -279,7 +279,7 @@ fn so_are_other_numbers_of_cells_rates_and_classic_can() {
         let reached = reached(&case(rates, cells), REAL, 18);
         assert!(reached >= 0.85, "{rates} {cells}: {reached}");
     }
-    // Of few cells nobody's heartbeat is there to be in the way twice.
+    // With few cells there are no heartbeats that could block twice.
     for cells in [1, 2, 5] {
         assert!(reached(&case("1M/5M", cells), REAL, 90) >= 0.6);
     }

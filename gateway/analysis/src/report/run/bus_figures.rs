@@ -1,4 +1,4 @@
-//! What the frames of one bus say: the same accounts that the gateway kept, epoch by epoch.
+//! Figures from the frames of one bus: the same accounts that the gateway kept, epoch by epoch.
 
 use protocol::candump::{Direction, Record};
 use protocol::message::Message;
@@ -72,7 +72,7 @@ pub(super) struct LinkId {
     pub(super) load: Binned,
     /// The same with what only a bench sends.
     pub(super) load_of_all: Binned,
-    /// Frames that were lost on the way to the recording, as it says.
+    /// Frames that the recorder lost, by its own notes.
     pub(super) dropped: u64,
 }
 
@@ -103,7 +103,7 @@ impl LinkId {
         }
     }
 
-    /// A frame that was on the bus before the recording began, and still says what holds.
+    /// A frame from before the recording that is latched when it begins.
     pub(super) fn latched(&mut self, before: &Latched) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }

@@ -2,14 +2,14 @@
 //!
 //! ```text
 //!   /ROBOT/…, /gateway/timing ─> motion ─┐
-//!   /can/BUS ─┬> lane (a Table each) ────┼─> page
+//!   /can/BUS ─┬> BusFigures (a Table each)┼─> page
 //!             └> Shadow ─────────────────┤
 //!   metadata, /can/notes ────────────────┘
 //! ```
 //!
 //! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
-//! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. What a real bus would have made of
-//! them is what `gateway shadow` says of the same recording.
+//! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. The load of a
+//! real bus is that of `gateway shadow` for the same recording.
 
 mod bus_figures;
 mod motion;
@@ -58,7 +58,7 @@ pub enum ReportError {
         what: String,
     },
     /// Bit rates that CAN does not have.
-    #[error("{bus}: {source}; say others with --nominal and --data")]
+    #[error("{bus}: {source}; give others with --nominal and --data")]
     Rates {
         /// The bus.
         bus: String,
@@ -70,7 +70,7 @@ pub enum ReportError {
 /// A report, and what of the recording is missing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
-    /// What it says.
+    /// Its contents.
     pub page: Page,
     /// A sentence, when the recording is cut off or damaged.
     pub missing: Option<String>,
@@ -97,7 +97,7 @@ impl Options {
     }
 }
 
-/// Reads a recording, or the parts of one, and says what it holds.
+/// Reads a recording, or the parts of one, and makes a report.
 ///
 /// # Errors
 /// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
@@ -189,7 +189,7 @@ struct Run {
     backlog: u64,
     /// Frames of buses that the skin does not have.
     others: u64,
-    /// Messages that are not what their topics say.
+    /// Messages that do not match the type of their topic.
     unreadable: u64,
 }
 

@@ -1,4 +1,4 @@
-//! What the ticks of a recording say: joints, torques, the loop's timing.
+//! Series from the ticks of a recording: joints, torques, the loop's timing.
 
 use crate::report::thin::Thinned;
 use model::quantiles::Times;

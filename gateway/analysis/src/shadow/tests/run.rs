@@ -1,4 +1,4 @@
-//! What a shadow makes of a run: start-up and operation, what only a bench sends, who answered, and what fits.
+//! A shadow of a run: start-up and operation, what only a bench sends, which cells answered, and what fits.
 
 use super::super::*;
 use crate::fit::traffic::BenchFrames;
@@ -24,8 +24,8 @@ struct Run {
     epoch: Epoch,
 }
 
-fn cell(number: i64) -> CellId {
-    CellId::new(number).unwrap()
+fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
 }
 
 fn page(from: i64, page: NetworkPage) -> Message {
@@ -60,13 +60,13 @@ impl Run {
         self.frames.extend(frames.map(|frame| (self.now, frame)));
     }
 
-    /// Cells claim their numbers and are configured, all at once: more than a bus can carry for a while.
+    /// Address claims and configuration of all cells at once: more than a bus can carry for a while.
     fn start(&mut self, cells: i64) {
-        for number in 1..=cells {
-            self.say(&heartbeat(number, State::CLAIMING));
+        for node in 1..=cells {
+            self.say(&heartbeat(node, State::CLAIMING));
             for tag in 0..4 {
                 let request = Request::Read { number: 1 };
-                self.say(&Message::Configure { to: Node::Cell(cell(number)), tag, request });
+                self.say(&Message::Configure { to: Node::Cell(cell(node)), tag, request });
             }
         }
         self.now += 400 * MS;
@@ -78,11 +78,11 @@ impl Run {
 
     /// The answers to a report.
     fn report(&mut self, cells: i64) {
-        for number in 1..=cells {
-            self.say(&page(number, NetworkPage::Heard(Heard::default())));
-            self.say(&page(number, NetworkPage::Refused(Refused::default())));
-            self.say(&sensors(number, false));
-            self.say(&sensors(number, true));
+        for node in 1..=cells {
+            self.say(&page(node, NetworkPage::Heard(Heard::default())));
+            self.say(&page(node, NetworkPage::Refused(Refused::default())));
+            self.say(&sensors(node, false));
+            self.say(&sensors(node, true));
         }
     }
 
@@ -91,8 +91,8 @@ impl Run {
         let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
         self.say(&Message::Joints { epoch: self.epoch, joints });
         self.now += MS;
-        for number in 1..=answering {
-            let (from, torque) = (cell(number), [Q3_12::from_bits(3); WORDS]);
+        for node in 1..=answering {
+            let (from, torque) = (cell(node), [Q3_12::from_bits(3); WORDS]);
             self.say(&Message::Torque { from, epoch: self.epoch, torque });
         }
         self.epoch = self.epoch.next();
@@ -106,13 +106,13 @@ impl Run {
     /// Stimuli of every epoch, and the end of a bench.
     fn bench(&mut self, epochs: u32, cells: i64) {
         for _ in 0..epochs {
-            (1..=cells).for_each(|number| self.say(&stimulus(number)));
+            (1..=cells).for_each(|node| self.say(&stimulus(node)));
             self.epoch(cells);
         }
         self.say(&Message::Report);
         self.report(cells);
         self.say(&Message::Sync);
-        (1..=cells).for_each(|number| self.say(&heartbeat(number, State::CONFIGURED)));
+        (1..=cells).for_each(|node| self.say(&heartbeat(node, State::CONFIGURED)));
     }
 
     fn shadow(&self, options: Options) -> BusShadow {
@@ -224,7 +224,7 @@ fn a_second_run_in_one_capture_starts_up_again_and_time_without_joints_is_not_op
 }
 
 #[test]
-fn a_run_without_joints_is_no_operation_and_is_not_judged() {
+fn a_run_without_joints_has_no_operation_and_is_not_rated() {
     let mut run = Run::new(Format::Fd);
     run.start(20);
     let shadow = run.shadow(options());
@@ -265,11 +265,11 @@ fn beside_the_run_stands_the_worst_case_of_the_skin_at_the_same_rates() {
     );
     let heard = run.shadow(options());
     assert_eq!(heard.worst_case, None);
-    assert!(heard.this_run.unwrap().to_string().contains("at most 120 of 253 cells heard answered"));
+    assert!(heard.this_run.unwrap().to_string().contains("at most 120 of 253 cells seen answered"));
 }
 
 #[test]
-fn an_answer_that_was_ready_too_late_for_any_bus_is_not_held_against_this_one() {
+fn an_answer_that_was_ready_too_late_for_any_bus_does_not_count_for_the_verdict() {
     let verdict = |after: u64| {
         let mut run = Run::new(Format::Fd);
         run.operate(20, 4);
@@ -278,8 +278,8 @@ fn an_answer_that_was_ready_too_late_for_any_bus_is_not_held_against_this_one() 
         let (next, epoch) = (run.now, Epoch(run.epoch.0 - 1));
         run.now = next - 16 * MS + after;
         let torque = [Q3_12::from_bits(3); WORDS];
-        for number in 1..=60 {
-            run.say(&Message::Torque { from: cell(number), epoch, torque });
+        for node in 1..=60 {
+            run.say(&Message::Torque { from: cell(node), epoch, torque });
         }
         run.now = next;
         run.operate(20, 4);

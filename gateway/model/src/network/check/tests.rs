@@ -1,4 +1,4 @@
-//! Networks are damaged at random; what was damaged is named, and nothing else.
+//! Networks are damaged at random; each damage is named, and nothing else.
 
 use std::collections::VecDeque;
 
@@ -9,8 +9,8 @@ use protocol::skin::Skin;
 
 use super::*;
 
-fn cell(number: usize) -> CellId {
-    CellId::new(i64::try_from(number).unwrap()).unwrap()
+fn cell(node: usize) -> CellId {
+    CellId::new(i64::try_from(node).unwrap()).unwrap()
 }
 
 fn serial(node: CellId) -> u32 {
@@ -34,16 +34,16 @@ fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
     Skin::parse("skin.toml", &text).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// A bench whose wires and cells are as they are, and not as they should be.
+/// A bench with the actual wires and cells.
 struct Truth {
     wires: Wires,
     cells: usize,
-    /// From where to where something can be said.
+    /// From which end to which end messages pass.
     leads: BTreeMap<End, End>,
     dead: BTreeSet<CellId>,
     beats: BTreeMap<CellId, Heartbeat>,
     versions: BTreeMap<CellId, u16>,
-    /// What nothing else is to be damaged at.
+    /// Cells at which nothing else may be damaged.
     touched: BTreeSet<CellId>,
     expected: BTreeSet<Difference>,
 }
@@ -195,13 +195,13 @@ impl Truth {
         }
     }
 
-    fn speaks(&self, cell: CellId) -> bool {
+    fn sends(&self, cell: CellId) -> bool {
         !self.dead.contains(&cell)
     }
 
     fn works(&self, end: End) -> Option<End> {
         let other = *self.leads.get(&end)?;
-        let ours = |cell| self.speaks(cell) && !self.versions.contains_key(&cell);
+        let ours = |cell| self.sends(cell) && !self.versions.contains_key(&cell);
         (self.leads.get(&other) == Some(&end) && ours(end.cell) && ours(other.cell)).then_some(other)
     }
 
@@ -229,8 +229,8 @@ impl Truth {
             let mut ports = [PortState::default(); PORTS];
             for (port, state) in ports.iter_mut().enumerate() {
                 let end = End { cell, port };
-                // Something comes in where somebody speaks towards it.
-                let from = self.leads.iter().find(|(from, to)| **to == end && self.speaks(from.cell));
+                // A port receives where a cell sends towards it.
+                let from = self.leads.iter().find(|(from, to)| **to == end && self.sends(from.cell));
                 let Some((from, _)) = from else { continue };
                 *state = PortState {
                     number: from.cell.get(),
@@ -245,7 +245,7 @@ impl Truth {
         };
         let seen = |(&node, &heartbeat): (&CellId, &Heartbeat)| {
             let described = usize::from(node.get()) <= self.cells;
-            let alive = self.speaks(node);
+            let alive = self.sends(node);
             Seen {
                 node,
                 serial: described.then(|| serial(node)),
@@ -271,7 +271,7 @@ impl Truth {
     }
 }
 
-/// Wirings in which every cell has a way to the first.
+/// Wirings in which every cell has a route to the first.
 fn wiring() -> impl Strategy<Value = Vec<[usize; PORTS]>> {
     let parents = proptest::collection::vec(any::<Index>(), 1..14);
     let more = proptest::collection::vec((any::<Index>(), any::<Index>()), 0..10);
@@ -298,7 +298,7 @@ fn wiring() -> impl Strategy<Value = Vec<[usize; PORTS]>> {
 
 proptest! {
     #[test]
-    fn what_was_damaged_is_named_and_nothing_else(
+    fn every_damage_is_named_and_nothing_else(
         neighbors in wiring(),
         damages in proptest::collection::vec((0_u8..12, any::<Index>(), any::<Index>()), 0..6),
     ) {
@@ -320,7 +320,7 @@ proptest! {
 }
 
 #[test]
-fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_is_unreachable() {
+fn a_circle_is_named_by_its_cells_and_cells_below_it_are_unreachable() {
     let skin = skin(&[[2, 0, 0, 0], [1, 3, 4, 0], [2, 4, 0, 0], [2, 3, 5, 0], [4, 0, 0, 0]]);
     let mut truth = Truth::new(&skin);
     let mut seen = truth.seen();
@@ -341,7 +341,7 @@ fn a_circle_is_named_by_its_cells_and_what_hangs_below_it_is_unreachable() {
 }
 
 #[test]
-fn exchanged_cells_and_cells_without_a_number_are_named() {
+fn exchanged_cells_and_cells_without_a_node_id_are_named() {
     let skin = skin(&[[2, 0, 0, 0], [1, 0, 0, 0]]);
     let mut truth = Truth::new(&skin);
     let mut seen = truth.seen();
@@ -351,9 +351,9 @@ fn exchanged_cells_and_cells_without_a_number_are_named() {
     assert_eq!(
         lines,
         [
-            "number 2 is that of the cell with serial number 501, which is described as cell 1; 502 is described \
+            "node id 2 is used by the cell with serial number 501, which is described as cell 1; 502 is described \
              there: exchange the cells, or their serial numbers in the description",
-            "a cell without a number is at port 2 of cell 2: it gets one from the network, unless all are used",
+            "a cell without a node id is at port 2 of cell 2: it gets one from the network, unless all are used",
         ]
     );
 }

@@ -20,7 +20,7 @@ pub(crate) struct McapReader {
     chunk: Chunk,
     place: Place,
     state: State,
-    /// What was read when it was opened: the first message that is wanted, or why there is none.
+    /// What was read when it was opened: the first requested message, or why there is none.
     first: Option<Result<Target, Fault>>,
 }
 
@@ -56,7 +56,7 @@ impl McapReader {
         Ok(self.first.is_none())
     }
 
-    /// The next entry, or message of another topic where these are wanted. Never panics.
+    /// The next entry, or message of another topic where these are requested. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
@@ -68,7 +68,7 @@ impl McapReader {
         Ok(Some(self.state.item(channel, log_time, data)))
     }
 
-    /// Reads up to the next message that is wanted.
+    /// Reads up to the next requested message.
     fn advance(&mut self) -> Result<Option<Target>, Fault> {
         while self.place != Place::Over {
             match self.step() {

@@ -1,4 +1,4 @@
-//! What is known of an MCAP recording, and what its messages are.
+//! The schemas, channels and extras of an MCAP recording, and how its messages are read.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -16,7 +16,7 @@ use crate::recording::TOPIC_OF_STATE;
 use crate::ros2::cdr::CdrError;
 use crate::ros2::{Message, MessageError, messages};
 
-/// Bytes of attachments, metadata and frames in force that are kept.
+/// Bytes of attachments, metadata and latched frames that are kept.
 pub(super) const KEPT: usize = 16 << 20;
 /// Bytes that a file, a fact or a frame costs beside its own.
 const ENTRY: usize = Names::ENTRY;
@@ -30,7 +30,7 @@ const LONGEST_BUS: usize = 255;
 /// What is known of a recording.
 pub(crate) struct State {
     schemas: HashMap<u16, String>,
-    channels: HashMap<u16, LinkId>,
+    channels: HashMap<u16, Channel>,
     /// The places of topics that are only counted, by name and type.
     counted: HashMap<(String, String), usize>,
     names: Names,
@@ -40,13 +40,13 @@ pub(crate) struct State {
     /// Whether attachments and metadata are known already.
     knows_files: bool,
     any_frame: bool,
-    /// Whether messages that are only counted are wanted too.
+    /// Whether messages that are only counted are requested too.
     others: bool,
     /// Whether no other part of the recording came before.
     is_first: bool,
 }
 
-/// A message that is wanted. What it says is the record that was read last.
+/// A requested message; its content is the record that was read last.
 #[derive(Clone, Copy)]
 pub(super) struct Target {
     pub(super) channel: u16,
@@ -55,7 +55,7 @@ pub(super) struct Target {
 }
 
 /// A channel: its topic, and what is done with its messages.
-struct LinkId {
+struct Channel {
     topic: String,
     what: What,
 }
@@ -65,7 +65,7 @@ enum What {
     Frames {
         nine_digits: bool,
     },
-    /// Frames of before, that are in force when the recording begins.
+    /// Earlier frames that are latched when the recording begins.
     Latched,
     Notes,
     Foreign(Foreign),
@@ -74,8 +74,8 @@ enum What {
 }
 
 impl State {
-    /// Nothing yet, or what the parts `before` this one have: what is in force when a part begins is no news then, and
-    /// its topics are theirs. `others` if messages are wanted that are only counted.
+    /// Nothing yet, or the extras of the parts `before` this one: frames that are latched when this part begins are known
+    /// then, and its topics are theirs. `others` if messages are requested that are only counted.
     pub(crate) fn new(others: bool, before: Option<Extras>) -> Self {
         let is_first = before.is_none();
         let extras = before.unwrap_or_default();
@@ -131,7 +131,7 @@ impl State {
             match parse(opcode, &body) {
                 Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
                 Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
-                // What is wrong with it is said when it is come to.
+                // Its errors are reported when it is read.
                 _ => {}
             }
         }
@@ -148,7 +148,7 @@ impl State {
                     self.schemas.insert(id, name.to_owned());
                 }
             }
-            // Said again in the summary, or in every chunk.
+            // Repeated in the summary, or in every chunk.
             Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
             Raw::Channel { id, schema, topic, encoding, facts } => {
                 self.channel(id, schema, topic, encoding, &facts)?;
@@ -168,10 +168,10 @@ impl State {
         Ok(None)
     }
 
-    /// Takes a message, if nobody else wants it.
+    /// Counts or keeps a message; whether it is requested.
     fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
-        let channel_state = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
-        match channel_state.what {
+        let Channel { topic, what } = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
+        match *what {
             What::Counted(topic) => {
                 if let Some(topic) = self.extras.topics.get_mut(topic) {
                     topic.messages += 1;
@@ -180,8 +180,8 @@ impl State {
             }
             What::Latched if !self.is_first => Ok(false),
             What::Latched => {
-                let record = latched(data)
-                    .map_err(|source| Damage::Message { topic: channel_state.topic.clone(), source })?;
+                let record =
+                    latched(data).map_err(|source| Damage::Message { topic: topic.clone(), source })?;
                 let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
                 let (frame, nanos) = (record.frame, record.time.nanos);
                 self.keep(bus.len() + ENTRY, |extras| {
@@ -249,12 +249,12 @@ impl State {
                 });
             What::Counted(*place)
         });
-        self.channels.insert(id, LinkId { topic: topic.to_owned(), what });
+        self.channels.insert(id, Channel { topic: topic.to_owned(), what });
         Ok(())
     }
 
     pub(super) fn item<'a>(&'a mut self, channel: u16, log_time: u64, message: &'a [u8]) -> Item<'a> {
-        let Some(LinkId { topic, what }) = self.channels.get(&channel) else {
+        let Some(Channel { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
         };
         let decoded = match *what {
@@ -263,7 +263,7 @@ impl State {
                 let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
                 return Item::Other(Other { topic, schema, nanos: log_time, message });
             }
-            // They are never wanted.
+            // They are never requested.
             What::Latched => latched(message).map(Entry::Frame),
             What::Frames { nine_digits } => {
                 let time = Timestamp { nanos: log_time, nine_digits };
@@ -290,7 +290,7 @@ impl State {
     }
 }
 
-/// What a message says, unless it is longer than it may be.
+/// Decodes a message, unless it is too long.
 fn decode<'a, T>(
     message: &'a [u8],
     limit: usize,
@@ -300,7 +300,7 @@ fn decode<'a, T>(
     if bytes > limit { Err(MessageError::Long { bytes, limit }) } else { Ok(decode(message)?) }
 }
 
-/// A frame of before, with its own time.
+/// A latched frame, with its own time.
 fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
         messages::frame(message, Timestamp { nanos: messages::stamp(message)?, nine_digits: true })
@@ -313,7 +313,7 @@ fn beginning(topic: &str) -> &str {
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
 }
 
-/// A message that is not what its channel says.
+/// A message that does not have the type of its channel.
 fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> Entry<'a> {
     let topic = beginning(topic);
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));

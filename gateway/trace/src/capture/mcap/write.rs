@@ -8,13 +8,13 @@ use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{NOTES, TOPIC_OF_BUS};
 
-/// Channels of frames: each costs a reader memory, and what a log calls its buses may be anything.
-const CHANNEL_STATES: usize = 64;
-/// Where the frames of further buses stand; each bears its bus' name.
+/// Channels of frames at most: each costs a reader memory, and a log may name any number of buses.
+const CHANNELS: usize = 64;
+/// The topic of the frames of further buses; each has its bus' name.
 const FURTHER: &str = "/further";
-/// The metadata that says what a recording was made from, when that was a capture.
+/// The metadata with the source of a recording that was made from a capture.
 pub const ORIGIN: &str = "capture";
-/// What it says.
+/// Its content.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
 /// Bytes of notes that wait for the first frame.
 const WAITING: usize = 1 << 20;
@@ -23,8 +23,8 @@ const WAITING: usize = 1 << 20;
 #[derive(Debug)]
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
-    channel_states: Vec<LinkId>,
-    /// The lane of the last frame.
+    channels: Vec<BusChannel>,
+    /// The channel of the last frame.
     last: usize,
     notes: Option<Channel>,
     /// Notes before the first frame.
@@ -35,7 +35,7 @@ pub(crate) struct McapWriter<W: Write> {
 
 /// The channel of a bus' frames with times of so many digits.
 #[derive(Debug)]
-struct LinkId {
+struct BusChannel {
     interface: String,
     nine_digits: bool,
     channel: Channel,
@@ -56,14 +56,7 @@ impl<W: Write> McapWriter<W> {
         let mut file = FileWriter::new(out)?;
         let (key, value) = SOURCE;
         file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
-        Ok(Self {
-            file,
-            channel_states: Vec::new(),
-            last: 0,
-            notes: None,
-            waiting: Some(Vec::new()),
-            bytes: 0,
-        })
+        Ok(Self { file, channels: Vec::new(), last: 0, notes: None, waiting: Some(Vec::new()), bytes: 0 })
     }
 
     /// Writes an entry.
@@ -73,9 +66,9 @@ impl<W: Write> McapWriter<W> {
                 if self.waiting.is_some() {
                     self.write_waiting(record.time.nanos)?;
                 }
-                let channel_state = self.channel_state(record)?;
-                let Some(channel_state) = self.channel_states.get_mut(channel_state) else { return Ok(()) };
-                self.file.write(&mut channel_state.channel, record.time.nanos, record)
+                let place = self.channel(record)?;
+                let Some(bus) = self.channels.get_mut(place) else { return Ok(()) };
+                self.file.write(&mut bus.channel, record.time.nanos, record)
             }
             Entry::Note(note) => match &mut self.waiting {
                 Some(waiting) if note.line > 0 && self.bytes < WAITING => {
@@ -108,24 +101,19 @@ impl<W: Write> McapWriter<W> {
         self.file.write(channel, note.nanos, note)
     }
 
-    /// The place of a frame's lane, which is made when it is the first one there.
-    fn channel_state(&mut self, record: &Record<'_>) -> io::Result<usize> {
+    /// The place of a frame's channel, which is created for its first frame.
+    fn channel(&mut self, record: &Record<'_>) -> io::Result<usize> {
         let nine_digits = record.time.nine_digits;
-        let is = |name: &str, channel_state: &LinkId| {
-            channel_state.nine_digits == nine_digits && channel_state.interface == name
-        };
-        if self.channel_states.get(self.last).is_some_and(|channel_state| is(record.interface, channel_state))
-        {
+        let is = |name: &str, bus: &BusChannel| bus.nine_digits == nine_digits && bus.interface == name;
+        if self.channels.get(self.last).is_some_and(|bus| is(record.interface, bus)) {
             return Ok(self.last);
         }
-        let find = |channel_states: &[LinkId], name: &str| {
-            channel_states.iter().position(|channel_state| is(name, channel_state))
-        };
-        let mut found = find(&self.channel_states, record.interface);
+        let find = |channels: &[BusChannel], name: &str| channels.iter().position(|bus| is(name, bus));
+        let mut found = find(&self.channels, record.interface);
         let mut name = record.interface;
-        if found.is_none() && self.channel_states.len() >= CHANNEL_STATES {
+        if found.is_none() && self.channels.len() >= CHANNELS {
             name = FURTHER;
-            found = find(&self.channel_states, name);
+            found = find(&self.channels, name);
         }
         self.last = if let Some(place) = found {
             place
@@ -133,8 +121,8 @@ impl<W: Write> McapWriter<W> {
             let topic = format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
             let digits = if nine_digits { "9" } else { "6" };
             let channel = self.file.channel::<Record<'_>>(&topic, &[("time_digits", digits)])?;
-            self.channel_states.push(LinkId { interface: name.to_owned(), nine_digits, channel });
-            self.channel_states.len() - 1
+            self.channels.push(BusChannel { interface: name.to_owned(), nine_digits, channel });
+            self.channels.len() - 1
         };
         Ok(self.last)
     }

@@ -17,7 +17,7 @@ impl Draft<'_> {
         let pairs = motion.distributed.iter().zip(&motion.central).enumerate();
         let figures = pairs.map(|(joint, (distributed, central))| {
             let joint = joint + 1;
-            let title = format!("Joint {joint}: what the cells say together, and what the gateway computes");
+            let title = format!("Joint {joint}: sum of the cells' torques, and the central computation");
             self.figure(format!("torque-joint{joint}"), title, Axis::new("torque", "Nm"))
                 .half()
                 .series([self.line("distributed", distributed)])
@@ -72,7 +72,7 @@ impl Draft<'_> {
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
             "Absolute errors in Nm, joint by joint: single cells where the joint carries them, and the whole skin's sum",
-            ["", "single cells: mean", "greatest", "torques", "whole skin: mean", "greatest", "epochs"],
+            ["", "single cells: mean", "max", "torques", "whole skin: mean", "max", "epochs"],
             joints.chain([all, papers]),
         ))
     }
@@ -132,7 +132,7 @@ impl Draft<'_> {
             let cells = ["the idle machine's thread woke late", p50, "", p99, max, ""];
             rows.push(cells.map(str::to_owned).into());
         }
-        let head = ["µs", "median", "90 %", "99 %", "greatest", "values"];
+        let head = ["µs", "median", "90 %", "99 %", "max", "values"];
         Section::new("cycle", "Cycle times")
             .text("The distributed computation has no part in a tick: the sum is kept while replies come.")
             .figures(figures)

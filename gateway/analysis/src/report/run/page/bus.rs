@@ -76,7 +76,7 @@ impl Draft<'_> {
             "complete",
             "last reply, ms: median",
             "99 %",
-            "greatest",
+            "max",
         ];
         Table::new("Replies by bus", head, rows)
     }
@@ -124,7 +124,7 @@ impl Draft<'_> {
             "packets lost",
             "restarts",
             "reply, ms: mean",
-            "greatest",
+            "max",
         ];
         let of = self.run.skin.cells.len();
         let title =
@@ -148,7 +148,7 @@ impl Draft<'_> {
         buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
     }
 
-    /// Whether real buses would carry it: in this run, and at most. Only rates that somebody chose are judged.
+    /// Whether real buses would carry it: in this run, and at most. Only chosen rates are rated, not defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         for bus in self.shadows() {
@@ -179,7 +179,7 @@ impl Draft<'_> {
                 .marks([Mark::y(100.0, "all that it can")])
         };
         let text = "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
-                    own bits make. This run is judged by the second in which most is asked of the bus; in the worst case all cells \
+                    own bits make. This run is rated by its second with the highest load; in the worst case all cells \
                     answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
                     wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
@@ -227,7 +227,7 @@ impl Draft<'_> {
         row("frames of buses that the skin does not have".to_owned(), run.others, false);
         row("messages that cannot be read".to_owned(), run.unreadable, false);
         Section::new("losses", "Losses")
-            .text("What can be lost and was not has a 0; other rows are there only when there is something to say.")
+            .text("Rows of possible losses are always shown; other rows only when they are not 0.")
             .tables([Table::new("", ["what", "count"], rows)])
     }
 }
