@@ -8,7 +8,7 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 #[test]
-fn the_moving_arm_is_run_recorded_drawn_and_judged() {
+fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     let place = Place::new();
     let ended = place.start("gateway", "experiment fig7 fig6 fig8 --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -34,7 +34,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_judged() {
     assert!((1e-4..0.0356).contains(&summed), "{summed}");
     assert!((value(finding(1, "active at once")) - 24.0).abs() < 0.5);
     assert!(value(finding(1, "velocity")) > 0.0);
-    assert!(value(finding(2, "after the switch, greatest")) <= 0.0, "the central computation is off");
+    assert!(value(finding(2, "after the switch, maximum")) <= 0.0, "the central computation is off");
     let page = place.read("results/report.html");
     assert!(page.contains("<svg") && page.contains("0.0356"));
     let torque = place.read("results/fig6-joint2.csv");
@@ -53,7 +53,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_judged() {
 }
 
 #[test]
-fn what_fails_or_is_ended_leaves_nothing() {
+fn a_failed_or_interrupted_experiment_leaves_nothing() {
     let place = Place::new();
     place.write("file", "mine");
     for (words, code, said) in [
