@@ -222,7 +222,7 @@ impl Bench<'_> {
             }
             script.fault += 1;
             if let FaultKind::Wire { link_down, from, to, both_ways } = fault.kind {
-                self.break_wire(link_down, (from, to), both_ways, progress);
+                self.switch_link(link_down, (from, to), both_ways, progress);
             }
             let FaultKind::Process { action, cells } = &fault.kind else { continue };
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
