@@ -1,4 +1,4 @@
-//! Finds out which revision of the sources this is, so that recordings can say it.
+//! Finds out the revision of the sources for the metadata of recordings.
 
 use std::process::Command;
 

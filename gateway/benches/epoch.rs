@@ -2,7 +2,7 @@
 //! `cargo bench -p gateway --bench epoch`
 //!
 //! All frames wait in the socket when the clock starts, as they do when a receiver has let them gather. *Frames* is what the
-//! receiver does to have them with their time stamps (`recvmmsg`), *table* is that and all that becomes of them: CRC, accounts,
+//! receiver does to have them with their time stamps (`recvmmsg`), *table* is that and their processing: CRC, accounts,
 //! sums. The C program (`recv.c`) asks for each frame alone, without a time stamp, and looks at one byte of it.
 
 use std::path::{Path, PathBuf};
@@ -23,10 +23,10 @@ use protocol::time::Micros;
 use vcan_setup::embedded::Served;
 
 const CELLS: usize = 253;
-/// Who hears it knows that the replies before it have been delivered.
+/// Its receiver knows that the replies before it have been delivered.
 const AFTER: u32 = 0x7FF;
 
-/// An embedded bus with replies, who sends them, and who takes them.
+/// An embedded bus with replies, their sender, and their receiver.
 struct Wire {
     _served: Served,
     cells: Bus,
@@ -48,7 +48,7 @@ impl Wire {
         Self { cells: open(Vec::new()), gateway, bell, inbox: Inbox::new(), _served: served }
     }
 
-    /// Lets these wait in the gateway's socket, all of them.
+    /// Queues all of these in the gateway's socket.
     fn put(&mut self, replies: &[Frame]) {
         self.cells.send(replies).expect("there is room");
         self.cells.send(&[Frame::classic(AFTER, &[]).expect("an empty frame")]).expect("there is room");
@@ -79,7 +79,7 @@ fn replies(epoch: Epoch) -> Vec<Frame> {
     CellId::all().take(CELLS).flat_map(reply).collect()
 }
 
-/// A table that follows epochs, and hears them.
+/// A table that follows epochs.
 struct Listener {
     table: Table,
     number: u64,
@@ -128,13 +128,13 @@ fn compile() -> PathBuf {
     program
 }
 
-/// Lets the C program take so many epochs; how long it says that took.
+/// Lets the C program take so many epochs; the time that it prints.
 fn in_c(program: &Path, epochs: u64) -> Duration {
     let output = Command::new(program).args([epochs.to_string(), CELLS.to_string()]).output();
     let output = output.expect("it was compiled");
     let text = String::from_utf8_lossy(&output.stdout);
     let words: Vec<u64> = text.split_whitespace().filter_map(|word| word.parse().ok()).collect();
-    let &[nanos, sum] = words.as_slice() else { unreachable!("recv says two numbers: {output:?}") };
+    let &[nanos, sum] = words.as_slice() else { unreachable!("recv prints two numbers: {output:?}") };
     assert_eq!(sum, epochs * (1..=253).sum::<u64>(), "every frame was taken");
     Duration::from_nanos(nanos)
 }

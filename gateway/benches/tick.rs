@@ -1,6 +1,6 @@
 //! How long one tick of the control loop takes: `cargo bench -p gateway --bench tick`
 //!
-//! From 1 to 10 000 cells, 253 on a bus, over whole epochs (one tick in eight sends joints to every bus, which take no
+//! From 1 to 10 000 cells, 253 on a bus, over complete epochs (one tick in eight sends joints to every bus, which take no
 //! time here). *Distributed* leaves the torques to the cells, *central* computes them in the tick, of cells none of which
 //! is in contact, or all. What fills the snapshots is the receivers' work, and not counted.
 
@@ -28,7 +28,7 @@ const ON_A_BUS: usize = 253;
 /// Ticks from one broadcast to the next.
 const EPOCH: u64 = 8;
 
-/// What the loop does, and what cells feel.
+/// What the loop does, and the contact states.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Case {
     Distributed,
@@ -59,7 +59,7 @@ impl Case {
     }
 }
 
-/// A UR5 with so many cells; from the second bus on it wears the first one's again.
+/// A UR5 with so many cells; further buses repeat the cells of the first one.
 fn skin(cells: usize) -> Skin {
     let text = generate(&Target { cells: cells.min(ON_A_BUS), ..Target::default() }).expect("a UR5 has room");
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");

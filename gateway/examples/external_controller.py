@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Closes skinbus' control loop from another program: the arm gives way to who pushes its skin.
+"""Closes skinbus' control loop from another program: a push on its skin moves the arm.
 
     python3 external_controller.py SOCKET [--damping NM_S_PER_RAD]
 

@@ -56,7 +56,7 @@ fn seconds(frames: &[Seen]) -> f64 {
     ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
 }
 
-/// What 253 cells say that are pressed by 1.5 N each, while each joint swings to and fro.
+/// What 253 cells send that are pressed by 1.5 N each, while each joint swings to and fro.
 fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
     let central = Central::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
@@ -107,8 +107,8 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
     let mcap = Mcap { path: path.clone(), split, attachments: Vec::new(), command_line: Vec::new() };
     let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
     let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
-    let (mut outlet, lane) = feed::bus_feed(true, Arc::default(), Arc::default());
-    let feed = Feed { bus_feeds: vec![lane], ticks: None };
+    let (mut outlet, bus_feed) = feed::bus_feed(true, Arc::default(), Arc::default());
+    let feed = Feed { bus_feeds: vec![bus_feed], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;
     let began = Instant::now();
     let mut count = 0_u64;

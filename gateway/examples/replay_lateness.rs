@@ -1,5 +1,5 @@
-//! How late a replay sends frames that come every 2 ms, on an embedded bus that somebody reads, for some shares of
-//! spinning: `cargo run --release -p gateway --example replay_lateness [SECONDS]`
+//! How late a replay sends frames that come every 2 ms, on an embedded bus with a reader, for some spinning times:
+//! `cargo run --release -p gateway --example replay_lateness [SECONDS]`
 //!
 //! Beside it stands how late the same machine wakes a thread that has nothing to do.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a measurement may stop")]
@@ -37,7 +37,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let file = folder.path().join("grid.log");
     std::fs::write(&file, grid)?;
 
-    println!("spin, us   late 50 % / 90 % / 99 % / greatest, us   idle        processor, cores");
+    println!("spin, us   late 50 % / 90 % / 99 % / maximum, us   idle        processor, cores");
     for spin in [0, 20, 50, 100, 150, 300] {
         let options = Options {
             files: vec![file.clone()],

@@ -147,7 +147,7 @@ pub(crate) struct Demo {
 /// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
 /// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
-/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is not whole; 2:
+/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is incomplete; 2:
 /// wrong use or configuration; 3: the robot was halted at its end.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:

@@ -1,4 +1,4 @@
-//! Several buses, some of CAN FD and some classic: one that is lost is lost alone, and comes back.
+//! Several buses, some of CAN FD and some classic: losing one does not affect the others, and it comes back.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -24,7 +24,7 @@ fn place() -> Place {
     place
 }
 
-/// Serves a bus as somebody else would.
+/// Serves a bus as another program would.
 fn serve(place: &Place, bus: &str) -> Running {
     let server = place.start("vcan-setup", &format!("serve {bus}"));
     server.prints(&format!("serving {bus} at "));
@@ -42,8 +42,8 @@ fn test_clients(place: &Place) -> [TestClient; 3] {
     BUSES.map(|(bus, format)| TestClient::on(place, bus, format))
 }
 
-/// Ends a bench, and who served vcan1 for it; sees that all adds up on all buses, and that only vcan1 was lost, so
-/// often.
+/// Ends a bench and the server of vcan1; checks that all counts add up on all buses, and that only vcan1 was lost,
+/// so often.
 fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64) {
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -87,7 +87,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
         said("vcan1 works again");
         test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     }
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, None, 2);
     let summary = place.summary();
     assert_eq!(summary.total("/loop/bad_cycles"), 0, "{:#}", summary.0);
@@ -95,7 +95,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
 }
 
 #[test]
-fn each_bus_has_a_tree_of_its_own_which_is_whole_again_when_the_bus_is_back() {
+fn each_bus_has_its_own_tree_which_is_complete_again_when_the_bus_is_back() {
     let place = place();
     let expected = Target { cells: CELLS, buses: 3, reply: Reply::Sum, ..Target::default() };
     place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
@@ -106,13 +106,13 @@ fn each_bus_has_a_tree_of_its_own_which_is_whole_again_when_the_bus_is_back() {
     signal(server(&place, "vcan1"), Signal::KILL);
     bench.hears("vcan1 works again");
     whole();
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, None, 1);
     assert_eq!(place.summary().total("/loop/bad_cycles"), 0, "{:#}", place.summary().0);
 }
 
 #[test]
-fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_up_for() {
+fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() {
     let place = place();
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "--record run.mcap");
@@ -127,18 +127,18 @@ fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_u
         test_client.waits_for_joints(30);
         test_client.waits_for_torques(1..=4);
     }
-    // The robot is halted and goes on while the bus does not hear of it.
+    // The robot is halted and resumed while the bus does not receive it.
     place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
-    (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "spoken again"));
+    (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "come back"));
     let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
     place.start("gateway", "ack vcan2 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, Some(second), 1);
     assert_eq!(place.summary().total("/loop/bad_cycles"), 0, "{:#}", place.summary().0);
     assert!(place.summary().number("/loop/unsent") > 0, "{:#}", place.summary().0);
@@ -150,7 +150,7 @@ fn while_a_bus_is_away_the_others_go_on_and_what_was_changed_meanwhile_is_made_u
 }
 
 #[test]
-fn cells_that_were_away_hear_of_a_resume_and_of_a_touch_that_they_missed() {
+fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     let place = place();
     let late = "at_s = 2.0\nfor_s = 60.0\nbus = \"vcan1\"";
     let text = place.read("scenario.toml");
@@ -243,7 +243,7 @@ fn a_gateway_that_has_no_bus_left_ends() {
 }
 
 #[test]
-fn each_bus_has_the_kind_that_is_said_of_it() {
+fn each_bus_has_the_requested_kind() {
     let place = place();
     let run = |kinds: &str| {
         place

@@ -1,6 +1,6 @@
 //! `docs/reference/command-line.md` lists every command and option of the programs, as their `-h` does.
 //!
-//! What is listed stands between `<!-- program: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test
+//! The lists are between `<!-- program: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test
 //! writes it instead of comparing.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
@@ -28,7 +28,7 @@ fn entries(help: &str, heading: &str) -> Vec<(String, String)> {
     let below = help.lines().skip_while(|line| *line != heading).skip(1);
     for line in below.take_while(|line| line.starts_with(' ')) {
         let text = line.trim_start();
-        // Names stand in column 2, or 6 where there is no short one; what does not is more of a meaning.
+        // Names start in column 2, or 6 without a short one; other lines continue a meaning.
         let (name, meaning) = match line.len() - text.len() {
             2 | 6 => text.split_once("  ").unwrap_or((text, "")),
             _ => ("", text),

@@ -38,7 +38,7 @@ impl Workshop {
         Self::with(text, &older(text), "")
     }
 
-    /// The cells 1 to their number in one process, with what `had` says.
+    /// The cells from 1 on in one process, with the skin `had`.
     fn with(text: &str, had: &str, more: &str) -> Self {
         let place = Place::new();
         place.write("skin.toml", text);
@@ -73,7 +73,7 @@ impl Workshop {
         }
     }
 
-    /// What is in the flash of each cell, by number.
+    /// The flash of each cell, by node id.
     fn flashes(&self) -> BTreeMap<u8, Option<Parameters>> {
         let of = |cell: &protocol::skin::Cell| {
             let file = self.place.path(&format!("flash/vcan0-{}.flash", cell.node));
@@ -84,7 +84,7 @@ impl Workshop {
         self.skin().cells.iter().filter_map(of).collect()
     }
 
-    /// Sees that each cell has the older skin's parameters or the new one's; how many have the new.
+    /// Checks that each cell has the older skin's parameters or the new one's; how many have the new.
     fn none_is_mixed(&self) -> usize {
         let of = |name: &str| {
             let skin = Skin::read(&self.place.path(name)).unwrap();
@@ -100,7 +100,7 @@ impl Workshop {
         flashes.iter().filter(|(node, parameters)| **parameters == new.get(node).copied()).count()
     }
 
-    /// Sees that all cells say that they have the skin's configuration.
+    /// Checks that all cells report the skin's configuration.
     fn all_have_it(&self) {
         let listed = self.list("--skin skin.toml").unwrap();
         let cells = listed["cells"].as_array().unwrap();
@@ -170,10 +170,10 @@ fn killed_in_the_middle_and_run_again_it_is_complete_and_nothing_is_mixed() {
 }
 
 #[test]
-fn cells_that_hang_hold_up_nobody_and_are_named() {
+fn cells_that_hang_delay_no_others_and_are_named() {
     let text = skin(9);
     let workshop = Workshop::new(&text);
-    // The cells of the second process: their numbers follow.
+    // The cells of the second process: the next node ids.
     let more = skin(12);
     workshop.place.write("skin.toml", &more);
     workshop.place.write("had.toml", &older(&more));
@@ -187,7 +187,7 @@ fn cells_that_hang_hold_up_nobody_and_are_named() {
         (listed["cells"].as_array().unwrap().iter().filter(ready).count() == 12).then_some(())
     });
     let running = workshop.commission("--json");
-    // Its first word is heard, and no answer comes.
+    // Its first message is received, and no answer comes.
     hung.signal(Signal::STOP);
     let ended = running.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -207,8 +207,8 @@ fn cells_that_hang_hold_up_nobody_and_are_named() {
 }
 
 #[test]
-fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
-    // The description calls 1 what is 6, and so on.
+fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
+    // Node 6 is 1 in the description, and so on.
     let had = skin(6);
     let text = had.replace("version = 1\n", "version = 1   # as drawn\n");
     let serial = |node: u32| format!("node = {node}\nserial = {}", 100_000 + node);
@@ -237,7 +237,7 @@ fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
         ended.stderr.contains("the cell with serial number 100001 is 1 on vcan0, 6 in skin.toml"),
         "{ended:#?}"
     );
-    assert_eq!(workshop.place.read("as-is.toml"), text, "numbers and neighbors, and nothing else");
+    assert_eq!(workshop.place.read("as-is.toml"), text, "node ids and neighbors, and nothing else");
     assert_eq!(workshop.commission("--json").end().well().stdout.matches("\"already so\"").count(), 6);
     let listed = workshop.list("--skin as-is.toml").unwrap();
     assert!(listed["cells"].as_array().unwrap().iter().all(|cell| cell["skin"] == "yes"), "{listed:#}");
@@ -247,7 +247,7 @@ fn numbers_on_the_bus_are_written_into_a_copy_of_the_description() {
 }
 
 #[test]
-fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters() {
+fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
     let place = Place::new();
     let text = generate(&Target { cells: 8, reply: Reply::Sum, ..Target::default() }).unwrap();
     place.write("skin.toml", &text);
@@ -273,7 +273,7 @@ fn cells_from_the_factory_get_numbers_from_the_network_and_then_their_parameters
         let file = fs::read(place.path(&format!("flash/vcan0-s{}.flash", described.serial))).unwrap();
         let kept = flash::decode(Identity { cell: None, serial: described.serial }, &file).unwrap();
         assert_eq!((kept.number, kept.parameters), (Some(there.node), Some(skin.parameters(described))));
-        // What is wired to what is the same, by other names.
+        // The wiring is the same, by other node ids.
         let renamed =
             |node: CellId| skin.cells.iter().position(|cell| cell.node == node).map(|at| copy.cells[at].node);
         assert_eq!(described.neighbors.map(|it| it.and_then(renamed)), there.neighbors);
@@ -323,7 +323,7 @@ fn a_list_is_redrawn_while_it_is_watched() {
 }
 
 #[test]
-fn unknown_nodes_are_named_and_left_alone_and_who_is_missing_is_named() {
+fn unknown_nodes_are_named_and_left_alone_and_missing_cells_are_named() {
     let text = skin(6);
     let workshop = Workshop::new(&text);
     let without: String = {
@@ -341,7 +341,7 @@ fn unknown_nodes_are_named_and_left_alone_and_who_is_missing_is_named() {
         listed["cells"].as_array().unwrap().iter().map(|cell| cell["skin"].as_str().unwrap()).collect();
     assert_eq!(says, ["yes", "yes", "yes", "unknown", "yes", "yes"]);
     assert_eq!(listed["missing"], serde_json::json!([4]));
-    // The stranger has what it had.
+    // The unknown cell keeps its parameters.
     workshop.place.write("skin.toml", &text);
     assert_eq!(workshop.none_is_mixed(), 5);
     workshop.commission("--node-ids out.toml").end().well();
@@ -349,7 +349,7 @@ fn unknown_nodes_are_named_and_left_alone_and_who_is_missing_is_named() {
 }
 
 #[test]
-fn beside_a_gateway_nothing_is_said() {
+fn beside_a_gateway_nothing_is_sent() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(30.0, "");
@@ -357,7 +357,7 @@ fn beside_a_gateway_nothing_is_said() {
     place.write("other.toml", &older(&text));
     let said = place.start("gateway", "commission other.toml --bus-kind embedded --quiet").end();
     assert_eq!(said.refusal(1), "gateway: another gateway is on vcan0: stop it first");
-    // A list disturbs nobody.
+    // Listing disturbs no one.
     let listed = place.start("gateway", "cells vcan0 --bus-kind embedded --skin skin.toml").end().well();
     assert_eq!(listed.stdout.lines().count(), 1 + 8 + 1, "{}", listed.stdout);
     assert!(

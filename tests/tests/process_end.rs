@@ -1,4 +1,4 @@
-//! However a bench ends, nothing of it is left.
+//! However a bench ends, nothing of it remains.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -13,12 +13,12 @@ use protocol::message::Message;
 use rustix::process::{Signal, kill_process_group};
 
 #[test]
-fn a_gateway_that_is_killed_takes_everything_along() {
+fn all_processes_end_with_a_killed_gateway() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
     assert_eq!(bench.cells().len(), 8);
-    // Also a cell that is stopped, and hears of nothing.
+    // Also a stopped cell, which handles no signal.
     let stopped = bench.cell(5);
     process::signal(stopped, Signal::STOP);
     until("a stopped cell", || is_stopped(stopped).then_some(()));
@@ -45,7 +45,7 @@ fn a_signal_ends_a_bench_early_and_well() {
         assert!(summary.figure("/duration_s") < 50.0);
         let log = Log::read(&place.read("run.log"), Format::Fd);
         assert_eq!(summary.number("/recording/frames"), log.frames.len() as u64);
-        // The cells are told to stop answering, and nothing tells them to go on.
+        // The cells are halted, and are not resumed.
         let last = log.messages.iter().rev().find_map(|(message, _)| match message {
             Message::Halt | Message::Resume | Message::Joints { .. } => Some(*message),
             _ => None,
@@ -58,7 +58,7 @@ fn a_signal_ends_a_bench_early_and_well() {
 fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
     let place = Place::new();
     place.pressed();
-    // A terminal signals everyone in the process group at once.
+    // A terminal signals the whole process group at once.
     let mut command = place.command(
         "gateway",
         "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --summary run.json",
@@ -83,7 +83,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
 }
 
 #[test]
-fn a_signal_while_starting_is_a_run_that_failed_and_leaves_what_it_knows() {
+fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
     let place = Place::new();
     place.pressed();
     let bench = place.bench(60.0, "--quiet --record run.mcap");
@@ -92,7 +92,7 @@ fn a_signal_while_starting_is_a_run_that_failed_and_leaves_what_it_knows() {
     assert_eq!(bench.end().refusal(1), "gateway: interrupted while starting");
     place.is_left_clean();
     assert_eq!(place.summary().0["failure"], "interrupted while starting");
-    // What was heard before is in the log, if anything was.
+    // Frames received before are in the log, if there were any.
     let files: Vec<_> = place.files().into_iter().filter(|name| name != "run.log").collect();
     assert_eq!(files, ["run.json", "scenario.toml", "skin.toml"]);
     assert!(!place.path("run.log").exists() || !place.read("run.log").is_empty());
@@ -110,7 +110,7 @@ fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
     place.is_left_clean();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stdout.contains("8 cells, ") && ended.stdout.contains(" s, failed "), "{}", ended.stdout);
-    // The cells hear of it too, and may be quicker.
+    // The cells notice it too, and may be quicker.
     let usual = |line: &&str| {
         line.contains(" s  ") || *line == "starting" || line.starts_with("the process of cell ")
     };
@@ -127,7 +127,7 @@ fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
 }
 
 #[test]
-fn a_reader_that_leaves_costs_the_table_and_not_the_summary() {
+fn a_reader_that_ends_loses_the_table_and_not_the_summary() {
     let place = Place::new();
     place.pressed();
     let script = "\"$0\" run skin.toml --bus-kind embedded --scenario scenario.toml --duration 0.5 \

@@ -8,7 +8,7 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 #[test]
-fn the_moving_arm_is_run_recorded_drawn_and_judged() {
+fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     let place = Place::new();
     let ended = place.start("gateway", "experiment fig7 fig6 fig8 --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -53,7 +53,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_judged() {
 }
 
 #[test]
-fn what_fails_or_is_ended_leaves_nothing() {
+fn a_failed_or_interrupted_experiment_leaves_nothing() {
     let place = Place::new();
     place.write("file", "mine");
     for (words, code, said) in [

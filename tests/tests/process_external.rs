@@ -54,7 +54,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     bench.hears(&format!(
         "the robot is halted: too many bad cycles in a row: {NOBODY}; `gateway ack vcan0 --bus-kind embedded`"
     ));
-    // What was lost is not had again by somebody saying hello; a person has to say so.
+    // A hello does not resume the robot; a person has to do that.
     let second = python(&place);
     second.prints("HALTED");
     assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
@@ -70,7 +70,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
 }
 
 #[test]
-fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
+fn a_controllers_nonsense_is_counted_and_ignored() {
     let place = place(25);
     let gateway = place.path("controller.sock");
     let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
@@ -80,9 +80,9 @@ fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
     own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), &gateway).unwrap();
 
     let mut state = [0; 200];
-    let (mut told, give_up) = (0, Instant::now() + TIMEOUT);
-    while told < 200 {
-        assert!(Instant::now() < give_up, "the gateway stopped talking to us: {}", bench.stderr());
+    let (mut sent, give_up) = (0, Instant::now() + TIMEOUT);
+    while sent < 200 {
+        assert!(Instant::now() < give_up, "the gateway stopped sending to us: {}", bench.stderr());
         let Ok(184) = own.recv(&mut state) else { continue };
         let tick = u64::from_le_bytes(state[8..16].try_into().unwrap());
         let good = answer(tick, 1.0);
@@ -96,8 +96,8 @@ fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
             &magic,
             &answer(tick + 1_000, 1.0),
         ];
-        let _ = own.send_to(nonsense[told % nonsense.len()], &gateway);
-        told += 1;
+        let _ = own.send_to(nonsense[sent % nonsense.len()], &gateway);
+        sent += 1;
     }
     bench.hears("the robot is halted: too many bad cycles in a row: ");
     bench.signal(Signal::TERM);
@@ -110,10 +110,10 @@ fn a_controller_that_talks_nonsense_is_counted_and_believed_in_nothing() {
     assert!(summary.count("/loop/bad_cycles", NONSENSE) > 0, "{:#}", summary.0);
     let reasons = [NONSENSE, NOBODY, MISSING].map(|reason| summary.count("/loop/bad_cycles", reason));
     assert_eq!(summary.total("/loop/bad_cycles"), reasons.iter().sum::<u64>());
-    // Nothing of it was done: the robot stands where it stood.
+    // Nothing of it was executed: the robot stands where it stood.
     let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);
     let mut positions = log.joints();
     positions.dedup();
     assert_eq!(positions.len(), 1);
-    assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are told");
+    assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are halted");
 }

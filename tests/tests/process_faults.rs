@@ -1,4 +1,4 @@
-//! Benches of real processes in which something breaks: it is named and counted, and the loop goes on.
+//! Faults in benches of real processes: they are named and counted, and the loop goes on.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -54,11 +54,11 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
     for said in [
         "scenario: Kill cell 2 on vcan0",
         "the process of cell 2 on vcan0 ended (signal: 9 (SIGKILL))",
-        "cell 3 on vcan0 started anew",
+        "cell 3 on vcan0 restarted",
     ] {
         assert!(stderr.contains(said), "{said:?} in\n{stderr}");
     }
-    for (cell, what) in [(2, "fallen silent"), (4, "fallen silent"), (4, "spoken again")] {
+    for (cell, what) in [(2, "fallen silent"), (4, "fallen silent"), (4, "come back")] {
         assert!(tells(&stderr, cell, what), "cell {cell} has {what} in\n{stderr}");
     }
     let summary = place.summary();
@@ -66,7 +66,7 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
     assert_eq!(summary.of_bus("/uplink/restarts"), 1);
     assert_eq!(summary.of_bus("/cells/dead"), 1);
     assert!(summary.of_bus("/replies/skipped") > 0, "cell 4 answers no old joints: {:#}", summary.0);
-    assert!(summary.of_bus("/replies/in_doubt") > 0, "nobody knows what cell 2 did last: {:#}", summary.0);
+    assert!(summary.of_bus("/replies/in_doubt") > 0, "what cell 2 did last is unknown: {:#}", summary.0);
     assert!(summary.number("/loop/ticks") + summary.number("/loop/ticks_skipped") >= 2_000);
 
     let log = Log::read(&place.read("run.log"), Format::Fd);
@@ -77,7 +77,7 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
     let started = log.messages.iter().rposition(|(message, _)| claims(message)).unwrap();
     assert!(log.torques_after(started, 3) > 0, "it answers again");
     assert_eq!(log.torques_after(started, 2), 0, "it was killed at the same time");
-    // A cell that was held up answers none of the joints that waited for it.
+    // A cell that was stopped answers none of the joints that waited for it.
     let answers: Vec<_> = log.torques().into_iter().filter(|(_, (cell, ..), _)| *cell == 4).collect();
     let gap = answers.windows(2).map(|pair| pair[1].0 - pair[0].0).max().unwrap();
     assert!(gap > 30, "it was stopped for 1.2 s, and missed {gap} joints in a row");
@@ -109,7 +109,7 @@ fn a_cell_that_is_stopped_and_continued_skips_what_it_missed_and_comes_back() {
     bench.tells(7, "fallen silent");
     let test_client = place.test_client();
     process::signal(cell, Signal::CONT);
-    bench.tells(7, "spoken again");
+    bench.tells(7, "come back");
     test_client.waits_for("a torque of cell 7", torque_of(7));
     bench.signal(Signal::TERM);
     bench.end().well();
@@ -188,11 +188,11 @@ fn cells_on_the_bus_are_not_started_twice() {
 }
 
 #[test]
-fn a_newcomer_under_a_taken_number_leaves_with_one_line() {
+fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
     let place = Place::new();
     place.pressed();
     place.write("other.toml", &skin(8).replace("serial = 100003\n", "serial = 777\n"));
-    // A stranger, and a twin by the same description.
+    // An unknown cell, and a duplicate by the same description.
     for skin in ["other.toml", "skin.toml"] {
         let bench = place.running_bench(60.0, "");
         let newcomer =
@@ -205,11 +205,12 @@ fn a_newcomer_under_a_taken_number_leaves_with_one_line() {
         let ended = bench.end().well();
         let summary = place.summary();
         assert_eq!(summary.silent().len(), 0);
-        // It may also have heard of cell 3 before it said a word.
-        let named =
-            ended.stderr.contains("cell 3 on vcan0 hears another cell under its number: stop one of the two");
+        // It may also have received from cell 3 before it sent anything.
+        let named = ended
+            .stderr
+            .contains("cell 3 on vcan0 shares its node id with another cell: stop one of the two");
         assert!(!named || summary.count("/buses/0/events", "duplicate number") > 0, "{:#}", summary.0);
-        // What the twin says cannot be told from a cell that starts anew, so it is in the cell's accounts.
+        // The duplicate looks like a restart of the cell, so its messages are in the cell's accounts.
         if skin == "other.toml" {
             summary.adds_up();
         }
@@ -284,7 +285,7 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
     log_has_all(&place, &summary);
 }
 
-/// The log has every frame, those that nobody can use too.
+/// The log has every frame, unusable ones too.
 fn log_has_all(place: &Place, summary: &Summary) {
     let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     let frames = packets + summary.count("/buses/0/events", "foreign");
@@ -293,7 +294,7 @@ fn log_has_all(place: &Place, summary: &Summary) {
 }
 
 #[test]
-fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
+fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let place = Place::new();
     place.skin(8);
     // The touch moves the arm.
@@ -303,7 +304,9 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_lets_it_go_on() {
     test_client.waits_for_motion();
     let sent = place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
-    bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded` lets it go on");
+    bench.hears(
+        "the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded` resumes it",
+    );
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     let test_client = place.test_client();
@@ -357,8 +360,8 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     process::signal(bench.cell(3), Signal::KILL);
     bench.hears("the process of cell 3 on vcan0 ended");
     let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
-    bench.hears("cell 3 on vcan0 started anew");
-    // One that has heard nothing of its first life.
+    bench.hears("cell 3 on vcan0 restarted");
+    // One that knows nothing of its predecessor.
     let test_client = place.test_client();
     let state = |message: &Message| match message {
         Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {
@@ -368,7 +371,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     };
     let says = |bits| move |message: &Message| state(message).is_some_and(|state| state.has(bits));
     let settled = |message: &Message| state(message).is_some_and(|state| !state.has(State::CLAIMING));
-    test_client.waits_for("cell 3 that has its number", settled);
+    test_client.waits_for("cell 3 that has its node id", settled);
     test_client.waits_for("another halt", |message| *message == Message::Halt);
     test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
     place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
@@ -383,7 +386,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     };
     let halt = from(0, &|message| *message == Message::Halt);
     let restarted = from(from(halt, &says(State::CLAIMING)), &settled);
-    let told = from(restarted, &|message| *message == Message::Halt);
-    let resumed = from(told, &|message| *message == Message::Resume);
-    assert_eq!(log.torques_after(told, 3) - log.torques_after(resumed, 3), 0, "torques of a halted cell");
+    let halted = from(restarted, &|message| *message == Message::Halt);
+    let resumed = from(halted, &|message| *message == Message::Resume);
+    assert_eq!(log.torques_after(halted, 3) - log.torques_after(resumed, 3), 0, "torques of a halted cell");
 }

@@ -1,5 +1,5 @@
-//! Files that commands write: a log is there while it grows, a summary after every end, and nothing is overwritten
-//! unasked.
+//! Files that commands write: a log can be read while it grows, a summary is there after every end, and nothing is
+//! overwritten without --force.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -79,7 +79,7 @@ fn a_log_survives_its_writer_being_killed_at_any_moment() {
 }
 
 #[test]
-fn a_log_can_be_followed_while_it_grows_and_is_its_writers_alone() {
+fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
     let place = Place::new();
     place.pressed();
     place.write("run.log", "of yesterday\n");
@@ -101,8 +101,9 @@ fn a_log_can_be_followed_while_it_grows_and_is_its_writers_alone() {
         let bench = place.start("gateway", &words);
         bench.hears_the_loop();
         follow(name);
-        for force in ["", "--force"] {
-            let words = format!("run skin.toml --bus-kind embedded --candump {name} {force}");
+        let options = ["", "--force"];
+        for option in options {
+            let words = format!("run skin.toml --bus-kind embedded --candump {name} {option}");
             let why = "another run is writing it: name another file, or wait for that run's end";
             let said = place.start("gateway", &words).end();
             assert_eq!(said.refusal(2), format!("gateway: --candump {name}: {why}"));
@@ -156,11 +157,12 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
                 _ => fs::create_dir(&path).unwrap(),
             }
             let before = place.files();
-            for force in ["", " --force"] {
-                if make == "file" && !force.is_empty() {
+            let options = ["", " --force"];
+            for overwrite in options {
+                if make == "file" && !overwrite.is_empty() {
                     continue;
                 }
-                let words = words.replace("NAME", name) + force;
+                let words = words.replace("NAME", name) + overwrite;
                 let ended = place.start("gateway", &words).end();
                 assert_eq!(ended.code(), Some(2), "{make}, {words}: {ended:#?}");
                 let said = ended.stderr.lines().last().unwrap();
@@ -192,7 +194,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
 }
 
 #[test]
-fn a_log_into_a_pipe_whose_reader_stops_holds_no_run_that_is_told_to_end() {
+fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
     let place = Place::new();
     place.pressed();
     let fifo = place.path("log.fifo");
@@ -220,7 +222,7 @@ fn a_log_into_a_pipe_whose_reader_stops_holds_no_run_that_is_told_to_end() {
 }
 
 #[test]
-fn no_command_overwrites_what_it_reads_whatever_it_is_told() {
+fn no_command_overwrites_what_it_reads_even_with_force() {
     let place = Place::new();
     place.pressed();
     place.write("in.log", "(1.000000) vcan0 123#11\n");
@@ -254,7 +256,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     let ended = place.start("gateway", &run).end().well();
     let (frames, table): (Vec<_>, Vec<_>) = ended.stdout.lines().partition(|line| line.starts_with('('));
     assert!(frames.len() > 50 && table.len() > 10, "{ended:#?}");
-    // A file that the shell has opened is not cut, whoever wrote into it before.
+    // A file that the shell has opened is not truncated, whatever is in it.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     let gateway = process::program("gateway");
     let script = format!(
@@ -269,7 +271,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     place.is_left_clean();
 }
 
-/// Sees that a run has failed, and that its summary says why, as its last line does.
+/// Checks that a run has failed, and that its summary has the reason, as its last line does.
 fn failed(place: &Place, ended: &process::Ended) -> Summary {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let summary = place.summary();
@@ -281,7 +283,7 @@ fn failed(place: &Place, ended: &process::Ended) -> Summary {
 }
 
 #[test]
-fn a_run_that_fails_has_a_summary_that_says_why() {
+fn a_failed_run_has_a_summary_with_the_reason() {
     let place = Place::new();
     place.pressed();
     // Before its loop begins.
@@ -336,7 +338,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         demo.hears("frames are recorded in skinbus-demo");
         demo.hears_the_loop();
         let said = demo.stderr();
-        // What it says shows its frames.
+        // The printed command shows its frames.
         let line = said.lines().find_map(|line| line.strip_prefix("its frames in words: ")).unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" gateway ").unwrap();
         let mut dump = place.command("gateway", &format!("{dump} --kind torque --max 3"));
@@ -355,7 +357,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     }
     let files = place.files();
     assert!(files.iter().all(|name| name.ends_with(".log")), "{files:?}");
-    // One that is killed leaves its log, and takes everything else along.
+    // One that is killed leaves its log, and nothing else.
     let killed = run("");
     killed.hears_the_loop();
     killed.signal(Signal::KILL);

@@ -60,11 +60,11 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
     let mut said: Vec<_> = ended.stderr.lines().collect();
     said.sort_unstable();
     let expected = [
-        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong; write it anew or \
+        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong; write it again or \
          delete the file"
             .to_owned(),
         format!(
-            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: 40 bytes, not {}; write it anew or \
+            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: 40 bytes, not {}; write it again or \
              delete the file",
             image.len()
         ),
@@ -73,18 +73,18 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
             .to_owned(),
     ];
     assert_eq!(said, expected);
-    assert_eq!(images(&place), before, "nobody but a person deletes them");
+    assert_eq!(images(&place), before, "no program deletes them");
     assert_eq!(place.files(), ["flash", "run.json", "run.log", "scenario.toml", "skin.toml"]);
 
     for node in [3, 5] {
         fs::remove_file(place.path(&format!("flash/vcan0-{node}.flash"))).unwrap();
     }
     place.bench(0.5, "--flash flash").end().well();
-    assert_eq!(fs::read(&path).unwrap(), image, "deleted, it is written anew");
+    assert_eq!(fs::read(&path).unwrap(), image, "deleted, it is written again");
 }
 
 #[test]
-fn what_is_no_regular_file_is_no_flash_and_holds_nobody_up() {
+fn what_is_no_regular_file_is_no_flash_and_delays_nothing() {
     let place = written();
     let path = place.path("flash/vcan0-3.flash");
     fs::remove_file(&path).unwrap();
@@ -96,7 +96,7 @@ fn what_is_no_regular_file_is_no_flash_and_holds_nobody_up() {
 }
 
 #[test]
-fn a_cell_without_parameters_says_so_and_sends_no_torque() {
+fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
     let place = written();
     damage(&place, 3);
     let server = place.start("vcan-setup", "serve vcan0");
@@ -104,7 +104,7 @@ fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     let cells = place
         .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
     cells.hears("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
-    place.test_client().waits_for("a heartbeat of cell 3 that says so", |message| {
+    place.test_client().waits_for("a heartbeat of cell 3 without parameters", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
             if cell.get() == 3
                 && heartbeat.state.has(State::FLASH_DAMAGED)
@@ -117,7 +117,7 @@ fn a_cell_without_parameters_says_so_and_sends_no_torque() {
     bench.signal(Signal::TERM);
     bench.end().well();
     let summary = place.summary();
-    assert_eq!(summary.adds_up().silent().len(), 0, "it is there, and silent only about torques");
+    assert_eq!(summary.adds_up().silent().len(), 0, "it is there, and sends no torques only");
     let log = Log::read(&place.read("run.log"), Format::Fd);
     assert_eq!(log.torques_after(0, 3), 0);
     assert!(log.torques_after(0, 4) > 0);
@@ -136,7 +136,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
 
-    // Another cell of the same number.
+    // Another cell of the same node id.
     place.write("skin.toml", &text.replace("serial = 100006\n", "serial = 6\n"));
     let ended = place.bench(1.0, "--flash flash --quiet").end();
     assert_eq!(ended.code(), Some(1));

@@ -1,4 +1,4 @@
-//! Benches whose robot is halted: what they say of it, and their exit code.
+//! Benches whose robot is halted: their messages, and their exit code.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -38,7 +38,7 @@ fn control(place: &Place, bench: &Running, answers: u32) {
     }
 }
 
-/// Sees that a run told of a halt that lasted to its end, in the table and on standard error; the halt.
+/// Checks that a run reported a halt that lasted to its end, in the table and on standard error; the halt.
 fn ended_halted(ended: &process::Ended, summary: &Summary, reason: &str) -> Value {
     assert_eq!(ended.code(), Some(3), "{ended:#?}");
     let halts = summary.0["halts"].as_array().unwrap();
@@ -117,7 +117,7 @@ fn without_any_controller_a_run_that_comes_to_its_end_was_halted() {
 }
 
 #[test]
-fn a_lost_bus_that_halts_is_told_with_its_name_and_the_halt_has_the_exit_code() {
+fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     let place = Place::new();
     let skin = process::skin_of(8, 2, model::generate::Format::Fd);
     // A bus that only this machine is late for is not lost.
@@ -145,7 +145,7 @@ fn a_lost_bus_that_halts_is_told_with_its_name_and_the_halt_has_the_exit_code() 
 }
 
 #[test]
-fn a_halt_that_was_resumed_is_told_and_the_run_is_well() {
+fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(60.0, "");
@@ -169,7 +169,7 @@ fn a_halt_that_was_resumed_is_told_and_the_run_is_well() {
 }
 
 #[test]
-fn a_recording_that_is_not_whole_outdoes_a_halt() {
+fn an_incomplete_recording_takes_precedence_over_a_halt() {
     let place = place(25);
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --candump /dev/full \
                  --summary run.json --quiet";
@@ -178,7 +178,7 @@ fn a_recording_that_is_not_whole_outdoes_a_halt() {
     let said: Vec<_> = ended.stderr.lines().collect();
     let halted = format!(" and not resumed: too many bad cycles in a row: {NOBODY}{HISTORY}");
     assert!(said.iter().any(|line| line.ends_with(&halted)), "{ended:#?}");
-    assert!(said.last().unwrap().starts_with("gateway: the recording is not whole, "), "{ended:#?}");
+    assert!(said.last().unwrap().starts_with("gateway: the recording is incomplete, "), "{ended:#?}");
     let summary = place.summary();
     assert_eq!(summary.0["outcome"], "failed");
     assert!(summary.0["halted"].is_string() && !before(&summary, &summary.0["halts"][0]).is_empty());
@@ -193,7 +193,7 @@ fn cells_that_are_halted_at_the_end_of_a_run_are_no_halt_of_the_robot() {
     bench.signal(Signal::INT);
     let ended = bench.end().well();
     let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);
-    assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are told");
+    assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are halted");
     let summary = place.summary();
     assert_eq!((&summary.0["outcome"], &summary.0["halts"]), (&"interrupted".into(), &serde_json::json!([])));
     assert_eq!(summary.0["before_halt"], serde_json::json!([]));

@@ -1,4 +1,4 @@
-//! Cells as processes in a network: numbers and sums over simulated wires, and a bus that goes away and comes back.
+//! Cells as processes in a network: node ids and sums over simulated wires, and a bus that is lost and comes back.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -36,7 +36,7 @@ use rustix::process::Signal;
 
 /// Cells in most skins.
 const CELLS: u8 = 12;
-/// A cell that has never been told what it computes with has this hash.
+/// A cell that was never configured has this hash.
 const UNCONFIGURED: u16 = 0;
 
 /// A skin of cells that answer with sums.
@@ -58,7 +58,7 @@ fn cells(place: &Place, which: &str, more: &str) -> Running {
     place.start("cell-node", &words)
 }
 
-/// The gateway's side of the bus: the other end of the roots' wires, and an ear.
+/// The gateway's side of the bus: the other end of the roots' wires, and a receiver.
 struct Side {
     test_client: TestClient,
     cells: usize,
@@ -91,7 +91,7 @@ impl Side {
         Micros(u64::try_from(self.start.elapsed().as_micros()).unwrap())
     }
 
-    /// Lets everything happen until it is as wanted.
+    /// Runs until the condition holds.
     fn until(&mut self, what: &str, expected: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + TIMEOUT;
         while !expected(self) {
@@ -106,7 +106,7 @@ impl Side {
         }
     }
 
-    /// Hears and answers what comes within this time.
+    /// Receives and answers what comes within this time.
     fn turn(&mut self, time: Duration) {
         let end = Instant::now() + time;
         let mut inbox = Inbox::new();
@@ -156,7 +156,7 @@ impl Side {
         }
     }
 
-    /// Whether every cell has a number of its own and a parent.
+    /// Whether every cell has a unique node id and a parent.
     fn is_tree_ready(&self) -> bool {
         let settled = |heartbeat: &&Heartbeat| !heartbeat.state.has(State::CLAIMING);
         self.heartbeats.values().filter(settled).count() == self.cells
@@ -164,7 +164,7 @@ impl Side {
             && self.trees.values().all(|tree| tree.parent.is_some())
     }
 
-    /// By serial number, the cells' numbers.
+    /// By serial number, the node ids.
     fn numbers(&self) -> BTreeMap<u32, u8> {
         self.heartbeats.iter().map(|(&number, heartbeat)| (heartbeat.serial, number)).collect()
     }
@@ -172,7 +172,7 @@ impl Side {
 
 // ID-2, ID-3, NODE-1, NODE-2, NODE-3
 #[test]
-fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
+fn new_cells_get_node_ids_over_their_wires_and_keep_them() {
     for format in [Target::Fd, Target::Classic] {
         let place = Place::new();
         let skin = sums(&place, CELLS, format);
@@ -189,7 +189,7 @@ fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
         };
         let running = start();
         let mut side = Side::new(&place, &skin);
-        side.until("a tree of cells with numbers", Side::is_tree_ready);
+        side.until("a tree of cells with node ids", Side::is_tree_ready);
         let numbers = side.numbers();
         let serials: BTreeSet<_> = skin.cells.iter().map(|cell| cell.serial).collect();
         assert_eq!(numbers.keys().copied().collect::<BTreeSet<_>>(), serials);
@@ -204,7 +204,7 @@ fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
             let kept = flash::decode(Identity { cell: None, serial }, &bytes).unwrap();
             assert_eq!((kept.number.map(CellId::get), kept.parameters), (Some(number), None));
         }
-        // Nobody gives numbers this time, and they have theirs from the start.
+        // No node ids are assigned this time, and they have theirs from the start.
         let running = start();
         let mut side = Side::new(&place, &skin);
         side.roots.clear();
@@ -217,7 +217,7 @@ fn cells_from_the_factory_get_numbers_over_their_wires_and_keep_them() {
 }
 
 #[test]
-fn sums_reach_the_roots_whoever_shares_a_process() {
+fn sums_reach_the_roots_whichever_cells_share_a_process() {
     for (format, count, shared) in [
         (Target::Fd, 12, vec!["--nodes 1-12"]),
         (Target::Classic, 12, vec!["--nodes 1-12"]),
@@ -247,7 +247,7 @@ fn sums_reach_the_roots_whoever_shares_a_process() {
             from: From::Next,
             page: SensorPage::Skin(touch),
         });
-        // A parent hears a child's sums from the epoch on that the child told it of.
+        // A parent receives a child's sums from the epoch on that the child has announced.
         let (root, _) = side.roots[0];
         let give_up = Instant::now() + TIMEOUT;
         let mut epoch = 0_u8;
@@ -292,15 +292,15 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     let mut side = Side::new(&place, &skin);
     let after = heard(&mut side);
     for (cell, heartbeat) in &after {
-        assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not start anew");
+        assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not restart");
         assert!(heartbeat.sent.wrapping_sub(before[cell].sent) < 0x8000, "cell {cell} went on counting");
     }
     side.test_client.sends(&Message::Report);
     side.until("a tree again", Side::is_tree_ready);
-    until("nobody said anything else", || (shared.stderr().lines().count() == 1).then_some(()));
+    until("no other message", || (shared.stderr().lines().count() == 1).then_some(()));
     assert_eq!(last.stderr(), "");
 
-    // Who was not told to come back ends with its bus.
+    // A cell without the option to wait ends with its bus.
     drop((shared, last));
     let leaves = cells(&place, "--node 3", "");
     let mut side = Side::new(&place, &skin);
@@ -319,7 +319,7 @@ fn heard(side: &mut Side) -> BTreeMap<u8, Heartbeat> {
 }
 
 #[test]
-fn flash_of_another_number_is_not_used() {
+fn flash_of_another_node_id_is_not_used() {
     let place = Place::new();
     let skin = sums(&place, CELLS, Target::Fd);
     fs::create_dir(place.path("flash")).unwrap();

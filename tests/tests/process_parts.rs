@@ -1,5 +1,5 @@
-//! Split recordings of real processes: every part replays by itself, bit for bit, whatever was pressed across the cut and
-//! whatever came late; all parts together are one recording.
+//! Split recordings of real processes: every part replays by itself, bit for bit, with presses across the split and late
+//! frames; all parts together are one recording.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -14,7 +14,7 @@ use process::{Place, skin_of, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Touches that lie across every cut of a second, and on both buses.
+/// Touches across every split of a second, and on both buses.
 fn touched(buses: usize) -> String {
     let more = |bus: usize| {
         format!(
@@ -32,7 +32,7 @@ fn parts(place: &Place) -> Vec<String> {
     (0..).map(name).take_while(|name| place.path(name).exists()).collect()
 }
 
-/// Sees that each part answers by itself as it is recorded, and all together.
+/// Checks that each part answers by itself as it is recorded, and all together.
 fn all_come_back(place: &Place, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
@@ -57,7 +57,7 @@ fn all_come_back(place: &Place, min: u64) {
 }
 
 #[test]
-fn parts_of_a_run_in_which_everything_was_said_come_back() {
+fn parts_of_a_run_with_every_message_come_back() {
     let place = Place::new();
     let skin = place.skin(8);
     place.scenario(&touched(1));
@@ -77,7 +77,7 @@ fn parts_of_two_buses_of_classic_frames_come_back() {
 }
 
 #[test]
-fn parts_of_cells_that_tell_events_come_back() {
+fn parts_of_cells_that_send_events_come_back() {
     let place = Place::new();
     place.write(
         "skin.toml",
@@ -89,7 +89,7 @@ fn parts_of_cells_that_tell_events_come_back() {
 }
 
 #[test]
-fn parts_of_cells_that_tell_all_the_time_on_a_slow_bus_come_back() {
+fn parts_of_cells_that_send_continuously_on_a_slow_bus_come_back() {
     let place = Place::new();
     let expected = Target { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..Target::default() };
     let sensing = "format = \"classic\"\nsensing = \"continuous\"\nsensing_hz = 5.0";
@@ -126,9 +126,8 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     assert!(ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
     let whole = place.start("gateway", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
-    let contact_state =
-        |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
-    assert_eq!(contact_state(&whole.stdout), contact_state(&ended.stdout));
+    let contact = |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
+    assert_eq!(contact(&whole.stdout), contact(&ended.stdout));
 
     let stats = |files: &str| -> Value {
         let ended = place.start("gateway", &format!("dump {files} --stats --json")).end().well();
@@ -181,7 +180,7 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
         line.starts_with("gateway: other.mcap and run-1.mcap are of different recordings, begun at "),
         "{line}"
     );
-    // What it is called does not matter; nor do parts that are missing at an end.
+    // The file name does not matter; nor do parts that are missing at an end.
     place.start("gateway", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
     place.start("gateway", "dump run-3.mcap run-2.mcap").end().well();
 }

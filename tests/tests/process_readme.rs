@@ -1,4 +1,4 @@
-//! Every command of README.md does what README.md says, in its order, as written, in one shell.
+//! Every command of README.md works as README.md describes, in its order, as written, in one shell.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 mod process;
@@ -104,7 +104,7 @@ fn every_command_does_what_it_should() {
     let ended = run(&place, &commands).well();
     place.is_left_clean();
 
-    // What the demo is said to print begins each line as what it prints.
+    // Each line of the quoted output begins as a line of the demo's output.
     let table = blocks(README).into_iter().find(|(_, block)| block.starts_with("ur5-253 ")).unwrap().1;
     let demo = printed(&ended, "gateway demo");
     let mut rest = demo;
@@ -132,7 +132,7 @@ fn commands_in_the_text_are_run_too() {
 }
 
 #[test]
-fn what_fails_or_is_not_known_fails_here() {
+fn failing_and_unknown_commands_fail_here() {
     let build = "cargo build --release";
     let path = "export PATH=$PWD/target/release:$PATH";
     let version = "gateway --version";

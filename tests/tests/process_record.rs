@@ -1,4 +1,4 @@
-//! Recordings of benches of real processes: everything is in them, whatever happens.
+//! Recordings of benches of real processes: they are complete, or the rest is counted.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -19,7 +19,7 @@ use recorded::Recorded;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Sees that a run's frames are the same in both formats, and as many as the gateway counted.
+/// Checks that a run's frames are the same in both formats, and as many as the gateway counted.
 fn frames_are_whole(lines: &[String], place: &Place, summary: &Summary, frames_a_packet: u64) {
     let log = place.read("run.log");
     let first = log.lines().zip(lines).position(|(log, line)| log != line);
@@ -66,7 +66,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
     assert!(recorded.metadata["program"]["command_line"].contains("--record run.mcap"));
     assert!(recorded.metadata["configuration"]["bus/vcan0"].starts_with("embedded, fd, receive buffer "));
 
-    // Own frames are told from others, and each cell has said its hash before the first joints.
+    // Own frames are distinguished, and each cell has sent its hash before the first joints.
     let frames: Vec<_> = recorded.on("/can/vcan0").map(|message| &message.value).collect();
     let id = |frame: &Value| frame["id"].as_u64().unwrap();
     let joints = frames.iter().position(|frame| id(frame) == 0x001 && frame["direction"] == 2).unwrap();
@@ -94,7 +94,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
     let messages: u64 = counts.values().sum();
     assert_eq!(summary.0["recording"]["files"][0]["messages"], messages, "{:#}", summary.0);
 
-    // Every cell is in one patch, presses with what it was told, and is where the arm has it.
+    // Every cell is in one patch, with the force of its stimulus and its position on the arm.
     let mut cells = 0;
     for (patch, _) in
         counts.iter().filter(|(topic, _)| topic.starts_with("/skin/") && !topic.ends_with("/points"))
@@ -184,13 +184,13 @@ fn a_recording_in_parts_is_one_recording_and_each_part_can_be_read_alone() {
             assert_eq!(force, Vec::<String>::new());
             continue;
         }
-        // What is in force are frames of the files before: of each cell its start, its last heartbeat, what it said that
-        // it felt, and its stimulus; the joints from which on that holds, the last ones, a resume.
+        // Latched are frames of the files before: of each cell its start, its last heartbeat, its contact state and its
+        // stimulus; the joints at which that was latched, the last ones, a resume.
         let of = |kind: u32| force.iter().filter(|line| line.contains(&format!(" {kind:X}"))).count();
         let before: Vec<_> = read[..number].iter().flat_map(|part| part.lines("/can/vcan0")).collect();
         assert!(force.iter().all(|line| before.contains(line)), "{force:?}");
         assert_eq!((of(7), of(0)), (8, 3), "{force:?}");
-        // A cell that has started claims its number for two heartbeats.
+        // A cell that has started claims its node id for two heartbeats.
         assert!((16..=24).contains(&of(4)) && of(3) <= 16, "{force:?}");
     }
 }
@@ -238,7 +238,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     assert_eq!(place.read("old.mcap"), "somebody's");
 }
 
-/// A bench in a shell that first says something.
+/// A bench in a shell that first runs a command.
 fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::Ended {
     let gateway = process::program("gateway");
     let script = format!("{before} && {{ {} {run}; code=$?; {after}; exit $code; }}", gateway.display());
@@ -247,15 +247,15 @@ fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::End
     process::Running::start(command).end()
 }
 
-/// Sees that a run whose recording broke off came to its end, and that everything is in the file or counted.
+/// Checks that a run whose recording broke off came to its end, and that everything is in the file or counted.
 fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stdout.contains("8 cells"), "the table is as ever: {ended:#?}");
+    assert!(ended.stdout.contains("8 cells"), "the table is complete: {ended:#?}");
     let said: Vec<_> =
         ended.stderr.lines().filter(|line| line.contains("the run goes on without it")).collect();
     assert!(said.len() == 1 && said[0].contains(why) && said[0].starts_with("run.mcap: "), "{ended:#?}");
     assert!(
-        ended.stderr.lines().last().unwrap().starts_with("gateway: the recording is not whole, "),
+        ended.stderr.lines().last().unwrap().starts_with("gateway: the recording is incomplete, "),
         "{ended:#?}"
     );
     let summary = place.summary();
@@ -353,7 +353,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
             "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --record run.mcap",
         );
         let (heard, listener) = listen(&place);
-        // Cells begin to speak half a second later, the loop runs a second later.
+        // Cells begin to send half a second later, the loop runs a second later.
         std::thread::sleep(Duration::from_millis(random.random_range(600..2_600)));
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
         bench.signal(Signal::KILL);
@@ -385,10 +385,10 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         fs::remove_file(repaired).unwrap();
         let heard = heard.lock().unwrap();
         let heard: Vec<_> = heard.iter().map(|(at, frame)| (*at, frame.to_string())).collect();
-        // Nobody speaks before both listen.
+        // Nothing is sent before both listen.
         let same = recorded.iter().zip(&heard).take_while(|((_, ours), (_, theirs))| ours == theirs).count();
-        assert_eq!(same, recorded.len(), "the frames are the first ones that the other has heard");
-        assert!(same > 0, "cells had spoken");
+        assert_eq!(same, recorded.len(), "the frames are the first ones that the other has received");
+        assert!(same > 0, "cells had sent");
         let last = recorded.last().unwrap();
         let before = heard.iter().rfind(|(at, _)| u128::from(*at) <= wall).unwrap();
         lost.push((before.0.saturating_sub(last.0)) as f64 / 1e6);

@@ -1,4 +1,4 @@
-//! What cannot be is refused before anything begins: one line that names it, what is allowed or what to do;
+//! Invalid input is refused before anything begins: one line that names it, what is allowed or what to do;
 //! exit code 2; and nothing is left behind.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
@@ -9,7 +9,7 @@ use std::os::unix::net::UnixDatagram;
 use process::{PRESSED, Place, skin};
 use protocol::bus::{BusKind, Choice};
 
-/// What a command says that is refused, and sees that it leaves nothing.
+/// The message of a refused command; checks that it leaves nothing.
 fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
     let before = place.files();
     let ended = place.start(program, words).end();
@@ -36,7 +36,7 @@ fn skin_refusal(old: &str, new: &str, expected: &str) {
 }
 
 #[test]
-fn a_skin_that_cannot_be_is_refused_with_line_key_value_and_what_is_allowed() {
+fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
     for (old, new, expected) in [
         ("node = 2\n", "node = 1\n", "cell[1].node = 1: cell[0] has this node on \"vcan0\" already"),
         ("node = 2\n", "node = 255\n", "cell[1].node = 255: a cell's node is 1 to 254"),
@@ -142,7 +142,7 @@ fn files_that_are_not_there_are_named() {
 }
 
 #[test]
-fn a_program_that_is_none_is_named() {
+fn a_file_that_is_no_program_is_named() {
     let place = Place::new();
     place.pressed();
     let said =
@@ -182,7 +182,7 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
 }
 
 #[test]
-fn a_run_that_fails_to_start_leaves_old_recordings_as_they_were_and_says_so_in_its_summary() {
+fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
     let place = Place::new();
     place.pressed();
     place.write("run.log", "of yesterday\n");
@@ -238,7 +238,7 @@ fn buses_are_not_kept_where_others_may_look() {
 }
 
 #[test]
-fn an_external_controllers_socket_that_cannot_be_had_is_named_before_cells_are_started() {
+fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_started() {
     let place = Place::new();
     let kinesthetic = |line: &&str| !line.starts_with("inertia = ") && !line.starts_with("damping = ");
     let text = skin(3);
@@ -291,7 +291,7 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --node 0",
-            "0 is no cell number: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
+            "0 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
         ),
     ] {
         let said = refusal(&place, program, words, 2);

@@ -1,5 +1,5 @@
-//! Runs are recorded, and replayed to cells that were just started, or that have been through something else: what
-//! they answer is what was recorded, bit for bit, or it is said what is not.
+//! Runs are recorded, and replayed to cells that were just started, or that have another history: their
+//! replies are those recorded, bit for bit, or the difference is reported.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -82,7 +82,7 @@ fn the_second_file_of_a_recording_begins_with_what_was_latched() {
     let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --max"));
     let first = first.all_came_back(&ended);
     let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --max"));
-    // It was pressed in the first file, and is felt in the second.
+    // It was pressed in the first file, and is in contact in the second.
     let second = second.all_came_back(&ended);
     assert!(first > 30 && second > 30, "{first} and {second}");
     place.is_left_clean();
@@ -110,7 +110,7 @@ fn from_the_middle_on_the_torques_are_the_same() {
     let (ended, all) = place.replayed("run.log", &format!("{FRESH} --max"));
     let all = all.all_came_back(&ended);
     let mut before = all;
-    // The second one begins while the cells are halted, the last one after cell 4 was configured anew.
+    // The second one begins while the cells are halted, the last one after cell 4 was configured again.
     for from in ["1.1", "2.1", "2.6", "3.2"] {
         let (ended, part) = place.replayed("run.log", &format!("{FRESH} --max --from {from}"));
         let count = part.all_came_back(&ended);
@@ -124,7 +124,7 @@ fn from_the_middle_on_the_torques_are_the_same() {
 }
 
 #[test]
-fn cells_that_have_been_through_something_else_answer_as_they_did_then() {
+fn cells_with_another_history_answer_as_they_did_then() {
     let place = Place::new();
     place.records(8);
     let _bench = by_hand(&place, "1-8");
@@ -247,7 +247,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.write("gone.log", &gone);
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
     replayed.all_came_back(&ended);
-    // A machine that was away while it was recorded is another reason, and nobody knows which one it is.
+    // A busy machine during the recording is another reason, and the two cannot be distinguished.
     let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
     assert!(lacking.iter().sum::<u64>() >= 1, "{:#}", replayed.0);
 }
@@ -258,7 +258,7 @@ fn is_sum(message: &Message, cell: u8) -> bool {
 }
 
 #[test]
-fn sums_come_back_less_their_children_whatever_the_tree() {
+fn sums_without_their_children_come_back_in_any_tree() {
     let place = Place::new();
     let expected = generate::Target { cells: 12, reply: generate::Reply::Sum, ..generate::Target::default() };
     place.write("skin.toml", &generate::generate(&expected).unwrap());
@@ -271,13 +271,13 @@ fn sums_come_back_less_their_children_whatever_the_tree() {
         place.is_left_clean();
         let lacking = |why| replayed.number(&format!("/expect/lacking/{why}"));
         assert_eq!(lacking("tree_unknown"), 0, "{:#}", replayed.0);
-        // Where the machine was away, cells look for other parents; mostly they do not.
+        // On a busy machine cells look for other parents; mostly they do not.
         let omitted = lacking("parent_changing") + lacking("sums_not_taken");
         let sums = replayed.number("/expect/sums");
         assert!(sums > 300 && sums > 2 * omitted, "{:#}", replayed.0);
     }
 
-    // The root, which feels nothing, adds something to what it passes on.
+    // The root, which is not in contact, adds something to what it forwards.
     let skin = Skin::read(&place.path("skin.toml")).unwrap();
     let root = skin.cells.iter().find(|cell| cell.root).unwrap().node;
     let wrong = (100..110).fold(place.read("run.log"), |log, nth| {
@@ -287,7 +287,7 @@ fn sums_come_back_less_their_children_whatever_the_tree() {
     let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --lockstep"));
     let [_, different, missing, extra] = replayed.replies();
     assert_eq!((ended.code(), missing, extra), (Some(1), 0, 0), "{:#}", replayed.0);
-    // A cell that changes its parent is left out, and so is what is said again with more cells in it.
+    // A cell that changes its parent is left out, and so is a resent sum with more cells in it.
     assert!((1..=10).contains(&different), "{:#}", replayed.0);
     let text = replayed.text("/expect/first/text");
     assert!(text.starts_with(&format!("the first difference: cell {root} on vcan0, joints ")), "{text}");
@@ -336,7 +336,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
 }
 
 #[test]
-fn a_cell_that_measures_obeys_for_the_replay_when_it_is_told_to() {
+fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     let place = Place::new();
     place.records(8);
     let _bench = by_hand(&place, "1-8");

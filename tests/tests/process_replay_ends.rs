@@ -1,4 +1,4 @@
-//! Replays that cannot go on, or cannot begin: what they say, and what they leave.
+//! Replays that cannot go on, or cannot begin: their messages, and the files they leave.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -94,7 +94,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
 }
 
 #[test]
-fn what_cannot_be_is_refused_in_one_line() {
+fn invalid_input_is_refused_in_one_line() {
     let place = Place::new();
     place.skin(3);
     place.write("empty.log", "");
@@ -110,7 +110,7 @@ fn what_cannot_be_is_refused_in_one_line() {
         ("some.zip", 2, "gateway: some.zip is a zip"),
         ("-", 2, "gateway: a capture is read twice, which standard input cannot be"),
         ("some.log --strict", 1, "gateway: some.log:2: column 5: 6 or 9 digits of a second"),
-        ("some.log --from 5", 2, "gateway: nothing is left to be sent: some.log lasts 2.000 s"),
+        ("some.log --from 5", 2, "gateway: nothing remains to be sent: some.log lasts 2.000 s"),
         ("some.log --map can0=can1", 2, "gateway: --map can0=can1: some.log has no bus can0; it has vcan0"),
         ("some.log --bus can0", 2, "gateway: --bus can0: some.log has no bus can0; it has vcan0"),
         (
@@ -153,7 +153,7 @@ fn what_cannot_be_is_refused_in_one_line() {
         assert!(!place.files().contains(&"replay.json".to_owned()), "{words}");
         place.is_left_clean();
     }
-    // A recording that says nothing of its cells.
+    // A recording without heartbeats.
     let ended = place.replay("torques.log", "--expect --spawn --skin skin.toml --quiet").end();
     assert!(
         ended.refusal(1).starts_with("gateway: cells of the recording are absent: 12 on vcan0"),
@@ -162,7 +162,7 @@ fn what_cannot_be_is_refused_in_one_line() {
 }
 
 #[test]
-fn a_line_that_cannot_be_read_is_named_and_omitted_and_times_that_run_backwards_are_said_once() {
+fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_reported_once() {
     let place = Place::new();
     let log = "(5.000000) vcan0 001#\n(1.5) vcan0 123#00\n(5.100000) vcan0 002#00\n(1.000000) vcan0 003#00\n\
                (2.000000) vcan0 004#00\n(5.150000) vcan0 005#00\nDROPCOUNT: dropped 7 CAN frames on 'vcan0' socket (total drops 7)\n";
@@ -177,7 +177,7 @@ fn a_line_that_cannot_be_read_is_named_and_omitted_and_times_that_run_backwards_
         [
             "odd.log:2: column 5: 6 or 9 digits of a second",
             "odd.log: lines that could not be read and are left out: 1",
-            "odd.log: 7 frames are missing: whoever took it lost them",
+            "odd.log: 7 frames are missing: they were lost while it was recorded",
             "odd.log: times run backwards, first at frame 3 by 4.100 s: what is older than what was sent before it is \
              sent at once",
         ]

@@ -50,7 +50,7 @@ fn found(page: &Page, what: &str) -> f64 {
     findings.find(|finding| finding.what.starts_with(what)).unwrap_or_else(|| panic!("no {what}")).ours.value
 }
 
-/// The first, the least, the greatest and the last.
+/// The first, the minimum, the maximum and the last.
 fn span(values: impl Iterator<Item = f64>) -> [f64; 4] {
     let values: Vec<_> = values.filter(|value| value.is_finite()).collect();
     let min = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -89,7 +89,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         assert_eq!(drawn(torque, 1), on("/UR5/torques", "central", Some(joint)));
     }
     let moved = drawn(figure(&page, "positions"), 1);
-    assert!((moved[0] - moved[3]).abs() > 0.01, "the arm gives way: {moved:?}");
+    assert!((moved[0] - moved[3]).abs() > 0.01, "the arm moves: {moved:?}");
     assert_eq!(drawn(figure(&page, "cycle"), 0), on("/gateway/timing", "took_us", None));
     assert_eq!(drawn(figure(&page, "cycle"), 1), on("/gateway/timing", "central_us", None));
     assert_eq!(drawn(figure(&page, "lateness"), 0), on("/gateway/timing", "late_us", None));
@@ -162,7 +162,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
 }
 
 #[test]
-fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_says_what_is_missing() {
+fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_what_is_missing() {
     let place = Place::new();
     recorded_bench(&place, 2.0);
     let before = place.files();
@@ -182,7 +182,7 @@ fn a_page_and_its_figures_are_written_whole_and_a_recording_cut_in_the_middle_sa
     let after: Vec<_> = place.files().into_iter().filter(|name| !before.contains(name)).collect();
     assert_eq!(after, ["figures", "run.html"]);
 
-    // Where nothing can be written nothing is left.
+    // A command that cannot write leaves nothing.
     for (options, said) in [
         (
             "-o run.mcap/run.html",

@@ -1,4 +1,4 @@
-//! Benches of real processes that nothing goes wrong with.
+//! Benches of real processes without faults.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -43,7 +43,7 @@ fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
     summary.adds_up();
     assert_eq!((summary.cells().len(), summary.silent().len()), (253, 0));
     assert!(summary.0["halted"].is_null() && summary.0["interrupted"] == false, "{:#}", summary.0);
-    // Every cell feels the touch from the first epoch on.
+    // Every cell is in contact from the first epoch on.
     summary.all_were_due(253, &ended.stderr);
     let answered = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
     assert!(answered > 253, "{:#}", summary.0);
@@ -79,7 +79,7 @@ fn buses_of_classic_frames_carry_the_same_bench() {
     log_is_whole(&place, &summary, 2);
 }
 
-/// Two runs of this scenario, the second one told more.
+/// Two runs of this scenario, the second one with more options.
 fn twice(scenario: &str, more: &str) {
     let place = Place::new();
     place.skin(8);
@@ -153,7 +153,7 @@ fn eight_cells_in_one_process_answer_as_eight_processes_do() {
 }
 
 #[test]
-fn cells_share_processes_as_they_are_told() {
+fn cells_share_processes_as_requested() {
     let place = Place::new();
     place.pressed();
     for (more, expected) in
@@ -196,7 +196,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
             assert!(summary.of_bus("/replies/in_time") > 0, "{:#}", summary.0);
         }
     }
-    // They are nobody's children, and are still there.
+    // They are not the gateway's children, and are still there.
     assert_eq!(place.processes().len(), 4);
 
     server.signal(Signal::TERM);
@@ -243,7 +243,7 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
 }
 
 #[test]
-fn a_gateway_without_cells_says_who_is_missing() {
+fn a_gateway_without_cells_names_the_missing_ones() {
     let place = Place::new();
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");

@@ -1,4 +1,4 @@
-//! Cells of processes that tell what they feel, as their skin says it and as somebody at a shell does.
+//! Sensors frames of cells as processes, switched by their skin and from a shell.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -11,7 +11,7 @@ use rustix::process::Signal;
 
 const CELLS: u8 = 8;
 
-/// A place whose skin says this of its bus.
+/// A place whose skin has these keys of its bus.
 fn place(sensing: &str, scenario: &str) -> Place {
     let place = Place::new();
     let format = "format = \"fd\"";
@@ -51,8 +51,8 @@ fn a_skin_switches_its_cells_to_events_and_the_summary_has_every_touch() {
     assert_eq!((sensors["touches"].as_u64(), sensors["releases"].as_u64()), (Some(8), Some(0)), "{sensors}");
     let frames = summary.count("/buses/0/received", "sensors");
     assert_eq!(sensors["frames"].as_u64(), Some(frames));
-    assert!(sensors["least_hz"].as_f64().unwrap() > 1.0, "{sensors}");
-    // At its start a cell is told twice, and answers twice: thresholds are those of every cell, so once.
+    assert!(sensors["min_hz"].as_f64().unwrap() > 1.0, "{sensors}");
+    // At its start a cell would be switched twice, and answer twice: it has the default thresholds, so once.
     assert_eq!(summary.count("/buses/0/received", "configured"), 8, "{:#}", summary.0);
 }
 
@@ -90,13 +90,13 @@ fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
     let bench = place.running_bench(60.0, "");
     let test_client = place.test_client();
     let fifth = CellId::new(5).unwrap();
-    bench.hears("cell 5 on vcan0 started anew");
+    bench.hears("cell 5 on vcan0 restarted");
     test_client.waits_for("its confirmation", |message| {
         matches!(message, Message::Configured { from, answer: Answer::Value { number: 7, written: true, words }, .. }
             if *from == fifth && words[..2] == [1, 50])
     });
     test_client.waits_for(
-        "what it feels",
+        "its sensors",
         |message| matches!(message, Message::Sensors { from, .. } if *from == fifth),
     );
     ends(bench);
@@ -105,7 +105,7 @@ fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
 }
 
 #[test]
-fn what_cannot_be_requested_is_said_in_a_line() {
+fn an_invalid_request_is_refused_in_one_line() {
     let place = Place::new();
     assert_eq!(
         refusal(&place, "vcan0 continuous", 2),

@@ -1,4 +1,4 @@
-//! Benches of real processes whose cells answer with sums along their tree: whole, broken and mended.
+//! Benches of real processes whose cells answer with sums along their tree: complete, with links down, and up again.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -17,7 +17,7 @@ use protocol::id::Kind;
 use rustix::process::Signal;
 
 #[test]
-fn the_gateway_hears_its_roots_and_nobody_else_and_every_cell_is_in_their_sums() {
+fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     let place = Place::new();
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
@@ -31,13 +31,18 @@ fn the_gateway_hears_its_roots_and_nobody_else_and_every_cell_is_in_their_sums()
     let sums = |key: &str| summary.of_bus(&format!("/sums/{key}"));
     let broadcasts = summary.number("/loop/broadcasts");
     assert_eq!((sums("roots"), sums("overheard")), (2, 0), "{:#}", summary.0);
-    // Each root once an epoch, and what it says again is counted.
+    // Each root once an epoch, and resent sums are counted.
     assert!(sums("first") > 0 && sums("first") <= 2 * broadcasts, "{:#}", summary.0);
     assert_eq!(summary.count("/buses/0/received", "sum"), sums("received"));
-    assert!(summary.of_bus("/uplink/unheard") > 0, "ten cells spoke to others: {:#}", summary.0);
+    assert!(summary.of_bus("/uplink/unheard") > 0, "ten cells sent to others: {:#}", summary.0);
     assert_eq!(summary.of_bus("/sums/contributions/unasked"), 0);
     assert!(summary.of_bus("/epochs_complete") > 0, "{:#}", summary.0);
-    assert_eq!(summary.count("/buses/0/events", "foreign"), 0, "wires are nobody's: {:#}", summary.0);
+    assert_eq!(
+        summary.count("/buses/0/events", "foreign"),
+        0,
+        "wire frames are not foreign: {:#}",
+        summary.0
+    );
     assert!((2..=11).contains(&summary.of_bus("/network/deepest")), "{:#}", summary.0);
     assert!(summary.figure("/buses/0/network/organised_s") >= 0.0);
     assert_eq!(summary.0["buses"][0]["network"]["differences"].as_array().unwrap().len(), 0);
@@ -73,28 +78,28 @@ fn a_recording_holds_every_sum_and_no_wire() {
 }
 
 #[test]
-fn sums_go_round_a_cell_that_is_killed_or_hangs_and_who_comes_back_is_in_them_again() {
+fn sums_bypass_a_cell_that_is_killed_or_hangs_until_it_comes_back() {
     goes_round_a_cell(&Place::new(), Format::Fd);
 }
 
 #[test]
-fn so_they_do_in_classic_frames() {
+fn sums_bypass_a_cell_in_classic_frames_too() {
     goes_round_a_cell(&Place::new(), Format::Classic);
 }
 
 #[test]
-fn without_a_touch_hellos_tell_who_is_gone_and_the_rest_finds_another_way() {
+fn without_a_touch_hellos_show_lost_cells_and_the_rest_finds_another_route() {
     keeps_ways_without_a_touch(&Place::new(), Format::Fd);
 }
 
 // JOIN-6
 #[test]
-fn who_is_unreachable_any_more_is_named_and_the_rest_finds_another() {
+fn an_unreachable_cell_is_named_and_the_rest_finds_another_route() {
     goes_on_without_a_wire(&Place::new(), Format::Fd);
 }
 
 #[test]
-fn so_it_is_in_classic_frames() {
+fn an_unreachable_cell_is_named_in_classic_frames_too() {
     goes_on_without_a_wire(&Place::new(), Format::Classic);
 }
 

@@ -93,7 +93,7 @@ fn an_interface_that_goes_down_is_lost_alone_and_works_again_when_it_is_up() {
         says(&bench, &format!("{name} works again"), times);
         all_answer(&place);
     }
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, [0, 2, 1, 0]);
 }
 
@@ -125,7 +125,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     let _vcan2 = Vcan::make("vcan2");
     bench.hears("vcan2 works again");
     all_answer(&place);
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, [0, 1, 1, 0]);
 }
 

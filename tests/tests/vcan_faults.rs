@@ -60,7 +60,7 @@ fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
     assert!(dropped == 0 && outage + unknown > 0, "{:#}", summary.0);
 }
 
-/// Waits until a cell says that the robot is halted, lets it go on, and sees that the same cells answer again.
+/// Waits until a cell reports that the robot is halted, acknowledges, and checks that the same cells answer again.
 fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
     place.test_client().waits_for("the cells to be told", |message| {
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
@@ -69,7 +69,7 @@ fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]
     place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
     all_answer(place);
-    assert_eq!(bench.cells(), cells, "nobody was started anew");
+    assert_eq!(bench.cells(), cells, "no cell was restarted");
 }
 
 /// Ends a bench whose bus took nothing for a while, and sees that this has cost what it must, and no more.
@@ -113,7 +113,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     let cells = bench.cells();
     vcan0.down();
     bench.hears(DOWN);
-    let hint = "`gateway ack vcan0 --bus-kind socketcan` lets it go on";
+    let hint = "`gateway ack vcan0 --bus-kind socketcan` resumes it";
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
         bench.tells(cell, "fallen silent");
@@ -124,7 +124,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     vcan0.up();
     bench.hears("vcan0 works again");
     for cell in 1..=6 {
-        bench.tells(cell, "spoken again");
+        bench.tells(cell, "come back");
     }
     assert!(!bench.stderr().contains("the robot goes on"), "{}", bench.stderr());
     goes_on_when_reported(&place, &bench, &cells);
@@ -148,7 +148,7 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     assert_eq!(full.refusal(1), said);
     vcan0.empty();
     for cell in 1..=6 {
-        bench.tells(cell, "spoken again");
+        bench.tells(cell, "come back");
     }
     goes_on_when_reported(&place, &bench, &cells);
     ends_well_after_a_pause(&place, bench);
@@ -248,11 +248,11 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     until("a stopped cell", || is_stopped(stopped).then_some(()));
     bench.tells(5, "fallen silent");
     let by_hand = place.start("cell-node", "--bus vcan0 --node 3 --skin skin.toml");
-    bench.hears("cell 3 on vcan0 started anew");
+    bench.hears("cell 3 on vcan0 restarted");
     // It feels what it did: the touch is as long as the run, and nobody else would tell it.
     place.test_client().waits_for("a torque of the new cell", torque_of(3));
     process::signal(stopped, Signal::CONT);
-    bench.tells(5, "spoken again");
+    bench.tells(5, "come back");
     all_answer(&place);
     bench.signal(Signal::TERM);
     bench.end().well();

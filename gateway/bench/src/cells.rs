@@ -1,4 +1,4 @@
-//! Asking the cells of a bus what they are, and hearing what they say of themselves.
+//! Queries the cells of a bus, and collects what they report.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -14,28 +14,28 @@ use protocol::time::Micros;
 use crate::listen::{self, Listener, passing, send};
 use crate::setup::since;
 
-/// Cells say a heartbeat four times a second, from which their frames' format is seen.
+/// Cells send four heartbeats a second, which show their frames' format.
 const FORMAT: Duration = Duration::from_millis(300);
-/// How often all are asked anew.
+/// How often all cells are queried again.
 const REQUEST: Duration = Duration::from_secs(2);
-/// How long one look at the bus takes, when nothing comes.
+/// How long one poll of the bus waits for a frame.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What is heard of the cells of a bus, and when they were asked.
+/// What was received from the cells of a bus, and when they were queried.
 #[derive(Debug)]
 pub struct Watch {
     listener: Listener,
     began: Instant,
     listing: Listing,
     others: u64,
-    /// What packets travel in, where that is known before anybody is heard.
+    /// The format of packets, if it is known before the first frame.
     format: Option<Format>,
     requested: Option<Instant>,
 }
 
 impl Watch {
-    /// Opens a bus to hear cells and gateways; a classic interface too. Packets that ask travel in this format, or
-    /// else in that of the cells.
+    /// Opens a bus, also a classic interface, to receive from cells and gateways. Queries are sent in this format,
+    /// or else in that of the cells.
     ///
     /// # Errors
     /// When the bus cannot be opened.
@@ -56,19 +56,19 @@ impl Watch {
         self.listener.bus()
     }
 
-    /// What was heard.
+    /// What was received.
     #[must_use]
     pub const fn listing(&self) -> &Listing {
         &self.listing
     }
 
-    /// Frames that no packet came of.
+    /// Frames that are no packet.
     #[must_use]
     pub const fn others(&self) -> u64 {
         self.others
     }
 
-    /// How long it has been heard.
+    /// How long it has been received on.
     #[must_use]
     pub fn elapsed(&self) -> Duration {
         self.began.elapsed()
@@ -80,7 +80,7 @@ impl Watch {
         since(self.began)
     }
 
-    /// Asks for everything, once it is known in which frames; again and again if wanted.
+    /// Queries the cells once their frames' format is known; repeatedly if `again`.
     ///
     /// # Errors
     /// When the bus is gone or closed.
@@ -94,13 +94,13 @@ impl Watch {
         let requested =
             [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
         match requested {
-            // Who cannot be asked may be heard all the same.
+            // Cells that cannot be queried are still received.
             Err(BusError::FdFrame { .. }) => Ok(()),
             requested => passing(requested, Duration::ZERO).map(|_| ()),
         }
     }
 
-    /// Hears what comes within a moment. A bus that is down may come up again, unless somebody says stop.
+    /// Receives what comes within a poll. A bus that is down is waited for, unless `stopped`.
     ///
     /// # Errors
     /// When the bus is gone or closed.

@@ -17,9 +17,9 @@ use crate::listen::{self, Listener, passing, send};
 use crate::run::roots::Roots;
 use crate::setup::since;
 
-/// How long a signal to end may wait, when nothing comes.
+/// How long a signal to end may wait if nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
-/// How often it is looked how far the buses are.
+/// How often progress is read.
 const TELL: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(20);
@@ -32,20 +32,20 @@ pub struct Bench {
     index: usize,
     listener: Listener,
     format: Format,
-    /// Where this side speaks to the roots of a network, whose cells may have no numbers yet.
+    /// The links to the roots of a network, whose cells may have no node ids yet.
     roots: Option<Roots>,
 }
 
-/// What became of a bus.
+/// The result of a bus.
 #[derive(Debug)]
 pub struct Done {
     /// The bus.
     pub name: String,
     /// Its kind.
     pub kind: String,
-    /// What became of its cells.
+    /// The result of its cells.
     pub report: Report,
-    /// Why it was ended: somebody else is there, or the bus is gone.
+    /// Why it was ended: another gateway is there, or the bus is gone.
     pub failure: Option<String>,
     /// Frames that came faster than they were read.
     pub dropped: u32,
@@ -59,7 +59,7 @@ pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError>
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let mut roots = Roots::of(skin, index);
-    // What they say is heard from the beginning.
+    // Their messages are received from the beginning.
     roots.iter_mut().for_each(Roots::explore);
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
@@ -68,13 +68,13 @@ pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError>
     let options = Options { filters, receive_buffer, ..Options::default() };
     let bus = listen::open(name, kinds.of(name), Some(format), options)?;
     if roots.is_some() && !bus.is_virtual()? {
-        // Simulated wires have no place among real cells, which have real ones.
+        // Real cells have real wires; simulated wires must not be used among them.
         roots = None;
     }
     Ok(Bench { index, listener: Listener::new(bus, Some(format)), format, roots })
 }
 
-/// Commissions the cells of all buses, or as many as it can until it is stopped; shows how far they are.
+/// Commissions the cells of all buses, or as many as it can until it is stopped; shows the progress.
 pub fn commission(
     benches: Vec<Bench>,
     skin: &Skin,
@@ -108,7 +108,7 @@ pub fn commission(
 }
 
 impl Bench {
-    /// Commissions the bus' cells, or as many as it can until it is stopped; tells how far it is.
+    /// Commissions the bus' cells, or as many as it can until it is stopped; reports the progress.
     fn work(mut self, skin: &Skin, wish: Wish, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> Done {
         let frames = match self.format {
             Format::Fd => 1,

@@ -2,12 +2,12 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | [`listen`] | an open bus on which others speak |
-//! | [`cells`], [`commission`], [`sensing`] | asking cells, writing their parameters, switching what they tell |
-//! | [`run`] | a run: processes, buses, loop, and what it came to ([`summary`]) |
+//! | [`listen`] | an open bus on which others send |
+//! | [`cells`], [`commission`], [`sensing`] | querying cells, writing their parameters, switching what they report |
+//! | [`run`] | a run: processes, buses, loop, and its result ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
 //! | [`replay`] | a capture on a bus again, compared |
-//! | [`view`] | what a receiver shows of a bus' cells |
+//! | [`view`] | the state of a bus' cells that a receiver shows |
 //! | [`signals`] | signals that end a command |
 
 pub mod cells;

@@ -1,4 +1,4 @@
-//! An open bus on which others speak: hearing them, and saying a word.
+//! An open bus on which others send: receives their frames, and sends single packets.
 
 use std::time::Duration;
 
@@ -41,7 +41,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Listens to a bus whose packets travel in this format; with `None` each frame is taken for what it is.
+    /// Receives on a bus whose packets travel in this format; with `None` each frame has its own.
     #[must_use]
     pub fn new(bus: Bus, format: Option<Format>) -> Self {
         Self { bus, inbox: Inbox::new(), decoder: Decoder::new(format) }
@@ -73,7 +73,7 @@ impl Listener {
         self.inbox.frames()
     }
 
-    /// The same, and what each of them says.
+    /// The same, decoded.
     pub fn decoded(&mut self) -> impl Iterator<Item = (Received, Decoded)> + '_ {
         let Self { bus, inbox, decoder } = self;
         inbox.frames().map(|received| {
@@ -83,10 +83,10 @@ impl Listener {
     }
 }
 
-/// What a bus that is down or full did not do is nothing, after this pause: it may be used again soon.
+/// Turns the error of a bus that is down or full into `None` after this pause: it may be used again soon.
 ///
 /// # Errors
-/// When it will not be.
+/// The other errors.
 pub fn passing<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
     match done {
         Ok(done) => Ok(Some(done)),

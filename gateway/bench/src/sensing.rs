@@ -1,4 +1,4 @@
-//! Telling the cells of a running bench when to say what they feel, until all that are there have confirmed it.
+//! Switches when the cells of a running bench send their sensors, until all that are there have confirmed it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -16,13 +16,13 @@ use thiserror::Error;
 use crate::listen::{self, Listener, send};
 use crate::setup::since;
 
-/// So long cells show that they are there: two heartbeats and some.
+/// How long cells are listened for: two heartbeats and a margin.
 const LISTEN: Duration = Duration::from_millis(600);
-/// From one word to a cell that does not answer to the next.
+/// The retry period for a cell that does not answer.
 const AGAIN: Span = Span::from_millis(250);
-/// Who has not answered by then will not.
+/// The timeout of an answer.
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Comes back in the answers, so that they are not taken for those to somebody else.
+/// Comes back in the answers, which distinguishes them from those to other senders.
 const TAG: u8 = 0x57;
 
 /// Opens a bus on which cells are to be switched, whose packets travel in this format.
@@ -41,20 +41,20 @@ pub enum SensingError {
     /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// Nobody is there who understands.
+    /// No cell answers.
     #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
     Nobody {
-        /// Who was asked.
+        /// The cells that were asked.
         who: String,
         /// The bus.
         bus: String,
         /// The format that the bus may have instead.
         other: &'static str,
     },
-    /// Some do not want to.
-    #[error("{cells} on {bus} refused with reason {reason}: docs/reference/protocol.md says what it means")]
+    /// Some refused.
+    #[error("{cells} on {bus} refused with reason {reason}: docs/reference/protocol.md explains it")]
     Refused {
-        /// Those, in words.
+        /// Those, as text.
         cells: String,
         /// The bus.
         bus: String,
@@ -64,7 +64,7 @@ pub enum SensingError {
     /// Some are there and do not answer.
     #[error("{cells} on {bus} did not answer, {done} did: switch them again when they are back")]
     Silent {
-        /// Those, in words.
+        /// Those, as text.
         cells: String,
         /// The bus.
         bus: String,
@@ -73,7 +73,7 @@ pub enum SensingError {
     },
 }
 
-/// Switches one cell, or all that are heard on a bus that [`open`] gave; says who was switched.
+/// Switches one cell, or all that send on a bus that [`open`] gave; names those that were switched.
 ///
 /// # Errors
 /// When not all of them confirm it, or the bus fails.
@@ -86,8 +86,8 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     };
     tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
-    let mut told = Repeats::new(AGAIN);
-    told.said_to_all(since(began));
+    let mut requests = Repeats::new(AGAIN);
+    requests.said_to_all(since(began));
     while began.elapsed() < TIMEOUT && !answers.are_complete(began.elapsed() >= LISTEN) {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
@@ -95,14 +95,14 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
                 answers.take(&message);
             }
         }
-        for cell in told.due(since(began), answers.missing()) {
+        for cell in requests.due(since(began), answers.missing()) {
             tell(listener.bus(), Node::Cell(cell))?;
         }
     }
     answers.verdict(listener.bus().name(), format)
 }
 
-/// Who is there, and what they answered.
+/// The cells that are there, and their answers.
 #[derive(Debug, Default)]
 struct Answers {
     /// The one cell that is asked; else all.
@@ -140,12 +140,12 @@ impl Answers {
         known.into_iter().filter(|cell| !answered(cell)).collect()
     }
 
-    /// Whether nobody is waited for any more; others than one cell show up as long as it is listened.
+    /// Whether no cell is waited for any more; while `listened` is not set, further cells may show up.
     fn are_complete(&self, listened: bool) -> bool {
         self.missing().is_empty() && (self.only.is_some() || (listened && !self.heard.is_empty()))
     }
 
-    /// Who was switched, in words; or why not all that should be were.
+    /// The cells that were switched, as text; or why some were not.
     fn verdict(&self, bus: &str, format: Format) -> Result<String, SensingError> {
         let (bus, missing) = (bus.to_owned(), self.missing());
         if self.confirmed.is_empty() && self.refused.is_empty() {
@@ -181,7 +181,7 @@ mod tests {
     use protocol::message::Heartbeat;
     use protocol::packet::{Epoch, WORDS};
 
-    /// What is said at the end, on an FD bus.
+    /// The final verdict, on an FD bus.
     fn verdict(answers: &Answers) -> Result<String, String> {
         answers.verdict("vcan0", Format::Fd).map_err(|error| error.to_string())
     }
@@ -201,14 +201,14 @@ mod tests {
     }
 
     #[test]
-    fn all_who_are_heard_have_to_answer() {
+    fn all_cells_that_send_have_to_answer() {
         let mut answers = Answers::default();
-        assert!(!answers.are_complete(true), "nobody is there yet");
+        assert!(!answers.are_complete(true), "no cell is there yet");
         for message in [beat(1), confirms(1, TAG), confirms(2, TAG), beat(3), confirms(3, TAG ^ 1)] {
             answers.take(&message);
         }
         assert!(!answers.are_complete(true));
-        assert_eq!(answers.missing(), [cell(3)], "the answer to somebody else is none");
+        assert_eq!(answers.missing(), [cell(3)], "the answer to another sender does not count");
         let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
         assert_eq!(verdict(&answers), Err(why.to_owned()));
         answers.take(&confirms(3, TAG));
@@ -229,11 +229,11 @@ mod tests {
     }
 
     #[test]
-    fn who_refuses_is_named() {
+    fn a_cell_that_refuses_is_named() {
         let mut answers = Answers::default();
         let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
         answers.take(&Message::Configured { from: cell(9), tag: TAG, answer });
-        let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md says what it means";
+        let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
         assert_eq!(verdict(&answers), Err(why.to_owned()));
     }
 }

@@ -1,4 +1,4 @@
-//! What a run and a replay have in common until their cells are there.
+//! What a run and a replay share until their cells are ready.
 
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use protocol::time::Micros;
 
 use crate::run::RunError;
 
-/// How long it is waited for something that is getting on.
+/// A timeout that restarts with each progress.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Timeout {
     length: Duration,
@@ -22,7 +22,7 @@ impl Timeout {
         Self { length, most: 0, since: Instant::now() }
     }
 
-    /// Takes in how far it is; whether it got no further than that for too long.
+    /// Takes in the progress; whether there was none for too long.
     pub(crate) fn is_over(&mut self, far: usize) -> bool {
         if far > self.most {
             (self.most, self.since) = (far, Instant::now());
@@ -31,7 +31,7 @@ impl Timeout {
     }
 }
 
-/// The numbers of some cells, for people, and where these are: `1, 2, 5 on vcan0`.
+/// The node ids of some cells as text, and their bus: `1, 2, 5 on vcan0`.
 pub(crate) fn names(cells: &[CellId], place: &str) -> String {
     let numbers: Vec<_> = cells.iter().map(ToString::to_string).collect();
     match numbers.len() {

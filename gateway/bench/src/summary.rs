@@ -1,6 +1,6 @@
-//! What a run came to: the figures of the table at its end, and of `--summary`.
+//! The result of a run: the figures of the table at its end, and of `--summary`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/reference/summary.md` says what they mean.
+//! The keys of the JSON are the names of the fields here; `docs/reference/summary.md` explains them.
 
 use std::collections::BTreeMap;
 
@@ -49,7 +49,7 @@ pub struct Summary {
     /// Distributed against central torques.
     pub accuracy: Accuracy,
     /// Packets of the whole machine, any interface's, that the kernel dropped before they came to a socket,
-    /// because a processor's backlog was full; none where it does not say.
+    /// because a processor's backlog was full; none if it does not report them.
     pub backlog_dropped: Option<u64>,
     /// Each bus.
     pub buses: Vec<BusSummary>,
@@ -57,12 +57,12 @@ pub struct Summary {
     pub processor: Processor,
     /// Private memory of the largest cell process in KiB, if cells were started.
     pub cell_private_kib: Option<u64>,
-    /// What was recorded, and what did not make it there.
+    /// What was recorded, and what was lost.
     pub recording: Option<Recording>,
 }
 
 impl Summary {
-    /// Of a run of which nothing is known yet.
+    /// The summary of a run of which nothing is known yet.
     #[must_use]
     pub fn empty(skin: &Skin) -> Self {
         Self {
@@ -73,16 +73,16 @@ impl Summary {
         }
     }
 
-    /// Of a run that failed before any bus was opened.
+    /// The summary of a run that failed before any bus was opened.
     #[must_use]
     pub fn of_no_run(skin: &Skin, why: String) -> Self {
         Self::empty(skin).rated(Some(why))
     }
 
-    /// Says how it ended, from what else is known; `failure` is why it did not come to its end.
+    /// Sets the outcome from what else is known; `failure` is why it did not come to its end.
     #[must_use]
     pub fn rated(mut self, failure: Option<String>) -> Self {
-        // A bus that was lost may be why the robot was halted, and the halt says more.
+        // A lost bus may be why the robot was halted, and the halt is the more precise outcome.
         let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
         self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
         self.outcome = match &self.failure {
@@ -94,10 +94,10 @@ impl Summary {
         self
     }
 
-    /// What is to be said of its end, a line each and the reason of its exit code last; nothing when all is well.
+    /// The messages about its end, a line each and the reason of its exit code last; none when all is well.
     #[must_use]
     pub fn complaints(&self) -> Vec<String> {
-        // A run that failed has said which bus was lost.
+        // The error of a failed run names the lost bus.
         let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
         let lost = self.lost_buses().filter(|_| came_to_its_end);
         let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
@@ -120,7 +120,7 @@ impl Summary {
         let Recording { errors, lost_write, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
         (!errors.is_empty() || *lost_write > 0)
-            .then(|| format!("the recording is not whole, {lost_write} frames were not written: {first}"))
+            .then(|| format!("the recording is incomplete, {lost_write} frames were not written: {first}"))
     }
 }
 
@@ -129,7 +129,7 @@ impl Summary {
 pub struct Loop {
     /// Ticks that happened.
     pub ticks: u64,
-    /// Ticks that were skipped because the machine was not there in time.
+    /// Ticks that were skipped because the machine was late.
     pub ticks_skipped: u64,
     /// Broadcasts sent.
     pub broadcasts: u64,
@@ -137,11 +137,11 @@ pub struct Loop {
     pub broadcasts_skipped: u64,
     /// Bad cycles, by reason.
     pub bad_cycles: BTreeMap<String, u64>,
-    /// What an external controller's datagrams came to, by name; empty for other controllers.
+    /// Outcomes of an external controller's datagrams, by name; empty for other controllers.
     pub controller: BTreeMap<String, u64>,
     /// How late ticks began.
     pub late_us: Quantiles,
-    /// How late the same machine wakes a thread when nothing else runs.
+    /// How late the same machine wakes an idle thread.
     pub idle_late_us: Quantiles,
     /// How long a tick took.
     pub took_us: Quantiles,
@@ -181,27 +181,27 @@ pub struct UplinkSummary {
     pub rejected: u64,
     /// Sums for another cell, which this gateway did not take.
     pub unheard: u64,
-    /// Sent and not arrived, because the bus dropped frames that we did not take in time.
+    /// Sent and not arrived, because the bus dropped frames that were not read in time.
     pub dropped: u64,
-    /// Sent and not arrived, as far as drops of the kernel's backlog explain it.
+    /// Sent and not arrived, as far as the kernel's backlog drops explain it.
     pub backlog: u64,
     /// Sent and not arrived, while the bus was lost.
     pub outage: u64,
-    /// Sent and not arrived, and nobody knows why.
+    /// Sent and not arrived, for an unknown reason.
     pub unknown: u64,
     /// Arrived more often than sent.
     pub surplus: u64,
-    /// Arrived of what a cell sent after its last heartbeat before it started anew: what else it sent then,
-    /// nobody knows.
+    /// Arrived of what a cell sent between its last heartbeat and its restart: what else it sent then is
+    /// unknown.
     pub in_doubt: u64,
     /// Arrived after a cell's last heartbeat, which nothing can be compared with.
     pub unsettled: u64,
-    /// Cells that started anew.
+    /// Cells that restarted.
     pub restarts: u32,
 }
 
 impl UplinkSummary {
-    /// Takes what is unknown for drops of the kernel's backlog, at most so many; how many it took.
+    /// Attributes unknown losses to the kernel's backlog, at most so many; how many.
     pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
@@ -215,10 +215,10 @@ impl UplinkSummary {
 pub struct SumsSummary {
     /// Cells that are wired to the gateway's side.
     pub roots: usize,
-    /// What became of those that came: received = first + resent + overheard + stale.
+    /// What was done with the received ones: received = first + resent + overheard + stale.
     #[serde(flatten)]
     pub counts: SumCounts,
-    /// Cells that were to be in sums, and were: due = in time + late + missing.
+    /// Cells that had to be in sums, and were: due = in time + late + missing.
     pub contributions: Contributions,
 }
 
@@ -227,32 +227,32 @@ pub struct SumsSummary {
 pub struct OutagesSummary {
     /// How often.
     pub times: u64,
-    /// For how long in all, in s: from when it was noticed to the first frame after it.
+    /// Its total time in s, each from when it was noticed to the first frame after it.
     pub lost_s: f64,
     /// Whether it was lost at the end.
     pub at_end: bool,
-    /// Ticks that had to do without it.
+    /// Ticks without it.
     pub ticks: u64,
 }
 
 /// The network of a bus' cells.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct NetworkSummary {
-    /// From the time when all cells were ready until all had a way to a root, in s; none when some never had.
+    /// From the time when all cells were ready until all had a route to a root, in s; none if some never had.
     pub tree_ready_s: Option<f64>,
-    /// The depth of the deepest cell that there was a slot for; a root's is 0.
+    /// The largest depth for which there was a slot; a root's is 0.
     pub deepest: u8,
-    /// What was different from the description at the start.
+    /// Differences from the description at the start.
     pub differences: Vec<String>,
-    /// Cells that spoke and had no way to a root at the end.
+    /// Cells that sent and had no route to a root at the end.
     pub unreachable: Vec<u8>,
-    /// The longest time that a cell spoke and had none while the loop ran, in s.
+    /// The longest time that a cell sent and had none while the loop ran, in s.
     pub longest_unreachable_s: f64,
     /// How often a cell's parent changed, by the cells' own count.
     pub parent_changes: u64,
 }
 
-/// What the cells of a bus told of what they feel.
+/// The sensors frames of a bus' cells.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SensorsSummary {
     /// Frames, of either page.
@@ -282,7 +282,7 @@ pub struct BusSummary {
     pub outages: OutagesSummary,
     /// Cells by status at the end.
     pub cells: BTreeMap<&'static str, usize>,
-    /// Cells that were dead or never heard at the end.
+    /// Cells that were dead or were never received at the end.
     pub silent_cells: Vec<u8>,
     /// Packets from the cells.
     pub uplink: UplinkSummary,
@@ -292,9 +292,9 @@ pub struct BusSummary {
     pub sums: Option<SumsSummary>,
     /// The network that they go along.
     pub network: Option<NetworkSummary>,
-    /// What cells told of what they feel.
+    /// Sensors frames of the cells.
     pub sensors: SensorsSummary,
-    /// Epochs that somebody had to answer, and those that everybody answered in time.
+    /// Epochs that some cell had to answer, and those that all answered in time.
     pub epochs_due: u64,
     /// See above.
     pub epochs_complete: u64,
@@ -302,9 +302,9 @@ pub struct BusSummary {
     pub received: BTreeMap<&'static str, u64>,
     /// Packets by kind, sent by this gateway as read back from the bus.
     pub sent: BTreeMap<&'static str, u64>,
-    /// What was odd, by reason; zeros are left out.
+    /// Irregular events by reason; zeros are left out.
     pub events: BTreeMap<&'static str, u64>,
-    /// Frames that the bus dropped because we did not take them in time.
+    /// Frames that the bus dropped because they were not read in time.
     pub dropped_by_bus: u64,
     /// From a broadcast to its last reply in time, by the kernel's time stamps.
     pub last_reply_us: Quantiles,
@@ -362,13 +362,13 @@ impl BusSummary {
 }
 
 fn sensors(table: &Table) -> SensorsSummary {
-    let told = || table.cells().iter().map(|cell| cell.sensed);
-    let rates: Vec<f64> = told().filter_map(|sensed| sensed.rate_hz()).collect();
+    let sensed = || table.cells().iter().map(|cell| cell.sensed);
+    let rates: Vec<f64> = sensed().filter_map(|sensed| sensed.rate_hz()).collect();
     let cells = u32::try_from(rates.len()).ok().filter(|&cells| cells > 0);
     SensorsSummary {
-        frames: told().map(|sensed| sensed.frames).sum(),
-        touches: told().map(|sensed| sensed.touches).sum(),
-        releases: told().map(|sensed| sensed.releases).sum(),
+        frames: sensed().map(|sensed| sensed.frames).sum(),
+        touches: sensed().map(|sensed| sensed.touches).sum(),
+        releases: sensed().map(|sensed| sensed.releases).sum(),
         min_hz: rates.iter().copied().reduce(f64::min),
         mean_hz: cells.map(|cells| rates.iter().sum::<f64>() / f64::from(cells)),
         max_hz: rates.iter().copied().reduce(f64::max),

@@ -1,4 +1,4 @@
-//! What the receiver of a bus shows of its cells to the main thread and to the recorder.
+//! The state of a bus' cells that its receiver shows to the main thread and to the recorder.
 
 use protocol::id::CellId;
 use protocol::message::State;
@@ -14,25 +14,25 @@ pub struct View {
     pub cells: Vec<CellView>,
     /// Commands of our own that were read back from the bus, or were lost with it.
     pub commands: u64,
-    /// What is known of the network's cells, those that are not described among them; nobody where cells answer
-    /// with their own torques.
+    /// What is known of the network's cells, those that are not described among them; none if cells
+    /// answer with their own torques.
     pub network: Vec<Seen>,
 }
 
 /// The state of one cell.
 #[derive(Clone, Copy, Debug)]
 pub struct CellView {
-    /// Its number.
+    /// Its node id.
     pub node: CellId,
-    /// Whether it has been heard of.
+    /// Whether anything was received from it.
     pub heard: bool,
     /// Whether it has fallen silent.
     pub dead: bool,
-    /// Whether it can be expected to answer, once nobody halts it.
+    /// Whether it can be expected to answer, unless it is halted.
     pub ready: bool,
     /// Whether it waits for a resume.
     pub halted: bool,
-    /// Whether it is there for good and has no parameters to compute with.
+    /// Whether it is settled and has no parameters to compute with.
     pub unconfigured: bool,
     /// Whether it measures, so that stimuli do not touch it.
     pub measures: bool,
@@ -40,11 +40,11 @@ pub struct CellView {
     pub other: bool,
     /// The joints that it had taken last.
     pub last_joints: Epoch,
-    /// What it has said since it was asked.
+    /// What it has sent since it was queried.
     pub said: Said,
-    /// What it answers joints with, as it said last.
+    /// What it answers joints with, by its last report.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports that hear nothing because it was told so, as it said last.
+    /// Ports whose link it holds down, by its last report.
     pub deaf: u8,
     /// What it is to be switched to and has not confirmed.
     pub lacks: [Option<Switch>; SWITCHES],

@@ -5,8 +5,8 @@
 //!                                                                └─> Step::Bad(why)
 //! ```
 //!
-//! [`Kinesthetic`] lets the arm give way to who pushes it. [`Hold`] and [`Sine`] are motions of a
-//! scenario that do not listen to torques. [`crate::external::External`] asks another program.
+//! [`Kinesthetic`] moves the arm with the torque of a push. [`Hold`] and [`Sine`] are motions of a
+//! scenario that ignore torques. [`crate::external::External`] queries another program.
 
 use core::f64::consts::TAU;
 
@@ -17,7 +17,7 @@ use thiserror::Error;
 
 use crate::robot::padded;
 
-/// What a controller is told in a tick. Joints that the robot does not have are zero.
+/// A controller's input in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Input {
     /// The number of the tick.
@@ -36,10 +36,10 @@ pub struct Input {
     pub contributing: u32,
     /// Whether the torque may be used.
     pub valid: bool,
-    /// Buses that are lost, whose cells are not in the torque, or fade from it: bit n is bus n of the skin, bit 31
+    /// Buses that are lost, whose cells are not in the torque, or decay in it: bit n is bus n of the skin, bit 31
     /// stands for all from there on.
     pub missing: u32,
-    /// Whether the robot is halted: nothing that a controller asks for is done.
+    /// Whether the robot is halted: a controller's commands have no effect.
     pub halted: bool,
 }
 
@@ -48,7 +48,7 @@ pub struct Input {
 pub enum Step {
     /// Joint velocities in rad/s until the next tick; finite, and within the limits of speed.
     Move([f64; MAX_JOINTS]),
-    /// It has no answer: a bad cycle. What the robot then does is the caller's to decide.
+    /// It has no answer: a bad cycle. The caller decides what the robot then does.
     Bad(BadCycle),
 }
 
@@ -58,10 +58,10 @@ pub enum BadCycle {
     /// The torque must not be used, or is not a number.
     #[error("the torque is not valid")]
     Torque,
-    /// An external controller has not yet said hello, or has gone.
+    /// An external controller has not yet sent a hello, or has ended.
     #[error("no external controller is connected")]
     NoPeer,
-    /// An external controller's answer to the last tick is not there.
+    /// An external controller's answer to the last tick is missing.
     #[error("the external controller's answer is missing")]
     NoAnswer,
     /// An external controller sent something that is no answer.
@@ -74,7 +74,7 @@ pub trait Controller: Send {
     /// One tick. Must not block, allocate, lock or log.
     fn step(&mut self, input: &Input) -> Step;
 
-    /// What it has counted, with names for people: for the end of a run, not for the tick.
+    /// Its counters with their names: for the end of a run, not for the tick.
     fn counts(&self) -> Vec<(String, u64)> {
         Vec::new()
     }
@@ -97,7 +97,7 @@ pub struct Kinesthetic {
 struct Admittance {
     /// 1/D in rad/s per Nm.
     mobility: f64,
-    /// What is left of a velocity after a tick: `e^(-D/M T)`.
+    /// The remaining part of a velocity after a tick: `e^(-D/M T)`.
     keep: f64,
     max_speed: f64,
 }
@@ -193,14 +193,14 @@ impl Sine {
 }
 
 impl Controller for Sine {
-    /// Aims at where it has to be when the next tick begins, so that it neither lags nor drifts.
+    /// Aims at the position for the begin of the next tick, so that it neither lags nor drifts.
     fn step(&mut self, input: &Input) -> Step {
         let next = self.at(seconds(input.time) + self.pace.tick);
         Step::Move(self.pace.towards(&next, input))
     }
 }
 
-/// How quickly joints may go, and how long a tick is.
+/// The limits of joint speeds, and the length of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pace {
     /// Length of a tick in s.

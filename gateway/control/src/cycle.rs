@@ -4,10 +4,10 @@
 //! ```text
 //!   Tick, Heard ─────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
 //!                                   ├─> Outcome::command > a halt or a resume for every bus
-//!                                   └─> Record ──────────> what this tick was like
+//!                                   └─> Record ──────────> the record of this tick
 //! ```
 //!
-//! A bus that is lost is lost alone: what its cells said last counts less and less ([`carried`]), and the loop goes on
+//! A lost bus does not affect others: the last torques of its cells decay to zero ([`carried`]), and the loop goes on
 //! with the others.
 //!
 //! A tick allocates nothing, takes no lock, writes no log, and its work does not grow with the cells,
@@ -43,11 +43,11 @@ pub struct Tick {
 pub enum Halt {
     /// So many bad cycles in a row.
     BadCycles(BadCycle),
-    /// Somebody sent a halt frame.
+    /// A halt frame was received.
     Frame,
 }
 
-/// What a tick was like.
+/// The record of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Record {
     /// When it was.
@@ -64,7 +64,7 @@ pub struct Record {
     pub valid: bool,
     /// The epoch of the last joints.
     pub epoch: Epoch,
-    /// The joint velocities in rad/s that the robot was told.
+    /// The commanded joint velocities in rad/s.
     pub command: [f64; WORDS],
     /// Cells in the torque.
     pub contributing: u32,
@@ -92,9 +92,9 @@ pub struct Outcome {
     /// Broadcasts that should have been before this one and were skipped with their ticks.
     pub broadcasts_skipped: u64,
     /// A halt or a resume that has to be sent on every bus: because this loop halts itself, or because
-    /// somebody said it on one bus and the others have not heard it.
+    /// it was received on one bus and has to be repeated on the others.
     pub command: Option<Command>,
-    /// For whoever records.
+    /// The record.
     pub record: Record,
 }
 
@@ -107,7 +107,7 @@ pub struct Cycle {
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     safety: Safety,
-    /// How far each bus has carried the broadcasts.
+    /// How many of the broadcasts each bus has carried.
     carried: Vec<Carried>,
     epoch: Epoch,
     broadcasts: u64,
@@ -152,7 +152,7 @@ impl Cycle {
         }
     }
 
-    /// Begins after this epoch: cells that were there before would take its joints for repeated ones.
+    /// Begins after this epoch: to cells that were there before, its joints would count as repeated.
     pub const fn start_after(&mut self, epoch: Epoch) {
         self.epoch = epoch;
     }
@@ -175,7 +175,7 @@ impl Cycle {
         self.broadcasts
     }
 
-    /// One tick; `skipped` ticks before it did not happen. It is given the buses' sums, in the skin's order, and no
+    /// One tick; `skipped` ticks before it did not happen. Its input is the buses' sums, in the skin's order, and no
     /// cells, so its work cannot grow with them.
     pub fn tick<'a>(
         &mut self,
@@ -259,7 +259,7 @@ impl Cycle {
         Outcome { joints, broadcasts_skipped, command, record }
     }
 
-    /// What the central computation makes of the last broadcast's words and what the cells then felt:
+    /// The reference torque: computed centrally from the last broadcast's words and the sensor values at it. This is
     /// the work that distributed computation takes out of the tick. It grows with the cells.
     #[must_use]
     pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> ReferenceTorque {
@@ -274,8 +274,8 @@ impl Cycle {
         reference_torque
     }
 
-    /// Halts and resumes that others sent; a halt outdoes a resume. Returns what the other buses have to
-    /// be told.
+    /// Halts and resumes that others sent; a halt takes precedence over a resume. Returns what has to be sent on
+    /// the other buses.
     fn obey(&mut self, halts: u32, resumes: u32) -> Option<Command> {
         let mut heard = None;
         if resumes != self.resumes {
@@ -292,7 +292,7 @@ impl Cycle {
         heard
     }
 
-    /// Counts bad cycles; returns whether this one was one too many.
+    /// Counts bad cycles; returns whether this one reached the limit.
     fn comparator(&mut self, bad: Option<BadCycle>) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;

@@ -2,8 +2,8 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | [`cycle`] | the tick itself, and what surrounds it |
-//! | [`controller`], [`motion`] | torques into joint velocities, and who does it in which motion |
+//! | [`cycle`] | the tick itself, and its input and output |
+//! | [`controller`], [`motion`] | torques into joint velocities, and the controller of each motion |
 //! | [`external`] | a controller in another program, behind a Unix datagram socket |
 //! | [`robot`] | the simulated arm |
 

@@ -1,4 +1,4 @@
-//! Which controller a motion of a scenario asks for.
+//! The controller of a scenario's motion.
 
 use std::path::Path;
 
@@ -36,7 +36,7 @@ mod tests {
     use model::testing::skin;
 
     #[test]
-    fn the_scenario_says_who_moves_the_robot() {
+    fn the_scenario_selects_the_controller() {
         let mut motion = Motion { start_rad: [0.25; 6], kind: MotionKind::Hold };
         let mut step = |kind, torque| {
             motion.kind = kind;
@@ -48,7 +48,7 @@ mod tests {
         };
         assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
         assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
-        assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "gives way");
+        assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "moves with the torque");
         assert!(step(MotionKind::Sine { amplitude_rad: [0.1; 6], period_s: 4.0 }, 0.0) > 0.0);
     }
 }

@@ -8,7 +8,7 @@ pub(crate) fn padded<T: Copy + Default>(given: &[T]) -> [T; MAX_JOINTS] {
     core::array::from_fn(|joint| given.get(joint).copied().unwrap_or_default())
 }
 
-/// A robot that is told joint velocities. Joints that it does not have stand at zero.
+/// A robot that takes joint velocities. Joints that it does not have stand at zero.
 pub trait Robot {
     /// Moves for `seconds` with these joint velocities in rad/s. Called once a tick: must not block,
     /// allocate, lock or log.
@@ -21,10 +21,10 @@ pub trait Robot {
     fn velocities(&self) -> [f64; MAX_JOINTS];
 }
 
-/// What became of a step.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Moved {
-    /// Joints that stand at a limit and were told to go on, one bit each, joint 1 lowest.
+    /// Joints that stand at a limit and were commanded beyond it, one bit each, joint 1 lowest.
     pub at_limit: u8,
     /// Whether a velocity was not finite and was taken as zero.
     pub refused: bool,
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn the_arm_stops_at_a_limit_says_so_and_comes_back() {
+    fn the_arm_stops_at_a_limit_reports_it_and_comes_back() {
         let mut skin = skin();
         skin.robot.limits_rad[2] = [-1.0, 0.5];
         let mut arm = SimulatedArm::new(&skin, [0.0, 0.0, 0.499, 0.0, 0.0, 0.0]);

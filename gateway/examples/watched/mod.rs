@@ -10,7 +10,7 @@ pub(crate) fn gateway() -> PathBuf {
     program.parent().and_then(Path::parent).expect("it lies in a folder of the build").join("gateway")
 }
 
-/// Seconds until a command has done its work, and the greatest memory of its process in MB.
+/// Seconds until a command has done its work, and the peak memory of its process in MB.
 pub(crate) fn run(command: &mut Command) -> (f64, f64) {
     let begun = Instant::now();
     let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");

@@ -1,8 +1,8 @@
-//! Benches whose loop another program closes.
+//! Benches whose loop is closed by another program.
 
 use super::{PRESSED, Place, skin};
 
-/// A bench whose loop another program closes, halted after so many bad cycles in a row.
+/// A bench whose loop is closed by another program, halted after so many bad cycles in a row.
 pub(crate) fn place(bad_cycles: u32) -> Place {
     let place = Place::new();
     let socket = place.path("controller.sock");

@@ -1,4 +1,4 @@
-//! What a recorded log says about the run that it is of.
+//! What a recorded log shows of its run.
 
 use std::collections::BTreeMap;
 
@@ -13,11 +13,11 @@ use protocol::time::Micros;
 /// A whole log.
 pub(crate) struct Log {
     pub(crate) frames: Vec<Frame>,
-    /// What could be understood, in the bus' order, with the packet that said it.
+    /// What could be decoded, in the bus' order, with its packet.
     pub(crate) messages: Vec<(Message, Packet)>,
 }
 
-/// What a torque is a function of, beside the cell's parameters: its number, the joints, and what it feels.
+/// What a torque is a function of, beside the cell's parameters: its node id, the joints, and its contact state.
 pub(crate) type Cause = (u8, [i16; WORDS], [i16; 6]);
 
 impl Log {
@@ -49,8 +49,8 @@ impl Log {
         Self { messages: messages.collect(), frames }
     }
 
-    /// What each sender has said, in its order; of heartbeats, which come when their time has come and not when
-    /// something happens, only what they say of a cell that is new.
+    /// What each sender has sent, in its order; of heartbeats, which are periodic and not caused by events, only
+    /// what they report of a new cell.
     pub(crate) fn by_sender(&self) -> BTreeMap<(Kind, u8, u8), Vec<String>> {
         let mut all = BTreeMap::<_, Vec<String>>::new();
         for (message, packet) in &self.messages {
@@ -58,7 +58,7 @@ impl Log {
                 Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                     format!("{:?}", Heartbeat { sent: 0, ..*heartbeat })
                 }
-                // The epoch of these is that of the joints before them, which comes by time.
+                // The epoch of these is that of the joints before them, which depends on time.
                 Message::Network { page, .. } => format!("{page:?}"),
                 Message::Sensors { page, .. } => format!("{page:?}"),
                 other => format!("{other:?}"),
@@ -73,7 +73,7 @@ impl Log {
         all
     }
 
-    /// Sees that each heartbeat counts exactly the packets of its cell that stand before it in the log, which
+    /// Checks that each heartbeat counts exactly the packets of its cell before it in the log, which
     /// begins before the cells do.
     pub(crate) fn heartbeats_count_what_came(&self) {
         let mut sent = BTreeMap::<u8, u16>::new();
@@ -99,7 +99,7 @@ impl Log {
         joints.collect()
     }
 
-    /// How many torques of a cell stand after the message at an index.
+    /// How many torques of a cell are after the message at an index.
     pub(crate) fn torques_after(&self, index: usize, cell: u8) -> usize {
         let torque =
             |message: &Message| matches!(message, Message::Torque { from, .. } if from.get() == cell);
@@ -143,7 +143,7 @@ fn words(skin: &SkinSensors) -> [i16; 6] {
     [a.to_bits(), b.to_bits(), c.to_bits(), proximity.to_bits(), d.to_bits(), e.to_bits()]
 }
 
-/// What a cell feels, by the protocol's rules, as the document has them.
+/// The contact state of a cell, by the protocol's rules, as the document has them.
 #[derive(Default)]
 struct ContactState {
     waiting: Vec<(From, SkinSensors)>,
@@ -166,7 +166,7 @@ impl ContactState {
     }
 }
 
-/// Sees that the same causes have the same torques in both runs, bit for bit, and that the same causes at the
+/// Checks that the same causes have the same torques in both runs, bit for bit, and that the same causes at the
 /// same broadcast have the same packets; returns how many causes they share, and how many the smaller has.
 pub(crate) fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
     let [one, other] = [one, other].map(Log::torques);

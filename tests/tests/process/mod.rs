@@ -1,7 +1,7 @@
 //! A bench of real processes on a bus of its own, embedded or a real kernel's: what all tests of this kind share.
 //!
-//! Nothing here waits for a time to pass: what is waited for is looked at until it is so, or until
-//! [`TIMEOUT`] is over, which a slow machine never needs and a hanging program does.
+//! Nothing here waits for a fixed time: conditions are polled until they hold, or until [`TIMEOUT`]
+//! is over, which a slow machine never needs and a hanging program does.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -59,7 +59,7 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Looks until something is there.
+/// Polls until something is there.
 pub(crate) fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let give_up = Instant::now() + TIMEOUT;
     loop {
@@ -121,7 +121,7 @@ pub(crate) fn signal(pid: Pid, signal: Signal) {
     kill_process(pid, signal).unwrap();
 }
 
-/// Whether a bench has said of a cell, alone or with others, that it has done something.
+/// Whether a bench has reported of a cell, alone or with others, that it has done something.
 pub(crate) fn tells(text: &str, cell: u8, what: &str) -> bool {
     tells_on(text, "vcan0", cell, what)
 }

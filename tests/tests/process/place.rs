@@ -132,7 +132,7 @@ impl Place {
         all_processes().into_iter().filter(ours).map(|pid| (pid, command_line(pid))).collect()
     }
 
-    /// Sees that no process and no socket of this place is left, soon.
+    /// Checks that soon no process and no socket of this place remains.
     pub(crate) fn is_left_clean(&self) {
         let left = || {
             let processes = self.processes();

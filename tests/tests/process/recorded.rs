@@ -1,4 +1,4 @@
-//! A recording, read by its own definitions and by nothing that wrote it.
+//! A recording, read by its own definitions and without the code that wrote it.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -58,7 +58,7 @@ impl Recorded {
             let stamp = stamp["sec"].as_u64().unwrap() * 1_000_000_000 + stamp["nanosec"].as_u64().unwrap();
             let topic = message.channel.topic.clone();
             assert_eq!(message.publish_time, message.log_time);
-            // What is in force when a file begins is older.
+            // What is latched when a file begins is older.
             let of_the_past = topic.starts_with("/state/");
             assert!(
                 if of_the_past { stamp < message.log_time } else { stamp == message.log_time },
@@ -195,7 +195,7 @@ impl<'a> From<'a> {
     }
 }
 
-/// Records a bench of pressed cells, and sees that the recording has exactly the frames that candump has seen.
+/// Records a bench of pressed cells, and checks that the recording has exactly the frames that candump has seen.
 pub(crate) fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f64, more: &str) {
     let expected = Target { cells, broadcast_hz, ..Target::default() };
     place.write("skin.toml", &generate(&expected).unwrap());

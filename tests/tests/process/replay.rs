@@ -58,11 +58,11 @@ force_n = 6.0
 profile = "ramp"
 "#;
 
-pub(crate) fn cell(number: i64) -> CellId {
-    CellId::new(number).unwrap()
+pub(crate) fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
 }
 
-/// What a guest says while a run is recorded: every command, stimuli of both pages in both ways, parameters that are
+/// What a test client sends while a run is recorded: every command, stimuli of both pages in both ways, parameters that are
 /// read, written, refused and taken into use.
 pub(crate) fn says_everything(test_client: &TestClient, skin: &Path) {
     let configure = |to, tag, request| Message::Configure { to, tag, request };
@@ -97,18 +97,18 @@ pub(crate) fn says_everything(test_client: &TestClient, skin: &Path) {
     test_client.waits_for_epoch(90);
     test_client.sends(&Message::Resume);
     test_client.waits_for_epoch(110);
-    // Whoever is told what its mode is forgets what it felt.
+    // Writing the mode of a cell resets its contact state.
     test_client.sends(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
 }
 
 impl Place {
-    /// `run.log` and `skin.toml`: a run of some cells with touches and all that can be said.
+    /// `run.log` and `skin.toml`: a run of some cells with touches and every message.
     pub(crate) fn records(&self, cells: usize) {
         let skin = self.skin(cells);
         self.records_with(&skin);
     }
 
-    /// The same of a skin that is there.
+    /// The same of a given skin.
     pub(crate) fn records_with(&self, skin: &Path) {
         self.scenario(TOUCHED);
         let bench = self.running_bench(4.0, "");
@@ -153,15 +153,15 @@ impl Replayed {
         ["equal", "different", "missing", "extra"].map(|what| self.number(&format!("/expect/{what}")))
     }
 
-    /// Sees that all replies came back, and nothing else; returns how many.
+    /// Checks that all replies came back, and nothing else; returns how many.
     pub(crate) fn all_came_back(&self, ended: &Ended) -> u64 {
         let [equal, rest @ ..] = self.replies();
         assert_eq!((rest, ended.code()), ([0, 0, 0], Some(0)), "{:#} {ended:#?}", self.0);
         equal
     }
 
-    /// The same at the recording's own times, which a machine that was away misses: then what is missing was
-    /// not answered because it came too late.
+    /// The same at the recording's own times, which a busy machine misses: then missing replies are those to
+    /// joints that came too late.
     pub(crate) fn all_came_back_in_time(&self, ended: &Ended) -> u64 {
         let late = self.number("/expect/joints_skipped");
         if late == 0 {
@@ -174,7 +174,7 @@ impl Replayed {
     }
 }
 
-/// Changes the `nth` packet of a log for which `expected` says so, with its CRC made right again.
+/// Changes the `nth` packet of a log that satisfies `expected`, with its CRC corrected.
 pub(crate) fn changed(
     log: &str,
     nth: usize,

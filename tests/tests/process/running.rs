@@ -1,4 +1,4 @@
-//! Processes: what they say, how they end, and which there are.
+//! Processes: their output, how they end, and which there are.
 
 use std::fs;
 use std::io::Read;
@@ -13,7 +13,7 @@ use rustix::process::{Pid, Signal};
 
 use super::{TIMEOUT, signal, tells, tells_on, until};
 
-/// A process whose words are taken as they come; it ends with the test.
+/// A process whose output is read as it comes; it ends with the test.
 pub(crate) struct Running {
     child: Child,
     out: Output,
@@ -39,13 +39,13 @@ impl Ended {
         self.status.signal()
     }
 
-    /// Sees that it did what it should.
+    /// Checks that it succeeded.
     pub(crate) fn well(self) -> Self {
         assert_eq!(self.code(), Some(0), "{self:#?}");
         self
     }
 
-    /// Sees that it ended with this code and one line, and returns that.
+    /// Checks that it ended with this code and one line, and returns that.
     pub(crate) fn refusal(&self, code: i32) -> &str {
         assert_eq!((self.code(), self.stdout.as_str()), (Some(code), ""), "{self:#?}");
         let line = self.stderr.trim_end_matches('\n');
@@ -71,12 +71,12 @@ impl Running {
         signal(self.pid(), it);
     }
 
-    /// Waits until it has said something on standard error.
+    /// Waits for a text on standard error.
     pub(crate) fn hears(&self, words: &str) {
         self.err.wait_for(words);
     }
 
-    /// Waits until a bench has said of a cell that it has done something.
+    /// Waits until a bench has reported of a cell that it has done something.
     pub(crate) fn tells(&self, cell: u8, what: &str) {
         self.err.wait_until(what, |text| tells(text, cell, what));
     }
@@ -86,17 +86,17 @@ impl Running {
         self.err.wait_until(what, |text| tells_on(text, bus, cell, what));
     }
 
-    /// Waits until a bench's loop runs: then come the lines that say how it goes.
+    /// Waits until a bench's loop runs: then progress lines come.
     pub(crate) fn hears_the_loop(&self) {
-        self.err.wait_until("how it goes", |text| text.contains(" s  ") || text.contains("\nstarting\n"));
+        self.err.wait_until("progress", |text| text.contains(" s  ") || text.contains("\nstarting\n"));
     }
 
-    /// Waits until it has said something on standard output.
+    /// Waits for a text on standard output.
     pub(crate) fn prints(&self, words: &str) {
         self.out.wait_for(words);
     }
 
-    /// What it has said on standard error so far.
+    /// Standard error so far.
     pub(crate) fn stderr(&self) -> String {
         self.err.text.lock().unwrap().clone()
     }
@@ -121,7 +121,7 @@ impl Running {
         Ended { status, stdout: self.out.whole(), stderr: self.err.whole() }
     }
 
-    /// The processes of its cells, with the numbers that each was told.
+    /// The processes of its cells, with the node ids of each.
     pub(crate) fn cells(&self) -> Vec<(Pid, String)> {
         let mark = format!("--with-parent {}", self.pid().as_raw_nonzero());
         let cell = |pid| {
@@ -181,7 +181,7 @@ impl Output {
                 return;
             }
             let over = self.reader.as_ref().is_none_or(JoinHandle::is_finished);
-            assert!(!over && Instant::now() < give_up, "never said {words:?}, but this:\n{text}");
+            assert!(!over && Instant::now() < give_up, "never printed {words:?}, but this:\n{text}");
             std::thread::sleep(Duration::from_millis(5));
         }
     }
@@ -189,7 +189,7 @@ impl Output {
     /// Everything, once the other side has closed it.
     fn whole(&mut self) -> String {
         let reader = self.reader.take().unwrap();
-        until("the end of an output: somebody still has it open", || reader.is_finished().then_some(()));
+        until("the end of an output: a process still has it open", || reader.is_finished().then_some(()));
         reader.join().unwrap();
         self.text.lock().unwrap().clone()
     }

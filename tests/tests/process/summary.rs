@@ -32,14 +32,14 @@ impl Summary {
         self.0.pointer(table).unwrap().as_object().unwrap().values().map(|it| it.as_u64().unwrap()).sum()
     }
 
-    /// What was odd on a bus, without torques that came too late: those tell of the machine.
+    /// Irregular events on a bus, without torques that came too late: those depend on the machine.
     pub(crate) fn odd(&self, bus: usize) -> u64 {
         let table = format!("/buses/{bus}/events");
         self.total(&table) - self.count(&table, "stale torque")
     }
 
-    /// Sees that so many cells owed an answer to every broadcast, unless a machine that was away took some
-    /// for dead.
+    /// Checks that so many cells had to answer every broadcast, unless on a busy machine some counted as
+    /// dead.
     pub(crate) fn all_were_due(&self, cells: u64, stderr: &str) {
         let (due, all) = (self.of_bus("/replies/due"), cells * self.number("/loop/broadcasts"));
         let away = stderr.contains("fallen silent");
@@ -57,7 +57,7 @@ impl Summary {
         self.0["cells"].as_array().unwrap()
     }
 
-    /// Sees that everything that was due, sent and written is accounted for on every bus.
+    /// Checks that everything that was due, sent and written is accounted for on every bus.
     pub(crate) fn adds_up(&self) -> &Self {
         let buses = self.0["buses"].as_array().unwrap().len();
         for bus in 0..buses {

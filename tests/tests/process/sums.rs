@@ -1,4 +1,4 @@
-//! Cells in a grid that answer with sums along their tree, on a bus of either format: whole, broken and mended.
+//! Cells in a grid that answer with sums along their tree, on a bus of either format: complete, with links down, and up again.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -27,7 +27,7 @@ pub(crate) fn neighbors(cell: u8) -> [u8; 4] {
     ]
 }
 
-/// `skin.toml`: a grid, with joints so seldom that a machine that does something else too keeps up.
+/// `skin.toml`: a grid, with a joint rate so low that a busy machine keeps up.
 pub(crate) fn grid(place: &Place, format: Format) {
     wired(place, format, neighbors);
 }
@@ -76,7 +76,7 @@ pub(crate) fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
 /// Waits until the roots' sums of three epochs in a row hold so many cells.
 pub(crate) fn holds(test_client: &TestClient, expected: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
-    // A root that found another way is in another one's sum.
+    // A root that found another route is in another one's sum.
     let mut below = BTreeSet::new();
     test_client.sends(&Message::Report);
     let mut seen = Vec::new();
@@ -107,7 +107,7 @@ pub(crate) fn holds(test_client: &TestClient, expected: u32) {
     assert!(whole, "waited {TIMEOUT:?} for sums of {expected} cells; they were of {seen:?}");
 }
 
-/// Waits until, by what cells say, each of these has a way to a root that leads over these only.
+/// Waits until, by the cells' reports, each of these has a route to a root over these only.
 fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
@@ -122,10 +122,10 @@ fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
         }
         cells.iter().all(|&cell| leads(&parents, cell))
     });
-    assert!(all, "waited {TIMEOUT:?} for ways of {cells:?}: {parents:?}");
+    assert!(all, "waited {TIMEOUT:?} for routes of {cells:?}: {parents:?}");
 }
 
-/// Ends a bench, and sees that all is accounted for.
+/// Ends a bench, and checks that all is accounted for.
 pub(crate) fn end(place: &Place, bench: Running) -> Ended {
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -134,7 +134,7 @@ pub(crate) fn end(place: &Place, bench: Running) -> Ended {
     ended
 }
 
-/// Sums go round a cell that is killed, and one that hangs; who comes back is in them again.
+/// Sums bypass a cell that is killed, and one that hangs, until they come back.
 pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED);
@@ -154,10 +154,10 @@ pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
     super::signal(stopped, Signal::CONT);
     holds(&test_client, 11);
 
-    // It is told again when to speak, and what it feels.
+    // It gets its slot and its stimulus again.
     let words = format!("--bus vcan0 --bus-kind {} --node 6 --skin skin.toml", place.kind());
     let again = place.start("cell-node", &words);
-    bench.hears("cell 6 on vcan0 started anew");
+    bench.hears("cell 6 on vcan0 restarted");
     holds(&test_client, 12);
     bench.signal(Signal::TERM);
     bench.end().well();
@@ -168,7 +168,7 @@ pub(crate) fn goes_round_a_cell(place: &Place, format: Format) {
     assert!(summary.of_bus("/sums/contributions/missing") > 0, "{:#}", summary.0);
 }
 
-/// Without a touch, hellos tell who is gone, and the rest finds another way.
+/// Without a touch, hellos show which cell is lost, and the rest finds another route.
 pub(crate) fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
@@ -190,7 +190,7 @@ pub(crate) fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     end(place, bench);
 }
 
-/// Wires are cut while the loop runs: one of many in one direction, and all of the cell in a corner.
+/// Links go down while the loop runs: one of many in one direction, and all of the cell in a corner.
 const LINKS_DOWN: &str = r#"
 [[fault]]
 at_s = 2.0
@@ -211,22 +211,22 @@ cells = [8, 4]
 for_s = 8.0
 "#;
 
-/// Who has no way any more is named, and the rest finds another.
+/// An unreachable cell is named, and the rest finds another route.
 pub(crate) fn goes_on_without_a_wire(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));
     let bench = unrecorded(place, 120.0, "");
     bench.hears_the_loop();
     let test_client = TestClient::on(place, "vcan0", format);
-    bench.hears("scenario: Cut the wires one way, from cell 6 and cell 5 on vcan0");
+    bench.hears("scenario: link down from cell 6 to cell 5 on vcan0");
     holds(&test_client, 12);
-    bench.hears("cell 4 on vcan0 has no way to a root: no sum holds it since");
+    bench.hears("cell 4 on vcan0 is unreachable: no route to a root, in no sum for");
     holds(&test_client, 11);
-    bench.hears("scenario: Mend the wires between cell 8 and cell 4 on vcan0");
-    bench.hears("cell 4 on vcan0 has a way to a root again, after");
+    bench.hears("scenario: link up between cell 8 and cell 4 on vcan0");
+    bench.hears("cell 4 on vcan0 has a route to a root again, after");
     holds(&test_client, 12);
     end(place, bench);
     let summary = place.summary();
-    assert!(summary.figure("/buses/0/network/longest_without_way_s") > 1.0, "{:#}", summary.0);
-    assert_eq!(summary.0["buses"][0]["network"]["without_way"].as_array().unwrap().len(), 0);
+    assert!(summary.figure("/buses/0/network/longest_unreachable_s") > 1.0, "{:#}", summary.0);
+    assert_eq!(summary.0["buses"][0]["network"]["unreachable"].as_array().unwrap().len(), 0);
 }

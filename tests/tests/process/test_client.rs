@@ -1,4 +1,4 @@
-//! Another client of a bench's bus, which hears and speaks the protocol.
+//! Another client of a bench's bus, which receives and sends by the protocol.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -35,18 +35,18 @@ impl TestClient {
         Self { bus, format, decoder: RefCell::new(Decoder::new(Some(format))) }
     }
 
-    /// What the next frame says.
+    /// The next frame, decoded.
     pub(crate) fn decodes(&self, at: Micros, frame: &Frame) -> Decoded {
         self.decoder.borrow_mut().decode(at, self.bus.name(), frame)
     }
 
-    /// Says something to everyone.
+    /// Sends a message to all.
     pub(crate) fn sends(&self, message: &Message) {
         let frames: Vec<_> = message.encode().frames(self.format).collect();
         self.bus.send(&frames).unwrap();
     }
 
-    /// Hears messages until somebody has enough, or until `TIMEOUT` is over: whether somebody had.
+    /// Receives messages until `enough` holds, or until `TIMEOUT` is over: whether it held.
     pub(crate) fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
         let mut inbox = Inbox::new();
         let give_up = Instant::now() + TIMEOUT;
@@ -65,12 +65,12 @@ impl TestClient {
         false
     }
 
-    /// Waits for a message after which somebody has enough.
+    /// Waits for a message at which `enough` holds.
     pub(crate) fn waits_for(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
         assert!(self.hears(enough), "waited {TIMEOUT:?} for {what} on {}", self.bus.name());
     }
 
-    /// Waits until each of these cells has said a torque that is not zero.
+    /// Waits until each of these cells has sent a torque that is not zero.
     pub(crate) fn waits_for_torques(&self, cells: RangeInclusive<u8>) {
         let mut missing: BTreeSet<u8> = cells.collect();
         self.waits_for("torques", |message| {
@@ -96,7 +96,7 @@ impl TestClient {
         });
     }
 
-    /// Waits until each of these cells has said that it is halted.
+    /// Waits until each of these cells has reported that it is halted.
     pub(crate) fn waits_for_halted_cells(&self, cells: RangeInclusive<u8>) {
         let mut missing: BTreeSet<u8> = cells.collect();
         self.waits_for("cells that are halted", |message| {
@@ -128,10 +128,10 @@ impl TestClient {
         });
     }
 
-    /// Waits until the cells 1 to so many have said that they have their numbers and parameters.
+    /// Waits until the cells 1 to so many have reported their node ids and parameters.
     pub(crate) fn waits_for_settled_cells(&self, cells: usize) {
         let mut settled = BTreeSet::new();
-        self.waits_for("cells that have their numbers", |message| {
+        self.waits_for("cells that have their node ids", |message| {
             if let Message::Network {
                 from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), ..
             } = message

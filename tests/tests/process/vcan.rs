@@ -1,7 +1,7 @@
 //! A real kernel's vcan, and the stock tools beside us.
 //!
 //! `tests/vcan` runs the programs that need it: each alone in a network of its own, where `vcan0` is there with
-//! MTU 72 and up, and nobody else's interfaces are.
+//! MTU 72 and up, and no other interfaces are.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -16,7 +16,7 @@ use protocol::id::{Id, Kind};
 
 use super::{Place, until};
 
-/// Sees that an interface is there and that it is nobody else's.
+/// Checks that an interface is there and that no other process uses it.
 pub(crate) fn needs(interface: &str) {
     let ours = std::env::var_os("SKINBUS_OWN_NETWORK").is_some();
     // Not /sys, which may show another network.
@@ -28,7 +28,7 @@ pub(crate) fn needs(interface: &str) {
     );
 }
 
-/// Another program, which must do what it is told: `ip link set vcan0 down`.
+/// Another program, which must succeed: `ip link set vcan0 down`.
 pub(crate) fn tool(words: &str) -> Output {
     let output = command(words).output().unwrap_or_else(|error| missing(words, &error));
     assert!(output.status.success(), "{words}: {output:?}");
@@ -75,7 +75,7 @@ impl Drop for Vcan {
     }
 }
 
-/// Frames of one bus that match a filter go to the other, changed as it says. The kernel's rules are for CAN FD
+/// Frames of one bus that match a filter go to the other, changed by `change`. The kernel's rules are for CAN FD
 /// frames here, and what they send is seen by every socket on that bus (vcan needs that to be asked for).
 pub(crate) fn route(from: &str, to: &str, filter: &str, change: &str) {
     tool(format!("cangw -A -s {from} -d {to} -X -e -f {filter} {change}").trim_end());
@@ -113,8 +113,8 @@ impl Vcan0 {
         tool("ip link set vcan0 up");
     }
 
-    /// Lets it take no frame at all: a transmit queue without room, as a real controller's is when nobody
-    /// acknowledges. Senders are told ENOBUFS.
+    /// Lets it take no frame at all: a transmit queue without room, as a real controller's is without any
+    /// acknowledge. Senders get ENOBUFS.
     pub(crate) fn fill(&self) {
         tool("tc qdisc add dev vcan0 root pfifo limit 0");
     }
@@ -150,7 +150,7 @@ impl Drop for Beside {
     }
 }
 
-/// `candump -L`, which has room for 300 MB of frames and interrupts nobody: on one processor it would else be
+/// `candump -L`, which has room for 300 MB of frames and preempts no process: on one processor it would else be
 /// woken by every single frame.
 pub(crate) struct Candump {
     child: Beside,
@@ -169,7 +169,7 @@ impl Candump {
         command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
         let child = Beside(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
         let candump = Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 };
-        // The kernel's lists of who listens do not say whose each entry is.
+        // The kernel's lists of listeners do not name the process of an entry.
         until("candump to listen", || {
             tool(&format!("cansend {bus} {}", mark(0)));
             candump.tail().contains(&mark(0)).then_some(())
@@ -188,7 +188,7 @@ impl Candump {
     }
 
     /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, which is
-    /// foreign to everybody and stays in its log.
+    /// foreign to all clients and stays in its log.
     pub(crate) fn catch_up(&mut self) {
         self.marks += 1;
         let mark = mark(self.marks);
@@ -208,7 +208,7 @@ impl Candump {
     }
 }
 
-/// A frame that nobody else sends.
+/// A frame that no other client sends.
 fn mark(number: u32) -> String {
     format!("1BADCAFE#{number:08X}")
 }
@@ -233,7 +233,7 @@ pub(crate) fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
 }
 
 /// What the gateway keeps is what `candump` sees, in the same order by sender; but cells that are being ended may still
-/// say a heartbeat when the gateway no longer listens.
+/// send a heartbeat when the gateway no longer listens.
 pub(crate) fn same_by_sender(ours: &[Frame], theirs: &[Frame]) {
     let (ours, theirs) = (by_identifier(ours), by_identifier(theirs));
     assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());

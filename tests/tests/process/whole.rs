@@ -36,7 +36,7 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Runs it for half a minute and sees that every broadcast was sent or counted as one that the machine was too
+/// Runs it for half a minute and checks that every broadcast was sent or counted as one that the machine was too
 /// late for, that no frame was lost, and that candump saw exactly what was counted.
 pub(crate) fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
@@ -72,7 +72,7 @@ pub(crate) fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summar
 
     let seen = candump.frames();
     let counted = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
-    // Cells that are being ended may still say a heartbeat to nobody.
+    // Cells that are being ended may still send a heartbeat.
     let (ours, later) = seen.split_at(usize::try_from(counted).unwrap());
     assert!(later.iter().all(|frame| kind_of(frame) == Kind::Network), "{} and {counted}", seen.len());
     let torques = ours.iter().filter(|frame| kind_of(frame) == Kind::Torque).count() as u64;
@@ -80,7 +80,7 @@ pub(crate) fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summar
     summary
 }
 
-/// Sees that every broadcast that was due was sent, and that all cells have answered each.
+/// Checks that every broadcast that was due was sent, and that all cells have answered each.
 pub(crate) fn all_is_answered(summary: &Summary) {
     assert_eq!(summary.number("/loop/broadcasts_skipped"), 0);
     let due = CELLS * summary.number("/loop/broadcasts");

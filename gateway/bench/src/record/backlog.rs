@@ -1,11 +1,11 @@
-//! Frames that the kernel drops between a sender and the sockets, while it tells the sender that they were sent:
+//! Frames that the kernel drops between a sender and the sockets, although the sender's call succeeds:
 //! when a processor's queue of arrived packets is full (`net.core.netdev_max_backlog`).
 //!
 //! The kernel counts them for the whole machine, any network and any interface, not for a bus.
 
 use std::fs;
 
-/// How many packets the machine has dropped so; nothing where the kernel does not say.
+/// How many packets the machine has dropped so; none where the kernel does not report it.
 pub(crate) fn dropped() -> Option<u64> {
     read(&fs::read_to_string("/proc/net/softnet_stat").ok()?)
 }

@@ -1,4 +1,4 @@
-//! What a recording says of itself: the program, the machine, the clocks, the configuration in force.
+//! The metadata of a recording: the program, the machine, the clocks, the current configuration.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -67,7 +67,7 @@ pub fn realtime_minus_monotonic() -> i64 {
     (0..3).map(reading).min().map_or(0, |(_, offset)| offset)
 }
 
-/// The skin and its timing as they are in force, beside what the run says of itself.
+/// The skin and its effective timing, beside the metadata of the run.
 #[must_use]
 pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Facts {
     let mut all = facts([
@@ -91,7 +91,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
     all
 }
 
-/// The hash that each cell's configuration must have, by bus and number.
+/// The hash that each cell's configuration must have, by bus and node id.
 #[must_use]
 pub fn hashes(skin: &Skin) -> Facts {
     let of_cell = |cell: &protocol::skin::Cell| {

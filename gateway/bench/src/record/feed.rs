@@ -1,5 +1,5 @@
-//! What is handed over to the recorder: bounded queues, one for each thread that fills one. Nobody waits for
-//! room; what does not fit is counted, and said in the recording where it is missing.
+//! What is handed over to the recorder: bounded queues, one for each producer thread. No producer waits for
+//! room: what does not fit is counted, and the recording notes where it is missing.
 
 use std::sync::{Arc, Mutex};
 
@@ -31,14 +31,14 @@ pub enum Captured {
     },
     /// Frames that did not fit into this queue.
     Unrecorded {
-        /// When this was said, in ns since 1970.
+        /// When this was reported, in ns since 1970.
         at_nanos: u64,
         /// How many.
         frames: u64,
     },
 }
 
-/// What the cells of a bus felt when joints stood on it.
+/// The contact state of a bus' cells when joints were on it.
 #[derive(Clone, Debug)]
 pub struct Touched {
     /// When, in ns since 1970.
@@ -56,8 +56,8 @@ pub struct Outlet {
     touched: Option<rtrb::Producer<Touched>>,
     /// Frames that did not fit, in all.
     unrecorded: u64,
-    /// Of these, what nobody has been told of yet.
-    untold: u64,
+    /// Of these, those that are not reported yet.
+    unreported: u64,
     /// Epochs that did not fit.
     untouched: u64,
 }
@@ -67,19 +67,19 @@ pub struct Outlet {
 pub struct Unrecorded {
     /// Frames.
     pub frames: u64,
-    /// What cells felt in an epoch.
+    /// Contact states of an epoch.
     pub epochs: u64,
 }
 
 impl Outlet {
     /// Hands a frame over.
     pub fn frame(&mut self, seen: Seen) {
-        if self.untold > 0 {
+        if self.unreported > 0 {
             self.tell(seen.at_nanos);
         }
-        if self.untold > 0 || self.frames.push(Captured::Frame(seen)).is_err() {
+        if self.unreported > 0 || self.frames.push(Captured::Frame(seen)).is_err() {
             self.unrecorded += 1;
-            self.untold += 1;
+            self.unreported += 1;
         }
     }
 
@@ -89,19 +89,19 @@ impl Outlet {
         self.frames.slots()
     }
 
-    /// Says that the bus dropped frames.
+    /// Reports that the bus dropped frames.
     pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
-        // A full queue says so itself.
+        // A full queue is reported by itself.
         let _ = self.frames.push(Captured::Dropped { at_nanos, frames });
     }
 
-    /// Whether anybody wants to know what cells feel.
+    /// Whether contact states are recorded.
     #[must_use]
     pub const fn wants_touched(&self) -> bool {
         self.touched.is_some()
     }
 
-    /// Hands over what cells felt.
+    /// Hands contact states over.
     pub fn touched(&mut self, touched: Touched) {
         if let Some(queue) = &mut self.touched
             && queue.push(touched).is_err()
@@ -110,13 +110,13 @@ impl Outlet {
         }
     }
 
-    /// Says what did not fit, if there is room for saying it; whether nothing is left to say.
+    /// Reports what did not fit, if there is room for the report; whether nothing remains to be reported.
     pub fn tell(&mut self, at_nanos: u64) -> bool {
-        let frames = self.untold;
+        let frames = self.unreported;
         if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
-            self.untold = 0;
+            self.unreported = 0;
         }
-        self.untold == 0
+        self.unreported == 0
     }
 
     /// What did not fit.
@@ -128,29 +128,29 @@ impl Outlet {
 
 /// The recorder's end of a bus.
 #[derive(Debug)]
-pub struct LinkId {
+pub struct BusFeed {
     pub(super) frames: rtrb::Consumer<Captured>,
     pub(super) touched: Option<rtrb::Consumer<Touched>>,
-    /// How its cells are.
+    /// The state of its cells.
     pub(super) view: Arc<Mutex<View>>,
-    /// How it is.
+    /// The state of the bus.
     pub(super) state: Arc<BusState>,
 }
 
-/// The queues of a bus, both ends; `all` when not only frames are wanted.
+/// The queues of a bus, both ends; `all` if more than frames is recorded.
 #[must_use]
-pub fn bus_feed(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, LinkId) {
+pub fn bus_feed(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
     let (frames, taken) = rtrb::RingBuffer::new(FRAMES);
-    let (touched, contact_state) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
-    let outlet = Outlet { frames, touched, unrecorded: 0, untold: 0, untouched: 0 };
-    (outlet, LinkId { frames: taken, touched: contact_state, view, state })
+    let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
+    let outlet = Outlet { frames, touched, unrecorded: 0, unreported: 0, untouched: 0 };
+    (outlet, BusFeed { frames: taken, touched: states, view, state })
 }
 
-/// All that comes to the recorder.
+/// All input of the recorder.
 #[derive(Debug)]
 pub struct Feed {
     /// Each bus.
-    pub bus_feeds: Vec<LinkId>,
+    pub bus_feeds: Vec<BusFeed>,
     /// The control loop's ticks.
     pub ticks: Option<rtrb::Consumer<Timed>>,
 }
@@ -161,7 +161,7 @@ mod tests {
     use protocol::can::Frame;
 
     #[test]
-    fn what_does_not_fit_is_said_where_it_is_missing() {
+    fn what_does_not_fit_is_reported_where_it_is_missing() {
         let (mut outlet, mut bus_feed) = bus_feed(false, Arc::default(), Arc::default());
         let frame = |at_nanos| Seen { at_nanos, own: false, frame: Frame::EMPTY };
         let all = FRAMES as u64;

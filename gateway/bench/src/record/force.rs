@@ -1,14 +1,14 @@
-//! What is in force on a bus: the packets that somebody needs who begins in the middle.
+//! The latched state of a bus: the packets that a reader needs who begins in the middle of a recording.
 //!
 //! ```text
-//!   frames of a bus ──> take ──> [ InForce ] ──> frames: what still counts, in the bus' own order
+//!   frames of a bus ──> take ──> [ Latched ] ──> frames that still count, in the bus' order
 //! ```
 //!
-//! The last heartbeat of every cell, with the hash of its configuration, its last start and its place in the tree; what
-//! was switched and configured at run time; the stimuli that it feels and that wait for their epochs; the last joints,
-//! and whether cells were halted. Epochs count modulo 256, so a stimulus alone does not say whether it still waits. So
-//! with each stimulus come the joints before it and those from which on it holds: who takes these packets in their
-//! order by the protocol's rules comes to the same state as who took all of them.
+//! Of every cell: its last heartbeat with the hash of its configuration, its last start, its place in the tree, what
+//! was switched and configured at run time, and its stimuli, latched or waiting for their epochs. Of the bus: the last
+//! joints, and whether cells were halted. Epochs count modulo 256, so a stimulus alone does not tell whether it still waits.
+//! Therefore each stimulus is kept with the joints before it and those at which it is latched. A receiver that applies
+//! these packets in order by the protocol's rules reaches the same state as one that received all packets.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use protocol::packet::{self, Epoch, Packet, Reassembly, Segment};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-/// A frame that somebody saw.
+/// A frame that was received.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Seen {
     /// When, in ns since 1970.
@@ -41,7 +41,7 @@ struct PlacedPacket {
 
 type Kept = Option<Arc<PlacedPacket>>;
 
-/// Where a page that a cell feels stands: who said it, the last joints before that, and those from which on it holds.
+/// The positions of a latched page: its packet, the last joints before it, and those at which it was latched.
 #[derive(Clone, Debug)]
 struct ContactPage {
     placed_packet: Arc<PlacedPacket>,
@@ -49,7 +49,7 @@ struct ContactPage {
     since: Kept,
 }
 
-/// What is in force for one cell.
+/// The latched state of one cell.
 #[derive(Clone, Debug, Default)]
 struct Cell {
     claim: Claim,
@@ -57,20 +57,20 @@ struct Cell {
     heartbeat: Kept,
     /// The first and the last heartbeat of its last start.
     starts: [Kept; 2],
-    /// Its last word on where its sums go.
+    /// Its last report of where its sums go.
     tree: Kept,
-    /// By number: the last writes of what is not stored.
+    /// By parameter: the last writes of what is not stored.
     switches: BTreeMap<u8, Arc<PlacedPacket>>,
-    /// By number: the last writes that a commit has taken into use, and that commit.
+    /// By parameter: the last writes that a commit has taken into use, and that commit.
     committed: BTreeMap<u8, Arc<PlacedPacket>>,
     commit: Kept,
-    /// By number: the last writes since then, and a commit that has not been answered.
+    /// By parameter: the last writes since then, and a commit that has not been answered.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: Kept,
     contact: Contact<ContactPage>,
 }
 
-/// The packets of one bus that are in force.
+/// The packets of one bus that are latched.
 #[derive(Debug)]
 pub struct Latched {
     /// Packets so far.
@@ -79,9 +79,9 @@ pub struct Latched {
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: Kept,
-    /// By identifier: a classic first half whose second one is to come.
+    /// By identifier: a first segment whose second one is still to come.
     segments: Vec<(Segment, Option<Seen>)>,
-    /// Identifiers of the gateway's side of which a first half stood on the bus last, and when, in ns since 1970.
+    /// Identifiers of the gateway's side of which the last segment was a first one, and when, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
 
@@ -99,7 +99,7 @@ impl Default for Latched {
 }
 
 impl Cell {
-    /// It has started, or was told its mode: it forgets what it felt.
+    /// It has started, or its mode was written: its contact state is reset.
     fn clear(&mut self, obeys: bool) {
         self.contact.reset();
         self.contact.set_obeys(obeys);
@@ -140,7 +140,7 @@ impl Cell {
         }
     }
 
-    /// It has taken into use what was written before the commit that was asked last.
+    /// It has taken into use what was written before the last requested commit.
     fn commit(&mut self) {
         let Some(requested) = self.requested.take() else { return };
         let staged = std::mem::take(&mut self.staged).into_iter();
@@ -150,7 +150,7 @@ impl Cell {
         (self.staged, self.commit) = (later, Some(requested));
     }
 
-    /// What the cell itself says that it feels, when nothing else is known of it.
+    /// The contact state that the cell itself reports, when nothing else is known of it.
     fn learn(&mut self, page: SensorPage, contact_page: ContactPage) {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
@@ -177,7 +177,7 @@ impl Cell {
 }
 
 impl Latched {
-    /// Takes a frame that stood on the bus. Bounded work; what is no packet counts for nothing.
+    /// Takes a frame that was on the bus. Bounded work; what is no packet is ignored.
     pub fn take(&mut self, seen: Seen) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         match id.kind {
@@ -213,7 +213,7 @@ impl Latched {
         }
     }
 
-    /// Whether the second half of something that the gateway's side says may still come: nobody should begin between
+    /// Whether the second segment of a packet of the gateway's side may still come: no file should begin between
     /// the two.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
@@ -340,7 +340,7 @@ mod tests {
             expected.extend(say(&mut force, 2, format, &write(7, 2)));
             expected.extend(say(&mut force, 2, format, &write(9, 2)));
             expected.extend(say(&mut force, 3, format, &heartbeat(3, 2)));
-            // The order is the bus', whatever the times say.
+            // The order is that of the bus, whatever the times are.
             expected.extend(say(&mut force, 4, format, &joints(1)));
             expected.extend(say(&mut force, 1, format, &stimulus(3, 1.0, 7)));
             expected.extend(say(&mut force, 6, format, &stimulus(255, 2.0, 8)));
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn of_stimuli_those_are_kept_that_are_contact_page_or_wait_with_the_joints_that_say_which() {
+    fn latched_and_waiting_stimuli_are_kept_with_the_joints_that_tell_which() {
         let mut force = Latched::default();
         let mut kept = vec![];
         let mut now = 0;
@@ -368,7 +368,7 @@ mod tests {
         say(&joints(2), true);
         say(&stimulus(9, 2.0, 3), true);
         say(&joints(3), true);
-        // More than the half of all epochs later it is still felt.
+        // It is still latched after more than half of all epochs.
         (4..=199).for_each(|epoch| say(&joints(epoch), false));
         say(&joints(200), true);
         (0..12).for_each(|at| say(&stimulus(8, 1.0, 210), at < 8));
@@ -377,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_restarted_has_nothing_latched_but_what_was_committed() {
+    fn a_restarted_cell_has_nothing_latched_but_what_was_committed() {
         let mut force = Latched::default();
         let to = Node::Cell(CellId::new(3).unwrap());
         let write = |number, word| {
@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_begins_between_the_segments_of_what_the_gateway_says() {
+    fn no_file_begins_between_the_segments_of_a_gateway_packet() {
         let mut force = Latched::default();
         let segments = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
         let (ours, theirs) = (segments(&joints(1)), segments(&heartbeat(3, 1)));
@@ -415,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claim_of_a_number_that_is_taken_takes_nothing_out_of_force() {
+    fn a_claim_of_a_taken_node_id_releases_nothing() {
         let to = Node::Cell(CellId::new(3).unwrap());
         let beat = |serial, sent, state| {
             let beat = Heartbeat { serial, sent, state, ..Heartbeat::default() };

@@ -1,13 +1,13 @@
 //! What a run records, and the thread that writes it.
 //!
 //! ```text
-//!   receiver, one a bus ─ frames, drops, what cells feel ─┐
+//!   receiver, one a bus ─ frames, drops, contact states ───┐
 //!   control loop ─────── ticks ────────────────────────────┼─> queues ─> recorder ─┬─> run.mcap, run-1.mcap, ...
 //!   kernel ───────────── drops of its backlog ─────────────┘   (bounded)            └─> candump log
 //! ```
 //!
-//! Nobody waits for the recorder: what does not fit into a queue is counted, and said in the recording where it is
-//! missing. Nothing that happens to a file ends the run. `docs/reference/recording.md` has the topics.
+//! No thread waits for the recorder: what does not fit into a queue is counted, and the recording notes where it is
+//! missing. No error of a file ends the run. `docs/reference/recording.md` has the topics.
 
 pub(crate) mod backlog;
 pub mod facts;
@@ -94,7 +94,7 @@ pub enum OutputError {
     Name(PathBuf),
 }
 
-/// Files that are claimed, and not begun.
+/// Files that are reserved, and not begun.
 #[derive(Debug)]
 pub struct Outputs {
     text: Option<Text>,
@@ -103,8 +103,8 @@ pub struct Outputs {
 
 impl Outputs {
     /// Opens what will be written, so that what makes that impossible is known before there is anything to write.
-    /// Repairs what runs that were killed left beside it, each of which is said. A FIFO is waited for until somebody
-    /// reads it, or until `stopped`.
+    /// Repairs the unfinished files of killed runs beside it, and reports each. A FIFO is waited for until it has a
+    /// reader, or until `stopped`.
     ///
     /// # Errors
     /// What cannot be written, and what to do.
@@ -142,7 +142,7 @@ impl Outputs {
         self.text.as_ref().map(Text::path)
     }
 
-    /// Whether more than frames is wanted.
+    /// Whether more than frames is recorded.
     #[must_use]
     pub const fn wants_all(&self) -> bool {
         self.series.is_some()
@@ -180,21 +180,21 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// What people should know since they were told last.
+    /// Messages for the user since the last call.
     pub fn said(&self) -> impl Iterator<Item = String> + '_ {
         self.said.try_iter()
     }
 
-    /// Ends a recording of a run that never began, and leaves nothing of it but a log of what was heard.
+    /// Ends the recording of a run that never began, and leaves only a log of received frames.
     #[must_use]
     pub fn discard(self) -> Recording {
         self.stop.discard.store(true, Ordering::Relaxed);
         self.stop.now.store(true, Ordering::Release);
-        // It can leave no more than a file that the next run takes away.
+        // At most it leaves a file that the next run removes.
         self.thread.join().unwrap_or_default()
     }
 
-    /// Records what has been handed over, when nobody hands over more, and ends the files. `unrecorded` is what
+    /// Records what has been handed over once no thread hands over more, and ends the files. `unrecorded` is what
     /// did not fit into receivers' queues, `ticks` what did not into the loop's.
     #[must_use]
     pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> Recording {

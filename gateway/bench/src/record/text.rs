@@ -30,7 +30,7 @@ pub struct Text {
 }
 
 impl Text {
-    /// Begins a log. A FIFO is waited for until somebody reads it, or until `stopped`.
+    /// Begins a log. A FIFO is waited for until it has a reader, or until `stopped`.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -53,7 +53,7 @@ impl Text {
     /// A frame.
     ///
     /// # Errors
-    /// When the log cannot be written; said once.
+    /// When the log cannot be written; reported once.
     pub fn frame(&mut self, interface: &str, seen: &Seen) -> io::Result<()> {
         if self.failed {
             self.lost += 1;
@@ -70,7 +70,7 @@ impl Text {
     /// A line that is no frame.
     ///
     /// # Errors
-    /// When the log cannot be written; said once.
+    /// When the log cannot be written; reported once.
     pub fn note(&mut self, text: &str) -> io::Result<()> {
         if self.failed {
             return Ok(());
@@ -84,10 +84,10 @@ impl Text {
         if self.lines.len() < PIECE { Ok(()) } else { self.flush() }
     }
 
-    /// Hands the lines that wait to the kernel: who follows the log sees them, and a run that is killed keeps them.
+    /// Hands the lines that wait to the kernel: readers that follow the log see them, and a killed run keeps them.
     ///
     /// # Errors
-    /// When the log cannot be written; said once.
+    /// When the log cannot be written; reported once.
     pub fn flush(&mut self) -> io::Result<()> {
         let put = self.log.append(&self.lines);
         if put.is_ok() {
@@ -101,7 +101,7 @@ impl Text {
         put
     }
 
-    /// Ends the log, also when it broke off: what it came to, frames that were lost, and whether all went well.
+    /// Ends the log, also after an error: the file, frames that were lost, and whether all was written.
     pub fn finish(mut self) -> (Written, u64, io::Result<()>) {
         let put = self.flush();
         let Self { log, frames, lost, .. } = self;
@@ -111,9 +111,9 @@ impl Text {
         (Written { path, format: "candump", frames, messages: frames, bytes }, lost, finished)
     }
 
-    /// Ends the log of a run that never began: what it came to, or nothing if nothing was heard.
+    /// Ends the log of a run that never began: the file, or none if nothing was received.
     pub fn discard(mut self) -> Option<Written> {
-        // Why the run did not begin is what people want to hear.
+        // The error to report is why the run did not begin.
         let _ = self.flush();
         (self.frames > 0).then(|| self.finish().0)
     }
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_and_notes_stand_in_their_order() {
+    fn frames_and_notes_keep_their_order() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.log");
         let mut text = text(&path);
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_said_once_and_every_frame_is_counted() {
+    fn a_full_disk_is_reported_once_and_every_frame_is_counted() {
         let mut text = text(Path::new("/dev/full"));
         let errors = (0..10_000).filter(|&at| text.frame("vcan0", &seen(at)).is_err()).count();
         assert_eq!(errors, 1);
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_never_began_leaves_what_was_heard() {
+    fn a_run_that_never_began_leaves_what_was_received() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.log");
         assert!(text(&path).discard().is_none());

@@ -1,4 +1,4 @@
-//! The recorder's thread: takes what has come, writes it, flushes, looks around.
+//! The recorder's thread: takes what has come, writes and flushes it, and records the state of everything.
 
 use std::io;
 use std::mem;
@@ -13,7 +13,7 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
 use super::facts::realtime_minus_monotonic;
-use super::feed::{Captured, FRAMES, Feed, LinkId};
+use super::feed::{BusFeed, Captured, FRAMES, Feed};
 use super::force::Latched;
 use super::text::Text;
 use super::topics::Topics;
@@ -29,9 +29,9 @@ use trace::ros2::standard::{Diagnosis, Level, Point};
 
 /// The thread's rhythm.
 const LOOK: Duration = Duration::from_millis(10);
-/// What has been written for so long is handed on: what a killed run may lose, beside one [`LOOK`].
+/// Written data is flushed after this time: a killed run may lose that much, and one [`LOOK`].
 const FLUSH: Duration = Duration::from_millis(40);
-/// How often the kernel is asked for what its backlog dropped.
+/// How often the kernel's count of backlog drops is read.
 const REQUEST: Duration = Duration::from_millis(100);
 /// How often the state of everything is recorded.
 const DIAGNOSE: Duration = Duration::from_millis(500);
@@ -65,8 +65,8 @@ pub(super) struct Work {
     feed: Feed,
     layout: Layout,
     tell: Sender<String>,
-    /// How many errors were told.
-    told: usize,
+    /// How many errors were reported.
+    reported: usize,
     buses: Vec<Seen>,
     /// Joint positions at the last tick.
     q: Option<[f64; MAX_JOINTS]>,
@@ -77,7 +77,7 @@ pub(super) struct Work {
     scratch: (Vec<ContactState>, Vec<Point>),
 }
 
-/// Something that happens now and then.
+/// Something periodic.
 struct Every(Duration, Instant);
 
 impl Every {
@@ -103,7 +103,7 @@ impl Work {
             feed,
             layout,
             tell,
-            told: 0,
+            reported: 0,
             buses,
             q: None,
             backlog: backlog::dropped(),
@@ -114,7 +114,7 @@ impl Work {
         }
     }
 
-    /// Records until someone says stop, and what has come until then.
+    /// Records until it is stopped, and what has come until then.
     pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
         if let Some(series) = &mut self.files.series {
             series.begin(head, |writer| Topics::new(writer, &self.layout));
@@ -165,7 +165,7 @@ impl Work {
         else {
             return 0;
         };
-        // What comes while this is written is the next round's, so that other queues have their turn.
+        // What comes meanwhile is left to the next round, so that other queues are served.
         let waiting = bus_feed.frames.slots();
         let Ok(waiting) = bus_feed.frames.read_chunk(waiting) else { return 0 };
         let taken = waiting.len();
@@ -225,7 +225,7 @@ impl Work {
         }
     }
 
-    /// What the kernel dropped on the way to all sockets: of which bus, if of any, nobody knows.
+    /// What the kernel dropped on the way to all sockets; the bus is unknown.
     fn request_kernel(&mut self) {
         let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
         let frames = total.saturating_sub(before);
@@ -245,7 +245,7 @@ impl Work {
             values: vec![
                 ("ticks", mem::take(&mut self.ticks).to_string()),
                 ("skipped", mem::take(&mut self.ticks_skipped).to_string()),
-                ("greatest_late_us", (mem::take(&mut self.max_late_ns) / 1_000).to_string()),
+                ("max_late_us", (mem::take(&mut self.max_late_ns) / 1_000).to_string()),
             ],
         }];
         let buses = self.feed.bus_feeds.iter().zip(&self.layout.buses).zip(&self.buses);
@@ -271,7 +271,7 @@ impl Work {
     fn flush(&mut self) {
         self.files.text(Text::flush);
         let Some(series) = &mut self.files.series else { return };
-        // Both halves of what the cells are told stand in one file.
+        // Both segments of a packet to the cells belong into one file.
         let now = wall();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
         if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
@@ -294,18 +294,18 @@ impl Work {
         }
     }
 
-    /// Tells what people should know.
+    /// Sends messages for the user.
     fn say(&mut self) {
         let Files { series, errors, .. } = &mut self.files;
         errors.extend(series.iter_mut().flat_map(Series::said));
-        for line in errors.get(self.told..).unwrap_or_default() {
-            // Nobody listens any more when the run ends.
+        for line in errors.get(self.reported..).unwrap_or_default() {
+            // At the end of the run there is no receiver any more.
             let _ = self.tell.send(line.to_string());
         }
-        self.told = errors.len();
+        self.reported = errors.len();
     }
 
-    /// Leaves a log of what was heard, and else nothing.
+    /// Leaves only a log of received frames.
     fn discard(mut self) -> Recording {
         if let Some(series) = &mut self.files.series {
             series.discard();
@@ -320,7 +320,7 @@ impl Work {
         if let Some(mut series) = self.files.series.take() {
             let (files, unwritten) = series.finish();
             for Written { path, .. } in &files {
-                // While the run lasted the recorder waited for no disk; now nobody waits for the recorder.
+                // During the run the recorder must not wait for the disk; now it may.
                 if let Err(error) = sync(Path::new(path)) {
                     self.files.errors.push(Said::Else(format!("{path}: {error}")));
                 }
@@ -337,7 +337,7 @@ impl Work {
             let (file, unwritten, finished) = text.finish();
             recording.files.push(file);
             lost = lost.max(unwritten);
-            // What was said before is the reason.
+            // The reason was reported before.
             if let Err(error) = finished {
                 self.files.errors.push(Said::BrokeOff(format!("{path}: {error}")));
             }
@@ -376,14 +376,14 @@ impl Files {
         }
     }
 
-    /// Says in every format that frames of a bus, if it is known, are missing from here on: which, and where.
+    /// Notes in every format that frames of a bus, if it is known, are missing from here on: which, and where.
     fn dropped(&mut self, nanos: u64, interface: &str, frames: u64, place: &str, total: u64) {
         let line = dropped(frames, place, total);
         self.text(|text| text.note(&line));
         self.note(nanos, interface, frames, &line);
     }
 
-    /// Says it in the recording alone.
+    /// Notes it in the recording alone.
     fn note(&mut self, nanos: u64, interface: &str, frames: u64, line: &str) {
         let kind = NoteKind::Dropped(frames);
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
@@ -395,8 +395,8 @@ fn dropped(frames: u64, place: &str, total: u64) -> String {
     format!("DROPCOUNT: dropped {frames} {place} (total drops {total})")
 }
 
-/// How a bus is.
-fn bus(bus_feed: &LinkId, name: &str, seen: &Seen) -> Diagnosis {
+/// The state of a bus.
+fn bus(bus_feed: &BusFeed, name: &str, seen: &Seen) -> Diagnosis {
     let works = bus_feed.state.is_there();
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = bus_feed.view.lock() {

@@ -1,4 +1,4 @@
-//! What stands on each topic of a recording.
+//! What is recorded on each topic.
 
 use std::io;
 
@@ -38,7 +38,7 @@ pub struct Topics {
 }
 
 impl Topics {
-    /// All of them, so that a reader knows from the beginning what may come.
+    /// All of them, so that a reader knows all topics from the beginning.
     ///
     /// # Errors
     /// When the file cannot be written, as of everything below.
@@ -77,8 +77,8 @@ impl Topics {
         writer.write(channel, seen.at_nanos, &message(name, seen))
     }
 
-    /// A frame that is in force when the file begins, at `nanos`: its own time may be long before, and would be
-    /// the beginning of what viewers show.
+    /// A frame that is latched when the file begins, at `nanos`: its own time may be long before, and viewers would
+    /// begin there.
     ///
     /// # Errors
     /// See above.
@@ -127,14 +127,14 @@ impl Topics {
         let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
         writer.write(&mut self.joint_commands, nanos, &command)?;
         let (central, active) = match &timed.central {
-            Some((_, contact_state)) => (of(names.len(), &contact_state.torque), contact_state.active),
+            Some((_, reference)) => (of(names.len(), &reference.torque), reference.active),
             None => (&[][..], 0),
         };
         writer.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active })?;
         writer.write(&mut self.timing, nanos, &timing(nanos, timed))
     }
 
-    /// What a patch's cells feel; with points where the joints' positions are given.
+    /// The contact states of a patch's cells; with points if the joints' positions are given.
     ///
     /// # Errors
     /// See above.
@@ -152,9 +152,9 @@ impl Topics {
             return Ok(());
         };
         let Some(central) = layout.central.get(patch.bus) else { return Ok(()) };
-        let (contact_state, cloud) = scratch;
-        contact_state.clear();
-        contact_state.extend(patch.cells.iter().map(|&(cell, node)| {
+        let (cells, cloud) = scratch;
+        cells.clear();
+        cells.extend(patch.cells.iter().map(|&(cell, node)| {
             let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, Status::Unknown));
             #[expect(clippy::cast_possible_truncation, reason = "words of 16 bits")]
             let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
@@ -163,20 +163,20 @@ impl Topics {
             ContactState { node, force, proximity, status: number(status) }
         }));
         let nanos = touched.at_nanos;
-        let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells: contact_state };
+        let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
         writer.write(state, nanos, &message)?;
         let Some(q) = q else { return Ok(()) };
         let frames = central.frames_at(q);
         cloud.clear();
-        cloud.extend(contact_state.iter().zip(&patch.cells).map(|(contact_state, &(cell, _))| {
+        cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
             #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]
             let position = central.position(cell, &frames).map(|metres| metres as f32);
-            Point { position, force: contact_state.force }
+            Point { position, force: state.force }
         }));
         writer.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud })
     }
 
-    /// How everything is.
+    /// The state of everything.
     ///
     /// # Errors
     /// See above.

@@ -39,9 +39,9 @@ pub enum Mismatch {
     /// Some are not there.
     #[error("cells of the recording are absent: {0}; start them with cell-node, or all with --spawn")]
     Absent(String),
-    /// Nobody knows.
+    /// The recording has no heartbeat.
     #[error(
-        "nothing can be compared: the recording has no heartbeat of a cell, so nothing says of which skin it is; record \
+        "nothing can be compared: the recording has no heartbeat of a cell, so its skin is unknown; record \
          for half a second at least"
     )]
     Unknown,
@@ -66,12 +66,12 @@ pub(super) struct Checks {
 }
 
 impl Checks {
-    /// What a lane is called now.
+    /// The present name of a bus.
     pub(super) fn bus_link(&self, bus_link: usize) -> &str {
         self.routes.names.get(bus_link).map_or("", |(_, name)| name)
     }
 
-    /// Each lane's name and its bus in the capture.
+    /// The name of each bus, and the bus in the capture.
     pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &Bus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
@@ -82,13 +82,13 @@ impl Checks {
         bus.cells_in(self.survey.bounds())
     }
 
-    /// The same, by lane.
+    /// The same, by bus.
     pub(super) fn recorded(&self) -> Vec<BTreeSet<CellId>> {
         self.bus_links().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
     }
 
-    /// Whether the state in force where the replay begins has to be brought about with new parameters: then cells
-    /// have them only after that.
+    /// Whether the state where the replay begins needs new parameters: then cells have their recorded configuration
+    /// only after that state is restored.
     pub(super) fn configures(&self) -> bool {
         self.bus_links().any(|(_, bus)| bus.state.configures())
     }
@@ -150,7 +150,7 @@ impl Checks {
         if equal == 0 { Err(Mismatch::Unknown) } else { Ok(()) }
     }
 
-    /// The cells on each lane that measure, though in the recording they obeyed stimuli.
+    /// The cells on each bus that measure, though in the recording they obeyed stimuli.
     pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
         let measures = |(bus_link, (_, bus)): (usize, (&str, &Bus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);

@@ -16,9 +16,9 @@ use model::decode::Decoded;
 pub enum What {
     /// A torque.
     Torque,
-    /// What a cell feels, page 0.
+    /// Its sensors, page 0.
     Skin,
-    /// What it feels, page 1.
+    /// Its sensors, page 1.
     Acceleration,
 }
 
@@ -34,12 +34,12 @@ pub enum How {
     Extra,
 }
 
-/// What a cell said.
+/// What a cell sent.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
     /// The words of a reply to joints.
     Words(What, [i16; WORDS]),
-    /// A sum, and what is left of it without those of the children.
+    /// A sum, and the remainder without those of the children.
     Sum(Own),
     /// An answer to `configure`, with its tag.
     Answer(u8, Answer),
@@ -73,7 +73,7 @@ pub struct Difference {
 }
 
 impl Difference {
-    /// Between what a cell said in the recording, and now.
+    /// Between what a cell sent in the recording, and now.
     #[must_use]
     pub fn new(
         how: How,
@@ -92,12 +92,12 @@ impl Difference {
             format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
-        let told =
-            |said: Option<&Said>| said.map_or_else(|| "nothing".to_owned(), |said| said.told(cell, epoch));
+        let shown =
+            |said: Option<&Said>| said.map_or_else(|| "nothing".to_owned(), |said| said.text(cell, epoch));
         let mut text = format!(
             "the first {what}: cell {cell} on {bus}{joints}\n  recorded  {}\n  now       {}",
-            told(recorded),
-            told(now)
+            shown(recorded),
+            shown(now)
         );
         if let Some(((recorded, step), (now, _))) =
             recorded.and_then(Said::steps).zip(now.and_then(Said::steps))
@@ -109,8 +109,8 @@ impl Difference {
 }
 
 impl Said {
-    /// In the words of a message.
-    fn told(&self, cell: CellId, epoch: Epoch) -> String {
+    /// As the text of a message.
+    fn text(&self, cell: CellId, epoch: Epoch) -> String {
         match self {
             &Self::Words(what, words) => {
                 let (kind, count) = match what {
@@ -155,7 +155,7 @@ fn summed(cell: CellId, epoch: Epoch, own: &Own) -> String {
     format!("{}; {less}:{words} Nm", meaning(sum))
 }
 
-/// A message in words, without the verdict.
+/// A message as text, without the verdict.
 fn meaning(message: Message) -> String {
     let text = Decoded::Message(message).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_said_is_nothing() {
+    fn a_reply_that_was_not_sent_is_nothing() {
         let refused = Said::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
         let cell = CellId::new(3).unwrap();
         let text = Difference::new(How::Missing, "can1", cell, None, Some(&refused), None).text;

@@ -33,7 +33,7 @@ pub enum ReplayError {
     /// The capture cannot be read to its end.
     #[error(transparent)]
     Read(CaptureError),
-    /// A line cannot be read, and no such line is wanted.
+    /// A line cannot be read, and no such line is tolerated.
     #[error("{0}")]
     Line(String),
     /// The capture has too many buses.
@@ -42,9 +42,9 @@ pub enum ReplayError {
     /// There is nothing to be sent.
     #[error("{0}: there is no frame in it")]
     Empty(String),
-    /// Nor in the part that is wanted.
+    /// Nor in the requested part.
     #[error(
-        "nothing is left to be sent: {name} lasts {seconds:.3} s from its first frame on, and --from and --to leave none \
+        "nothing remains to be sent: {name} lasts {seconds:.3} s from its first frame on, and --from and --to leave none \
          of it"
     )]
     NothingLeft {
@@ -70,7 +70,7 @@ pub enum ReplayError {
     MapTwice(String),
     /// Two buses would go to one.
     #[error(
-        "two buses of the capture go to one: whose cells would answer? give each a bus of its own, or leave out --expect, \
+        "two buses of the capture go to one, so replies cannot be assigned: give each a bus of its own, or leave out --expect, \
          --lockstep and --only inputs"
     )]
     Merged,
@@ -108,13 +108,13 @@ pub enum ReplayError {
     /// Another gateway is on a bus.
     #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]
     OtherGateway(String),
-    /// Nobody is there.
+    /// There is no cell.
     #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
     NoCell(String),
     /// The cells are not as they were.
     #[error(transparent)]
     Mismatch(#[from] Mismatch),
-    /// Cells do not do what they are told.
+    /// Cells do not confirm test mode.
     #[error("cells do not go into test mode: {0}")]
     NoTestMode(String),
     /// Cells measure, and stimuli mean nothing to them.

@@ -16,38 +16,38 @@ use super::player::{Pace, Stage};
 use super::replay_plan::Open;
 use super::report::Lockstep;
 use super::shared_state::SharedState;
-use super::start::LinkId;
+use super::start::BusLink;
 use super::{Options, ReplayError};
 use crate::run::realtime;
 use crate::setup::names;
 
-/// How often it is looked whether somebody has said stop.
+/// How often the stop flag is read.
 const LOOK_NS: u64 = 100_000_000;
-/// How long it is waited for the next step, or an interface that is down.
+/// How long to wait for the next step, or for an interface that is down.
 const PAUSE: Duration = Duration::from_micros(100);
 const DOWN: Duration = Duration::from_millis(50);
-/// Cells of which none has answered for so long are asked again, for a frame may have been lost; and given up.
+/// If no cell has answered for so long, cells are asked again, as a frame may have been lost; and given up.
 const REMIND: Duration = Duration::from_millis(500);
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Joints are asked again so often when cells were too late for them.
+/// Joints are resent so often when cells were too late for them.
 const REQUEST_AGAIN: u32 = 16;
-/// So often after joints for which that was in vain: then lateness is hardly the reason.
+/// So often after joints for which that did not help: then lateness is hardly the reason.
 const REQUEST_AGAIN_IN_VAIN: u32 = 2;
-/// The answers to that are waited for, so long the first time, before cells have a heartbeat to say as well.
+/// How long the answers to that are waited for the first time, before cells have a heartbeat to send as well.
 const ANSWERS: Duration = Duration::from_millis(100);
-/// So many times as long at most.
+/// This factor is the longest wait.
 const LONGEST: u32 = 4;
 
 /// The machine's clock, and buses.
 #[derive(Debug)]
 pub(super) struct Live {
-    pub(super) bus_links: Arc<Vec<LinkId>>,
+    pub(super) bus_links: Arc<Vec<BusLink>>,
     pub(super) shared_state: Arc<SharedState>,
-    /// For people.
+    /// Messages for the user.
     pub(super) log_sender: Sender<String>,
-    /// Cells that did not answer, and joints that were asked again.
+    /// Cells that did not answer, and joints that were resent.
     pub(super) lockstep: Lockstep,
-    /// The buses on which to ask again was in vain the last time.
+    /// The buses on which resending did not help the last time.
     pub(super) in_vain: BTreeSet<usize>,
     pub(super) down: BTreeSet<usize>,
 }
@@ -113,12 +113,10 @@ impl Stage for Live {
 
     fn wait_for_answers(&mut self, bus_link: usize, open: &Open) {
         self.wait_until_done(bus_link);
-        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
-            return;
-        };
-        // A cell skips joints that it comes to later than one period after them, and says nothing: on a machine that
-        // is slower than that. They are asked again under the epoch before, and then under their own; and the sync
-        // comes later, because on such a machine it is the heartbeats of some that keep others waiting.
+        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else { return };
+        // On a slow machine a cell skips joints that it processes more than one period late, and does not answer.
+        // They are resent under the epoch before, and then under their own; and the sync comes later, because on
+        // such a machine the heartbeats of some cells delay others.
         let tries = if self.in_vain.contains(&bus_link) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
         for again in 0.. {
             if self.shared_state.is_over() {
@@ -181,7 +179,7 @@ impl Stage for Live {
 }
 
 impl Live {
-    /// What makes the cells of a bus that are there forget what they felt, and obey what comes.
+    /// Messages that reset the contact state of the cells that are on a bus, and make them obey what comes.
     fn forgetting(&self, bus_link: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
         let obeying = comparator.settled(bus_link).filter(|(_, cell)| cell.claim.says(Flags::TEST_MODE));
@@ -192,7 +190,7 @@ impl Live {
         self.bus_links.get(bus_link).map_or(Ok(()), |bus_link| bus_link.send(messages))
     }
 
-    /// Says something to people; nobody listens any more at the end.
+    /// Sends a message for the user; at the end there is no receiver any more.
     fn say(&self, text: String) {
         let _ = self.log_sender.send(text);
     }
@@ -205,7 +203,7 @@ impl Live {
         Ok(())
     }
 
-    /// Asks for counters, and waits for them.
+    /// Requests counters, and waits for them.
     pub(super) fn report(&mut self, bus_link: usize) -> Result<(), BusError> {
         self.finish(bus_link, &[Message::Report, Message::Sync])
     }
@@ -220,7 +218,7 @@ impl Live {
             }
             if reminded.elapsed() > REMIND {
                 reminded = Instant::now();
-                // A bus that takes nothing says so at the next frame.
+                // A bus that takes nothing is noticed at the next frame.
                 let _ = self.tell(bus_link, &[Message::Sync]);
             }
             if progress.elapsed() > TIMEOUT {

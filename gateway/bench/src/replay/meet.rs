@@ -18,15 +18,15 @@ use crate::run::RunError;
 use crate::run::launch::STARTING;
 use crate::setup::{Timeout, names};
 
-/// Cells that were there before say something within this time, by heartbeats alone.
+/// Cells that were there before send at least a heartbeat within this time.
 const SHOWING: Duration = Duration::from_secs(1);
-/// Cells of which none more finds a way up for so long have none: two hellos, and a search.
+/// If no further cell finds a route to the root for so long, the rest are unreachable: two hellos, and a search.
 const ORGANISING: Duration = Duration::from_secs(2);
-/// How often it is looked.
+/// The polling period.
 const LOOK: Duration = Duration::from_millis(5);
 
 impl Session {
-    /// Calls the cells, and sees that they are as they have to be.
+    /// Queries the cells, and checks that they are as required.
     pub(super) fn meet(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
@@ -74,7 +74,7 @@ impl Session {
         Ok(())
     }
 
-    /// Looks again and again at who is there, until a look is the last one.
+    /// Polls which cells are there, until the check is done.
     fn wait(
         &mut self,
         mut is_last: impl FnMut(&mut Self, &Comparator) -> Result<bool, ReplayError>,
@@ -90,13 +90,13 @@ impl Session {
         self.signalled.load(Ordering::Relaxed)
     }
 
-    /// Waits until the cells that have to be there answer, or nobody more does.
+    /// Waits until the required cells answer, or no further cell does.
     fn wait_for_cells(&mut self, target: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
         let spawned = self.buses.processes.pids().next().is_some();
         for bus_link in self.buses.bus_links.iter() {
             bus_link.send(&[Message::Sync])?;
         }
-        // Whoever is there answers: also where nobody has to be there, who is there is known at the first look.
+        // Every cell answers: even if none is required, all are known at the first poll.
         thread::sleep(LOOK);
         let all = target.iter().map(BTreeSet::len).sum::<usize>();
         let mut timeout = Timeout::new(if spawned { STARTING } else { SHOWING });
@@ -120,7 +120,7 @@ impl Session {
         })
     }
 
-    /// Waits until all cells that reply with sums have a way to the gateway, or nobody more finds one.
+    /// Waits until all cells that reply with sums have a route to the gateway, or no further cell finds one.
     fn wait_for_tree(&mut self) -> Result<(), ReplayError> {
         for bus_link in self.buses.bus_links.iter().filter(|bus_link| bus_link.wired) {
             bus_link.send(&[Message::Report])?;
@@ -137,7 +137,9 @@ impl Session {
             let is_over = timeout.is_over(usize::MAX - count);
             for (bus_link, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
                 let (name, cells) = (bus_link.bus.name(), names(cells, ""));
-                session.progress.note(&format!("cells on {name} have no way to the gateway's side: {cells}"));
+                session.progress.note(&format!(
+                    "cells on {name} are unreachable, without a route to the gateway: {cells}"
+                ));
             }
             Ok(is_over)
         })
@@ -160,23 +162,23 @@ impl Session {
         })
     }
 
-    /// Leaves cells as they were met.
+    /// Restores the cells' former mode.
     pub(super) fn leave(&self) -> Result<(), ReplayError> {
         self.tell_mode(&self.measuring, false)
     }
 
-    /// Lets cells obey stimuli and say so at once, or measure.
+    /// Lets cells obey stimuli and report it at once, or measure.
     fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
         for (bus_link, cells) in self.buses.bus_links.iter().zip(cells).filter(|(_, cells)| !cells.is_empty())
         {
-            let told = cells.iter().map(|cell| mode(*cell, obey));
-            bus_link.send(&told.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
+            let modes = cells.iter().map(|cell| mode(*cell, obey));
+            bus_link.send(&modes.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
         }
         Ok(())
     }
 }
 
-/// The message that makes a cell obey stimuli, or measure; either way it forgets all stimuli.
+/// The message that makes a cell obey stimuli, or measure; either way it drops all stimuli.
 pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
     let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
     let request = Request::Write { number: Parameter::Mode.number(), words };

@@ -1,16 +1,16 @@
-//! Replay: a capture goes back onto buses, and what the cells answer is compared with what they answered then.
+//! Replay: a capture is sent onto buses again, and the cells' replies are compared with the recorded ones.
 //!
 //! ```text
 //!   capture ─ survey: buses, cells, hashes, the state where it begins
 //!      │
 //!      └─ reader thread ── order, pick, number ── steps ──> player (SCHED_FIFO) ──> buses ──> cells
 //!                               │                                │                    │
-//!                               └── recorded replies ──> judge <─┴─ announced joints  │
-//!                                                          ▲                          │
-//!                                                          └── ear (one a bus) <──────┘
+//!                               └─ replies ─> comparator <───────┴─ announced joints  │
+//!                                                  ▲                                  │
+//!                                                  └─ receiver (one a bus) <──────────┘
 //! ```
 //!
-//! What decides is pure: [`survey`], [`state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and buses are a
+//! The logic is pure: [`survey`], [`state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and buses are a
 //! [`player::Stage`]), [`comparator`] and [`difference`]. The rest is threads, sockets and the clock.
 
 mod checks;
@@ -57,7 +57,7 @@ use model::decode::BUSES;
 use model::decode::pick::Pick;
 use trace::capture::{Entry, Extras, NoteKind, Reader};
 
-/// The period of wake-ups at which lateness is judged, in ns.
+/// The period of wake-ups for which lateness is measured, in ns.
 const GRID_NS: u64 = 2_000_000;
 /// Lines of a log that cannot be read are named up to so many.
 const NAMED_LINES: u64 = 5;
@@ -90,7 +90,7 @@ pub struct Options {
     pub map: Vec<(String, String)>,
     /// Which part of the capture.
     pub part: Part,
-    /// How often; without end when there is no number.
+    /// How many passes; without end if none.
     pub passes: Option<u32>,
     /// How fast.
     pub pace: Pace,
@@ -112,7 +112,7 @@ pub struct Options {
     pub receive_buffer: usize,
     /// Whether a line that cannot be read ends it before it begins.
     pub strict: bool,
-    /// Whether nothing is said on the way.
+    /// Whether progress is hidden.
     pub quiet: bool,
 }
 
@@ -128,7 +128,7 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let skin_override =
         options.spawn.as_ref().map(|spawn| start::skin_override(spawn, &routes, &extras, &name));
     let skin_override = skin_override.transpose()?;
-    // Until now there was nothing that had to be put in order at an end.
+    // Until now there was nothing to clean up.
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
     let idle = matches!(options.pace, Pace::Timed(_)).then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
@@ -163,7 +163,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let mut survey = Survey::new(options.part);
     let few = |buses| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     let note = |text: String| progress.note(&format!("{name}: {text}"));
-    // What was in force stands before the first frame, and is known when it is open.
+    // What was latched is stored before the first frame, and is known once it is open.
     let latched = &reader.extras().latched;
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     few(buses.len())?;
@@ -199,7 +199,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
         note(format!("lines that could not be read and are left out: {unreadable}"));
     }
     if survey.dropped > 0 {
-        note(format!("{} frames are missing: whoever took it lost them", survey.dropped));
+        note(format!("{} frames are missing: they were lost while it was recorded", survey.dropped));
     }
     if let Some(what) = &reader.extras().unfinished {
         note(what.to_string());
@@ -222,13 +222,13 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     Ok((survey, reader.extras().clone(), name))
 }
 
-/// Cells that speak already are about to hear themselves.
+/// Cells that are on the bus already will receive their own recorded messages.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
     for ((name, bus), heard) in checks.bus_links().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.note(&format!(
-                "cells that are on {name} will hear their own words of the capture: {}; --only inputs leaves these out",
+                "cells that are on {name} will receive their own frames of the capture: {}; --only inputs leaves these out",
                 names(&both, "")
             ));
         }

@@ -21,15 +21,15 @@ use model::quantiles::histogram;
 /// From the decision to begin to the first frame, in ns.
 const LEAD_NS: u64 = 1_000_000;
 
-/// The clock, the buses, and whoever listens.
+/// The clock, the buses, and the output.
 pub trait Stage {
     /// A monotonic clock in ns.
     fn now(&self) -> u64;
-    /// Waits until the clock reads `at`, or somebody says stop.
+    /// Waits until the clock reads `at`, or the replay is stopped.
     fn wait_until(&mut self, at: u64);
     /// Nothing is there to be sent, and more will come.
     fn pause(&mut self);
-    /// Whether somebody has said stop.
+    /// Whether the replay was stopped.
     fn is_over(&self) -> bool;
     /// Joints are about to be sent.
     fn announce(&mut self, bus_link: usize, round: Option<u64>, epoch: Epoch);
@@ -42,12 +42,12 @@ pub trait Stage {
     fn was_not_sent(&mut self, bus_link: usize, round: u64);
     /// Waits until the cells of a bus have answered.
     fn wait_for_answers(&mut self, bus_link: usize, open: &Open);
-    /// Brings about a state, bus by bus.
+    /// Restores a state, bus by bus.
     ///
     /// # Errors
     /// When the cells are then not as they have to be, or a bus has ended.
     fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
-    /// The replay is there, in ns after its first frame.
+    /// Shows where the replay is, in ns after its first frame.
     fn show(&mut self, at: u64);
 }
 
@@ -60,7 +60,7 @@ pub enum Pace {
     Max,
 }
 
-/// What became of one bus' frames.
+/// The outcome of one bus' frames.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct BusLinkTally {
     /// Taken by the bus.
@@ -80,7 +80,7 @@ pub struct Played {
     pub bus_links: Vec<BusLinkTally>,
     /// How late frames were sent, in ns; without those that were to be sent at once.
     pub late: Histogram<u64>,
-    /// Whether somebody said stop before the end.
+    /// Whether it was stopped before the end.
     pub was_stopped: bool,
     /// Why it could not go on.
     pub failure: Option<ReplayError>,
@@ -124,14 +124,14 @@ impl Player {
         }
     }
 
-    /// Sends all, or until somebody says stop or a bus has ended.
+    /// Sends all, or until it is stopped or a bus has ended.
     pub fn play(mut self, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) -> Played {
         while self.played.failure.is_none() {
             if stage.is_over() {
                 self.played.was_stopped = true;
                 break;
             }
-            // Looked at before the queue, or what is pushed between the two would be missed.
+            // Read before the queue, or what is pushed between the two would be lost.
             let is_last = steps.is_abandoned();
             match steps.peek() {
                 Err(_) if is_last => break,
@@ -189,7 +189,7 @@ impl Player {
         self.batch.clear();
         self.rounds.clear();
         let deadline = self.deadline(first, stage.now());
-        // Whoever hears the answer has to know the question, and afterwards there is no time for that.
+        // The receiver of the answer has to know the request, and afterwards there is no time for that.
         let mut open = self.push(first, stage);
         let _ = steps.pop();
         if let Some(deadline) = deadline {
@@ -233,7 +233,7 @@ impl Player {
 
     fn was_late(&mut self, deadline: Option<u64>, now: u64) {
         if let Some(deadline) = deadline {
-            // It grows by itself; it cannot refuse.
+            // It resizes itself, so recording cannot fail.
             let _ = self.played.late.record(now.saturating_sub(deadline));
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   frames ──> take ──> [ order by time ] ──> [ what is it? ] ──> picked? ──> Step, Step, ... ──> player
-//!                                └── joints, replies ──> judge
+//!                                └── joints, replies ──> comparator
 //! ```
 
 use std::collections::{BTreeMap, VecDeque};
@@ -24,7 +24,7 @@ use trace::order::{Order, Ordered};
 
 /// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
-/// The least time from one pass to the next, in ns.
+/// The minimum time from one pass to the next, in ns.
 const MIN_GAP_NS: u64 = 1_000_000;
 
 /// Whose frames are sent.
@@ -35,14 +35,14 @@ pub enum Only {
     All,
     /// Commands, configuration and stimuli.
     Inputs,
-    /// What cells said.
+    /// What cells sent.
     Replies,
 }
 
 /// What is sent.
 #[derive(Clone, Debug)]
 pub struct Selection {
-    /// Whose.
+    /// The filter by sender.
     pub only: Only,
     /// Which kinds, to and from whom. Times are the survey's.
     pub pick: Pick,
@@ -57,7 +57,7 @@ pub struct Selection {
 pub enum Step {
     /// A frame is to be sent.
     Frame(Due),
-    /// A pass begins: the state in force is brought about, bus by bus.
+    /// A pass begins: the latched state is restored, bus by bus.
     Restore(Vec<(usize, Vec<Message>)>),
 }
 
@@ -81,7 +81,7 @@ pub struct Due {
 pub enum Role {
     /// Nothing.
     Plain,
-    /// The first half of joints.
+    /// The first segment of joints.
     SegmentOfJoints,
     /// Joints.
     Joints(Open),
@@ -98,7 +98,7 @@ pub struct Open {
     pub round: Option<u64>,
 }
 
-/// What a reel came to.
+/// What a replay plan has counted.
 #[derive(Clone, Debug, Default)]
 pub struct PlanSummary {
     /// Frames that were not sent, by reason.
@@ -176,7 +176,7 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// Takes in that the capture, or what is of interest of it, is at its end; another pass may follow.
+    /// Takes in that the capture, or the part of interest, has ended; another pass may follow.
     pub fn end_pass(&mut self, comparator: &mut Comparator) {
         while let Some(next) = self.order.pop_last() {
             self.settle(next);
@@ -194,7 +194,7 @@ impl<'a> ReplayPlan<'a> {
         self.counts = (0, 0);
     }
 
-    /// The messages that bring about the state in force where the part begins.
+    /// The messages that restore the state where the part begins.
     #[must_use]
     pub fn restoring(&self) -> Step {
         let bounds = self.survey.bounds();
@@ -205,7 +205,7 @@ impl<'a> ReplayPlan<'a> {
         Step::Restore(self.survey.buses.iter().zip(&self.selection.bus_links).filter_map(of).collect())
     }
 
-    /// What it came to.
+    /// Its counts.
     #[must_use]
     pub fn into_summary(self) -> PlanSummary {
         self.plan_summary
@@ -269,7 +269,7 @@ impl<'a> ReplayPlan<'a> {
         if matches!(decoded, Decoded::Wire(..)) {
             return Some(reason::WIRE);
         }
-        // Cells heard what is damaged as well.
+        // Cells received damaged frames as well.
         let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),
@@ -280,7 +280,7 @@ impl<'a> ReplayPlan<'a> {
     }
 }
 
-/// Reads what a frame says, as far as that is of interest.
+/// Decodes a frame, as far as that is of interest.
 fn read(
     bus_link: usize,
     nanos: u64,
@@ -324,11 +324,11 @@ pub mod reason {
     pub const NOT_PICKED: &str = "not picked";
     /// No command, configuration or stimulus.
     pub const NO_INPUT: &str = "no input";
-    /// Not said by a cell.
+    /// Not sent by a cell.
     pub const NO_REPLY: &str = "no reply";
     /// An error frame is a message of a driver, and was never on a bus.
     pub const ERROR: &str = "error frame";
-    /// Cells say over their wires what they have to say now; and wires are on no real bus.
+    /// Cells send their own messages over their wires now; and wires are on no real bus.
     pub const WIRE: &str = "simulated wire";
     /// Of a bus that the capture did not have when it was first read.
     pub const NEW: &str = "bus came later";

@@ -1,6 +1,6 @@
-//! What a replay came to: the figures of the table at its end, and of `--summary` and `--json`.
+//! The result of a replay: the figures of the table at its end, and of `--summary` and `--json`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/reference/replay.md` says what they mean.
+//! The keys of the JSON are the names of the fields here; `docs/reference/replay.md` explains them.
 
 use std::collections::BTreeMap;
 
@@ -42,9 +42,9 @@ pub struct Summary {
     pub fifo: bool,
     /// Whether it locked the memory.
     pub memory_locked: bool,
-    /// With lockstep, who did not answer.
+    /// With lockstep, the cells that did not answer.
     pub lockstep: Option<Lockstep>,
-    /// With a comparison, how it went.
+    /// With a comparison, its result.
     pub expect: Option<Expect>,
     /// Why it did not come to its end, if it did not.
     pub failure: Option<String>,
@@ -62,16 +62,16 @@ pub struct BusSummary {
     /// Its frames.
     #[serde(flatten)]
     pub frames: BusLinkTally,
-    /// Replies that came faster than they were heard.
+    /// Replies that came faster than they were read.
     pub unheard: u64,
 }
 
-/// How cells kept step.
+/// The outcome of lockstep.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Lockstep {
-    /// Cells that did not answer in time, as people read it.
+    /// Cells that did not answer in time, as text.
     pub silent_cells: Vec<String>,
-    /// Joints that were asked again, because a cell was too late for them.
+    /// Joints that were resent, because a cell was too late for them.
     pub retried: u64,
 }
 
@@ -83,9 +83,9 @@ pub struct Expect {
     /// The counts.
     #[serde(flatten)]
     pub tally: Tally,
-    /// Joints that the cells came to too late, by their own counters: replies to them are missing.
+    /// Joints that the cells processed too late, by their own counters: replies to them are missing.
     pub joints_skipped: u64,
-    /// Frames that whoever recorded said to have lost: inputs among them cannot be sent.
+    /// Frames that the recorder reported as lost: inputs among them cannot be sent.
     pub recording_dropped: u64,
     /// Cells whose configuration in the recording is not known, and was not compared.
     pub unchecked_cells: u64,
@@ -94,7 +94,7 @@ pub struct Expect {
 }
 
 impl Lacking {
-    /// The reasons that there were, with their counts, for people.
+    /// The reasons that occurred, with their counts, as text.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
         nonzero([
@@ -102,16 +102,16 @@ impl Lacking {
             ("the cell had not taken the joints", self.untaken),
             ("the reply was not recorded", self.unrecorded),
             ("the recording ended", self.ended),
-            ("the end of a contact was said later", self.said_later),
+            ("the end of a contact was sent later", self.said_later),
             ("no counters tell whether the cell took the joints", self.uncounted),
             ("the joints were not recorded", self.joints_unrecorded),
             ("the joints are in the part before", self.joints_earlier),
             ("the configure is in the part before", self.requested_earlier),
             ("the cell measured", self.measured),
-            ("what a cell felt was said at other joints", self.sensed_otherwise),
+            ("unrequested sensors were sent at other joints", self.sensed_otherwise),
             ("the cell did not come to its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
-            ("a cell had not said where its sums go", self.tree_unknown),
+            ("a cell had not reported where its sums go", self.tree_unknown),
             ("a sum lacked one of its children's", self.sums_not_taken),
         ])
     }
@@ -150,7 +150,7 @@ impl Summary {
             }
             if expect.tally.lacks_the_tree() {
                 wrong.push(
-                    "no sum could be compared: cells have not said where their sums go, then or now"
+                    "no sum could be compared: cells have not reported where their sums go, then or now"
                         .to_owned(),
                 );
             }
@@ -179,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_is_told_to_people_too() {
+    fn every_reason_has_a_text() {
         let all = Lacking {
             silent: 1,
             untaken: 1,

@@ -1,4 +1,4 @@
-//! A replay from its cells' first word to its summary.
+//! A replay from the first message of its cells to its summary.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ pub(super) struct Session {
     pub(super) buses: Buses,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) progress: Progress,
-    /// Cells that were put into test mode, by lane.
+    /// Cells that were put into test mode, by bus.
     pub(super) measuring: Vec<Vec<CellId>>,
 }
 
@@ -74,7 +74,7 @@ impl Session {
         outcome
     }
 
-    /// Sends everything; the summary is yet without what the receivers have not heard.
+    /// Sends everything; the summary is still without what the receivers have not read.
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
         let shared_state = Arc::clone(&self.shared_state);
@@ -102,7 +102,7 @@ impl Session {
             let granted = realtime::prepare();
             if hears {
                 for bus_link in 0..live.bus_links.len() {
-                    // Where the counters begin; a bus that is down says so at the first frame.
+                    // Where the counters begin; a bus that is down is noticed at the first frame.
                     let _ = live.report(bus_link);
                 }
                 live.shared_state.comparator().mute(false);
@@ -115,12 +115,12 @@ impl Session {
         let duration_s = began.elapsed().as_secs_f64();
         let plan_summary = reader.join().map_err(|_| RunError::Panicked("reader"))?;
         played.failure = other_gateway.or(played.failure);
-        // What a signal has ended is judged as far as it went.
+        // A replay ended by a signal is compared as far as it went.
         self.shared_state.over.store(false, Ordering::Relaxed);
         let bus_links = self.shared_state.checks.bus_links().enumerate();
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
             if let Err(why) = live.report(bus_link) {
-                self.progress.note(&format!("{name}: no last words of its cells: {why}"));
+                self.progress.note(&format!("{name}: no final report of its cells: {why}"));
             }
         }
         self.shared_state.comparator().finish(!played.was_stopped && played.failure.is_none());

@@ -1,4 +1,4 @@
-//! Where those who send and those who hear meet.
+//! The state shared by the sending thread and the receivers.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -10,17 +10,17 @@ use protocol::time::Micros;
 
 use super::checks::Checks;
 use super::comparator::Comparator;
-use super::start::LinkId;
+use super::start::BusLink;
 use crate::run::realtime;
 use crate::run::roots::Roots;
 use model::decode::{Decoded, Decoder};
 
-/// How often it is looked whether to go on.
+/// How often the stop flag is read.
 const LOOK: Duration = Duration::from_millis(50);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(20);
 
-/// What all threads of a replay look at.
+/// What all threads of a replay share.
 #[derive(Debug)]
 pub(super) struct SharedState {
     pub(super) checks: Checks,
@@ -30,9 +30,9 @@ pub(super) struct SharedState {
     pub(super) over: AtomicBool,
     /// Set when the queue of steps is full for the first time, or all has been read.
     pub(super) ready: AtomicBool,
-    /// Set once, at the end: hearing ends.
+    /// Set once, at the end: receiving ends.
     pub(super) deaf: AtomicBool,
-    /// Frames sent, for people.
+    /// Frames sent, for the progress line.
     pub(super) sent: AtomicU64,
     /// Where the replay is, in ns after its first frame.
     pub(super) at: AtomicU64,
@@ -55,16 +55,16 @@ impl SharedState {
     }
 
     pub(super) fn comparator(&self) -> MutexGuard<'_, Comparator> {
-        // Who panics here ends the replay anyway.
+        // A panic here ends the replay anyway.
         self.comparator.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lets those look who wait for an answer.
+    /// Wakes the threads that wait for an answer.
     pub(super) fn has_heard(&self) {
         self.heard.notify_all();
     }
 
-    /// Waits until somebody has been heard, or a moment.
+    /// Waits until a message was received, or for a moment.
     pub(super) fn wait<'a>(
         &self,
         comparator: MutexGuard<'a, Comparator>,
@@ -84,9 +84,9 @@ impl SharedState {
         self.has_heard();
     }
 
-    /// Hears a bus until it is over, and is the gateway's side of its roots' wires; returns how many frames came faster
-    /// than they were heard.
-    pub(super) fn hear(&self, index: usize, bus_link: &LinkId, mut roots: Option<Roots>) -> u64 {
+    /// Receives on a bus until the end, as the gateway's side of its roots' wires; returns how many frames came faster
+    /// than they were read.
+    pub(super) fn hear(&self, index: usize, bus_link: &BusLink, mut roots: Option<Roots>) -> u64 {
         realtime::prepare_receiver();
         let (bus, mut inbox, mut decoder) =
             (&bus_link.bus, Inbox::new(), Decoder::new(Some(bus_link.format)));
@@ -106,7 +106,7 @@ impl SharedState {
                 Err(error) => {
                     self.is_down(index);
                     if !error.may_pass() {
-                        // Whoever sends next hears it too, and says so.
+                        // The next sender gets the same error, and reports it.
                         break;
                     }
                     thread::sleep(DOWN);

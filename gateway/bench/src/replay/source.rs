@@ -10,7 +10,7 @@ use trace::capture::{CaptureError, Entry, Reader};
 
 /// Steps that are read ahead: some tenths of a second of a full bus.
 pub(super) const AHEAD: usize = 16_384;
-/// How long it is waited for room: what is read ahead lasts longer by far.
+/// How long to wait for room: what is read ahead lasts far longer.
 const PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture, as often as it is replayed, and hands on what is to be done.
@@ -20,7 +20,7 @@ struct Source<'a> {
     queue: rtrb::Producer<Step>,
 }
 
-/// Reads to the end, or until nobody wants more.
+/// Reads to the end, or until the receiver is gone.
 pub(super) fn read(
     shared_state: &SharedState,
     queue: rtrb::Producer<Step>,

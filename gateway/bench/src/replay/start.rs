@@ -1,4 +1,4 @@
-//! From options to buses that are open and cells that are as they have to be.
+//! From options to open buses and cells that are as required.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -22,15 +22,15 @@ use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{Extras, SKIN};
 
-/// How often it is looked.
+/// The polling period.
 const LOOK: Duration = Duration::from_millis(5);
 
 /// Where the capture's buses go.
 #[derive(Clone, Debug)]
 pub(super) struct Routes {
-    /// By the capture's buses: the lane, if its frames are sent.
+    /// By the capture's buses: the index of the bus to which its frames are sent, if they are.
     pub(super) bus_links: Vec<Option<usize>>,
-    /// By lane: which of the capture's buses it is, and what it is called now.
+    /// By that index: which of the capture's buses it is, and its present name.
     pub(super) names: Vec<(usize, String)>,
 }
 
@@ -77,16 +77,16 @@ impl Routes {
 
 /// One bus.
 #[derive(Debug)]
-pub(super) struct LinkId {
+pub(super) struct BusLink {
     pub(super) bus: Bus,
     pub(super) format: Format,
-    /// Whether nobody served it before.
+    /// Whether it was not served before.
     own: bool,
     /// Whether its cells reply with sums, over simulated wires.
     pub(super) wired: bool,
 }
 
-impl LinkId {
+impl BusLink {
     pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
         message.encode().frames(self.format)
     }
@@ -101,8 +101,8 @@ impl LinkId {
 /// Buses, and the processes that were started for them.
 #[derive(Debug)]
 pub(super) struct Buses {
-    pub(super) bus_links: Arc<Vec<LinkId>>,
-    /// The gateway's side of the wires to their roots, where there are such; taken by who hears.
+    pub(super) bus_links: Arc<Vec<BusLink>>,
+    /// The gateway's side of the wires to their roots, where there are such; taken by the receiver.
     pub(super) roots: Vec<Option<Roots>>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
@@ -145,7 +145,7 @@ pub(super) fn skin_override(
             return Err(ReplayError::NotOfSkin { bus, skin, buses });
         }
     }
-    // Cells on other buses would have nobody to hear.
+    // Cells on other buses would receive nothing.
     let buses = skin_override.skin.buses.clone();
     let goes =
         |bus: usize| buses.get(bus).is_some_and(|bus| routes.names.iter().any(|(_, name)| *name == bus.name));
@@ -195,17 +195,17 @@ pub(super) fn open(
         let (own, wired) = (of_ours.is_some(), root.is_some());
         roots.push(root);
         served.extend(of_ours);
-        bus_links.push(LinkId { bus, format: format.unwrap_or(Format::Fd), own, wired });
+        bus_links.push(BusLink { bus, format: format.unwrap_or(Format::Fd), own, wired });
     }
     Ok(Buses { bus_links: Arc::new(bus_links), roots, processes: Processes::default(), _served: served })
 }
 
 impl Buses {
-    /// Listens on the buses that were there before, as long as two gateways need to notice each other.
+    /// Receives on the buses that were there before, as long as two gateways need to notice each other.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
         let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
         let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)];
-        let again = |(index, bus_link): (usize, &LinkId)| {
+        let again = |(index, bus_link): (usize, &BusLink)| {
             let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
             let kind = Choice::Only(bus_link.bus.kind());
             let bus = listen::open(bus_link.bus.name(), kind, Some(bus_link.format), options)?;
@@ -261,7 +261,7 @@ impl Buses {
     }
 }
 
-/// Who speaks, when it is a gateway or a cell that is there for good.
+/// The sender, if it is a gateway or a settled cell.
 const fn speaker(decoded: &Decoded) -> Option<Node> {
     if let Decoded::Message(Message::Network { from, .. }) = decoded {
         Some(*from)
@@ -273,7 +273,7 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
 }
 
 impl Options {
-    /// Whether cells are listened to.
+    /// Whether messages of cells are received.
     pub(super) fn hears(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == Only::Inputs
     }

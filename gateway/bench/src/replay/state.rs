@@ -1,14 +1,14 @@
-//! What holds on a bus at some point of a capture, and the messages that bring it about again.
+//! The state of a bus at some point of a capture, and the messages that restore it.
 //!
 //! ```text
 //!   messages up to there ──> take ──> [ State ] ──> restoring ──> messages before the first replayed one
 //! ```
 //!
 //! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it; and the end of a
-//! contact is said once, by a cell that was in contact at the joints before. So a replay that begins in the middle
-//! says again, in this order: the configuration as it was written; resume; the stimuli in force before the last
-//! joints; those that waited then; halt, if that was in force; the last joints; and all inputs since then, as they
-//! were said.
+//! contact is sent once, by a cell that was in contact at the joints before. So a replay that begins in the middle
+//! resends, in this order: the configuration as it was written; resume; the stimuli latched before the last joints;
+//! those that waited then; halt, if the cells were halted; the last joints; and all inputs since then, as they were
+//! sent.
 
 use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
@@ -19,10 +19,10 @@ use protocol::parameters::Parameter;
 
 use super::touched::Touched;
 
-/// Messages since the last joints that are kept as they were said.
+/// Messages since the last joints that are kept as they were sent.
 const SINCE: usize = 16_384;
 
-/// What one cell feels.
+/// The contact state of one cell.
 type ContactState = Contact<()>;
 
 /// Nothing touches it, in either mode.
@@ -43,13 +43,13 @@ fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     then.skin().map(touches)
 }
 
-/// The pages that are latched, without those that say what every cell feels at its start.
+/// The pages that are latched, without those that equal the state of every cell at its start.
 fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
     let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 
-/// What held on a bus before its last joints.
+/// The state of a bus before its last joints.
 #[derive(Clone, Debug, Default)]
 struct Before {
     /// Parameters that were written, in order, without those that were written over.
@@ -58,20 +58,20 @@ struct Before {
     cells: PerCell<ContactState>,
 }
 
-/// What holds on one bus.
+/// The state of one bus.
 #[derive(Clone, Debug, Default)]
 pub struct State {
     before: Before,
-    /// Who has which node id.
+    /// The owners of node ids.
     claims: PerCell<Claim>,
-    /// The last joints. Whether a cell was in contact at them depends on what held before.
+    /// The last joints. Whether a cell was in contact at them depends on the state before.
     joints: Option<(Epoch, Joints)>,
-    /// What was said since then, as it was said.
+    /// Messages since then, as they were sent.
     since: Vec<Message>,
 }
 
 impl Before {
-    /// Takes in what was said after the joints `last`.
+    /// Takes in the messages after the joints `last`.
     fn take(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
             self.halted = *message == Message::Halt;
@@ -85,7 +85,7 @@ impl Before {
         }
     }
 
-    /// A cell that has started again has forgotten what it felt, and what was switched.
+    /// A restarted cell has lost its contact state, and what was switched.
     fn start_again(&mut self, cell: Node) {
         self.cells.named(cell).iter_mut().for_each(|cell| clear(cell, true));
         self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
@@ -131,7 +131,7 @@ impl State {
             }
             self.since.push(*message);
         } else if let Message::Sensors { from, epoch, page } = *message {
-            // What the cell itself says that it feels, when nothing else is known of it.
+            // The contact state that the cell itself reports, when nothing else is known of it.
             let cell = self.before.cells.get_mut(from).filter(|cell| cell.waiting().is_empty());
             if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
                 cell.learn(page, ());
@@ -154,7 +154,7 @@ impl State {
         self.since.retain(|message| !is_forgotten(message));
     }
 
-    /// What was said until now holds before what comes.
+    /// Messages up to now apply before those that come.
     fn fold(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
@@ -165,7 +165,7 @@ impl State {
         }
     }
 
-    /// Who has a node id.
+    /// The owner of a node id.
     #[must_use]
     pub fn claim(&self, cell: CellId) -> Option<&Claim> {
         self.claims.get(cell)
@@ -177,7 +177,7 @@ impl State {
         self.joints.map(|(epoch, _)| epoch)
     }
 
-    /// Who is touched since the last joints, by what was said before them.
+    /// The cells that are touched since the last joints, by the messages before them.
     #[must_use]
     pub fn touched(&self) -> Touched {
         let mut touched = Touched::default();
@@ -207,12 +207,12 @@ impl State {
         self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
     }
 
-    /// What has to be said so that `cells` are in this state; `next` are the joints that come first then, for a bus
-    /// that has had none yet: the cells then forget the epoch of whoever spoke to them before.
+    /// The messages that bring `cells` into this state; `next` are the joints that come first then, for a bus that has
+    /// had none yet: they make the cells drop the epoch of an earlier gateway.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
         let Before { writes, halted, cells: contact_states } = &self.before;
-        // Ports are cut in test mode only, and the mode may have been written again since.
+        // Links can be down in test mode only, and the mode may have been written again since.
         let links_down = |write: &&(Node, u8, Message)| write.1 == Parameter::LinksDown.number();
         let (plan_summary, others): (Vec<_>, Vec<_>) = writes.iter().partition(links_down);
         let mut messages: Vec<_> =
@@ -262,12 +262,12 @@ mod tests {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
     }
 
-    fn cell(number: i64) -> CellId {
-        CellId::new(number).unwrap()
+    fn cell(node: i64) -> CellId {
+        CellId::new(node).unwrap()
     }
 
-    fn to(number: i64, from: From, newtons: f64) -> Message {
-        Message::Stimulus { to: Node::Cell(cell(number)), from, page: press(newtons) }
+    fn to(node: i64, from: From, newtons: f64) -> Message {
+        Message::Stimulus { to: Node::Cell(cell(node)), from, page: press(newtons) }
     }
 
     fn joints(epoch: u8) -> Message {
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_latched_what_waited_and_what_was_said_since_are_told_apart() {
+    fn latched_waiting_and_later_stimuli_are_distinguished() {
         let at = |epoch| From::Epoch(Epoch(epoch));
         let said = [
             joints(10),
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_released_restarted_or_measures_feels_nothing() {
+    fn a_released_restarted_or_measuring_cell_is_not_in_contact() {
         let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         let restarted = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
@@ -405,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cell_says_of_itself_counts_until_somebody_presses_it() {
+    fn a_cells_own_report_counts_until_a_stimulus() {
         let says =
             |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
         let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bus_without_joints_makes_cells_forget_another_epoch() {
+    fn a_bus_without_joints_makes_cells_drop_another_epoch() {
         let state = State::default();
         assert!(state.is_fresh());
         let next = Some((Epoch(0), Joints::default()));
@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claim_of_a_number_that_is_taken_takes_nothing_away() {
+    fn a_claim_of_a_taken_node_id_changes_nothing() {
         let says = |serial, sent, state| {
             let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
             Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }

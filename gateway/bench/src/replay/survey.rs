@@ -1,5 +1,5 @@
-//! What a capture holds, found in a first reading: its buses and their cells, what the cells' own counters say that
-//! it lacks, and the state in force where the replay begins.
+//! What a capture holds, found in a first reading: its buses and their cells, what it lacks by the cells' own
+//! counters, and the state where the replay begins.
 
 use std::collections::BTreeMap;
 
@@ -16,7 +16,7 @@ use super::state::State;
 use model::decode::{Decoded, Decoder};
 use trace::capture::Latched;
 
-/// A cell that says nothing for so long is not there, in ns.
+/// A cell that sends nothing for so long is absent, in ns.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
 /// A part of a capture, in ns after its first frame.
@@ -34,11 +34,11 @@ pub struct Survey {
     part: Part,
     /// When the first frame came, in ns since 1970.
     pub first: Option<u64>,
-    /// The greatest time.
+    /// The latest time.
     pub last: u64,
     /// Frames.
     pub frames: u64,
-    /// Frames that whoever took the capture said to have lost.
+    /// Frames that the recorder reported as lost.
     pub dropped: u64,
     /// Each bus, in the order of their first frames.
     pub buses: Vec<Bus>,
@@ -58,16 +58,16 @@ pub struct Bus {
     pub format: Option<Format>,
     /// Joint broadcasts on it.
     pub joints: u64,
-    /// When the last of them stood on it, in ns since 1970.
+    /// When the last of them was on it, in ns since 1970.
     last_joints: u64,
-    /// Of these, those that were under way when somebody last asked for a report; none when nobody has.
+    /// Of these, those before the last request for a report; none if there was no request.
     at_report: Option<(u64, u64)>,
-    /// Whether a cell told its counters, or something was in force when the capture began: then a part of a
-    /// recording, or one that was cut off, may lack what its counters would account for.
+    /// Whether a cell reported its counters, or something was latched when the capture began: then a part of a
+    /// recording, or a truncated one, may lack what its counters would account for.
     is_accounted: bool,
-    /// What was said before the capture began and is in force at its beginning, as it has it.
+    /// The messages from before the capture that are latched at its beginning, as it has them.
     pub latched: Vec<Message>,
-    /// The state in force where the part begins.
+    /// The state where the part begins.
     pub state: State,
     /// The first joints in the part.
     pub first_joints: Option<(Epoch, Joints)>,
@@ -83,7 +83,7 @@ pub struct Bus {
 #[derive(Clone, Debug, Default)]
 struct Before {
     tracked: Tracked,
-    /// When it was heard last, in ns since 1970.
+    /// When it sent last, in ns since 1970.
     heard: u64,
     hash: Known<u16>,
     measures: bool,
@@ -96,20 +96,20 @@ pub struct Cell {
     pub hash: Known<u16>,
     /// Whether it measured in the part: then its torques cannot come back.
     pub measured: bool,
-    /// When it was heard, in ns since 1970: first and last.
+    /// When it sent, in ns since 1970: first and last.
     pub heard: (u64, u64),
-    /// From when to when it said nothing, when that was long.
+    /// From when to when it sent nothing, when that was long.
     pub silences: Vec<(u64, u64)>,
     /// Packets that it sent and that are not in the capture.
     pub unrecorded: u64,
-    /// Joints that it did not take or came too late for.
+    /// Joints that it did not take or processed too late.
     pub untaken: u64,
     /// Between which joints its counters account for that: from after one time up to another, in ns since 1970.
     accounted: Vec<(u64, u64)>,
-    /// Whether counters account for anything on its bus; else whatever is lacking is a difference.
+    /// Whether counters account for anything on its bus; else everything missing is a difference.
     is_accounted: bool,
     tracked: Tracked,
-    /// Since when it claims its number, which it does after each start.
+    /// Since when it claims its node id, which it does after each start.
     claims: Option<u64>,
     /// Its counters at the last report, the joints until then, and the time of the last of them.
     report: Option<(Heard, u64, u64)>,
@@ -124,13 +124,13 @@ enum Place {
     After,
 }
 
-/// Something that may have been learnt too late.
+/// Something that may become known too late.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Known<T> {
-    /// Nothing has been said of it.
+    /// Nothing was reported of it.
     #[default]
     No,
-    /// It has changed before anything was said of it.
+    /// It has changed before anything was reported of it.
     TooLate,
     /// This.
     Yes(T),
@@ -144,7 +144,7 @@ impl Survey {
         Self { part, first: None, last: 0, frames: 0, dropped: 0, buses: Vec::new(), decoder }
     }
 
-    /// Takes what was in force when the capture began, before its first frame.
+    /// Takes what was latched when the capture began, before its first frame.
     pub fn begin(&mut self, latched: &[Latched]) {
         let mut decoder = Decoder::new(None);
         for Latched { bus, frame, nanos, .. } in latched {
@@ -228,7 +228,7 @@ impl Survey {
 }
 
 impl Bus {
-    /// Takes in what was said before the capture and is in force at its beginning.
+    /// Takes in messages from before the capture that are latched at its beginning.
     fn take_before(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
@@ -276,7 +276,7 @@ impl Bus {
         }
     }
 
-    /// The cells that speak in a part of the capture.
+    /// The cells that send in a part of the capture.
     pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &Cell)> {
         let speaks = move |cell: &Cell| cell.heard.1 >= from && cell.heard.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
@@ -285,7 +285,7 @@ impl Bus {
 
 impl Cell {
     fn new(nanos: u64, before: Option<&Before>) -> Self {
-        // A cell that has just spoken before the capture was there when it began.
+        // A cell that sent just before the capture was there when it began.
         let first =
             before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
@@ -323,8 +323,8 @@ impl Cell {
         }
     }
 
-    /// Takes in what it says, after so many joints of which the last was at some time; a report was asked for last after
-    /// others.
+    /// Takes in a message of it, after so many joints of which the last was at some time; a report was requested last
+    /// after others.
     fn take(
         &mut self,
         message: &Message,
@@ -337,7 +337,7 @@ impl Cell {
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
                 Some(Word::Claimant | Word::Overtaken) | None => return,
-                // After a start its counters begin anew.
+                // After a start its counters begin again.
                 Some(Word::Started { .. }) => self.report = Some((Heard::default(), joints.0, joints.1)),
                 Some(Word::First | Word::Known | Word::Shared) => {}
             }
@@ -348,7 +348,7 @@ impl Cell {
             *message
             && number == Parameter::Commit.number()
         {
-            // Configured anew before its first heartbeat: what it computed with before, nobody knows.
+            // Configured again before its first heartbeat: its former configuration is unknown.
             self.hash = match self.hash {
                 _ if place == Place::Before => Known::No,
                 Known::No => Known::TooLate,
@@ -358,7 +358,7 @@ impl Cell {
     }
 
     fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: Place) {
-        // While it claims its number it answers nothing.
+        // While it claims its node id it answers nothing.
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
             return;
@@ -372,7 +372,7 @@ impl Cell {
         self.measured |= place == Place::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
-    /// Counters that were asked for at some joints. When that was before the capture, nobody knows which joints they
+    /// Counters that were requested at some joints. If that was before the capture, it is unknown which joints they
     /// account for.
     fn report(&mut self, heard: Heard, requested: Option<(u64, u64)>) {
         let Some((joints, last)) = requested else { return };
@@ -389,14 +389,14 @@ impl Cell {
         self.report = Some((heard, joints, last));
     }
 
-    /// Whether counters that it told before and after account for joints of this time, in ns since 1970; where none on
-    /// its bus do, nothing is excused by what they would say.
+    /// Whether counters that it reported before and after account for joints of this time, in ns since 1970; if none on
+    /// its bus do, they explain no deviation.
     #[must_use]
     pub fn is_counted_at(&self, nanos: u64) -> bool {
         !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
     }
 
-    /// Whether it said nothing for long around a time, in ns since 1970.
+    /// Whether it sent nothing for long around a time, in ns since 1970.
     #[must_use]
     pub fn is_silent_at(&self, nanos: u64) -> bool {
         nanos < self.heard.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
@@ -409,7 +409,7 @@ pub const fn is_input(id: Id) -> bool {
     !id.kind.is_from_cells()
 }
 
-/// Whether a frame is of a broadcast of joints, or of half of one.
+/// Whether a frame is of a broadcast of joints, or of a segment of one.
 #[must_use]
 pub fn is_joints(id: Id) -> bool {
     id == Id::command(Command::Joints)

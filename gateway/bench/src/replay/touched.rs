@@ -2,7 +2,7 @@
 
 use protocol::id::CellId;
 
-/// Of each cell whether something touches it; none when nobody knows.
+/// Of each cell whether something touches it; none if that is unknown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Touched([Option<bool>; CellId::COUNT]);
 
@@ -13,7 +13,7 @@ impl Default for Touched {
 }
 
 impl Touched {
-    /// Whether a cell is touched; none when nobody knows.
+    /// Whether a cell is touched; none if that is unknown.
     #[must_use]
     pub fn is(&self, cell: CellId) -> Option<bool> {
         self.0.get(cell.index()).copied().flatten()

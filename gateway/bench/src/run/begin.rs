@@ -1,4 +1,4 @@
-//! Until the loop begins: the cells start, nobody else is on their buses, and all are ready, switched and organised.
+//! Until the loop begins: the cells start, no other gateway is on their buses, and all are ready, switched and in a tree.
 
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -21,12 +21,12 @@ use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
 
-/// Cells that were there before are given so long to show up, and all to confirm what they are told.
+/// How long cells that were there before may take to show up, and all to confirm their switches.
 pub(super) const SHOWING: Duration = Duration::from_secs(2);
-/// From one word to a cell that does not confirm to what it is switched to the next.
+/// The retry period for a cell that does not confirm its switches.
 pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
 
-/// Cells that are told what they are to be switched to, by bus and number.
+/// Cells to which their switches were sent, by bus and node id.
 pub(super) type Announced = Repeats<(usize, CellId)>;
 
 impl Bench<'_> {
@@ -53,17 +53,17 @@ impl Bench<'_> {
         }
         let cells = options.skin.cells.len();
         self.wait(self.timeout(), |bench, timeout| {
-            // Who has no parameters will not get any by waiting.
+            // Waiting does not help cells without parameters.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
             let is_over = timeout.is_over(ready);
-            // Where the machine was away for a moment, all may look dead that were ready before it: they speak again.
+            // After the machine was busy for a moment, ready cells may seem dead: they will send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
         self.rate_start()?;
         self.wake_up()?;
         self.go_on_after_others();
         self.switch_cells()?;
-        // What they have counted and feel, and where they are in their networks.
+        // Their counters, contact states and places in their networks.
         self.say(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
             self.organise()
@@ -77,7 +77,7 @@ impl Bench<'_> {
         if self.options.spawn { STARTING } else { SHOWING }
     }
 
-    /// Looks again and again, until a look is the last one.
+    /// Polls until the check is done.
     pub(super) fn wait(
         &mut self,
         timeout: Duration,
@@ -98,13 +98,13 @@ impl Bench<'_> {
         if halted(self) == 0 {
             return Ok(());
         }
-        // Their next heartbeats say so.
+        // Their next heartbeats show it.
         self.say(&Message::Sync)?;
         self.wait(SHOWING, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
-    /// A bus that was there before may have a gateway, or cells whose numbers ours would take: nobody is
-    /// disturbed by listening first.
+    /// A bus that was there before may have a gateway, or cells with the same node ids: listening first disturbs
+    /// neither.
     fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
         self.wait(LISTEN, |_, _| Ok(Instant::now() >= until))?;
         let cells = self.names(|cell| cell.heard);
@@ -115,7 +115,7 @@ impl Bench<'_> {
         Err(RunError::CellsThere { cells, embedded })
     }
 
-    /// Cells that were there before have heard another gateway: its epochs go on.
+    /// Cells that were there before have received joints of another gateway: its epochs are continued.
     fn go_on_after_others(&mut self) {
         if self.options.spawn {
             return;
@@ -188,7 +188,7 @@ impl Bench<'_> {
         RunError::OtherGateway(link.map(|link| (link.name.clone(), link.kind)))
     }
 
-    /// The cells of a process that has ended, for people.
+    /// The cells of a process that has ended, as text.
     pub(super) fn cells_of(&self, ended: &Ended) -> String {
         format!("{ended} on {}", self.name(ended.bus))
     }
@@ -203,7 +203,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Switches all cells to what they forget at each start, before the first joints.
+    /// Switches all cells to what they lose at each start, before the first joints.
     fn switch_cells(&mut self) -> Result<(), RunError> {
         let mut announced = Announced::new(SWITCH_AGAIN);
         let lacking = self.lacking();
@@ -219,12 +219,12 @@ impl Bench<'_> {
         announced.said_to_all(self.now());
         self.wait(SHOWING, |bench, timeout| {
             bench.switch_again(&mut announced)?;
-            // Who has not answered by then is told later.
+            // Cells that have not answered by then are switched later.
             Ok(bench.lacking().is_empty() || timeout.is_over(0))
         })
     }
 
-    /// Tells those that have not confirmed, for which time has passed: they started anew, or a word was lost.
+    /// Switches again the cells that have not confirmed in time: they restarted, or a message was lost.
     pub(super) fn switch_again(&self, announced: &mut Announced) -> Result<(), RunError> {
         let lacking = self.lacking();
         let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
@@ -237,7 +237,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// The cells that can hear and have not confirmed something, and what.
+    /// The cells that can receive and have not confirmed something, and what.
     fn lacking(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
@@ -255,8 +255,8 @@ impl Bench<'_> {
     }
 }
 
-/// The epoch after which to begin on cells that have taken these last, the first cell's if that can be: joints of the
-/// epoch that a cell has taken last it takes for repeated ones. Buses need not have had the same.
+/// The epoch after which to begin on cells that have taken these last, if possible the first cell's: joints of the
+/// epoch that a cell has taken last count as repeated. Buses need not have had the same.
 fn after(taken: &[Epoch]) -> Epoch {
     let mut last = taken.first().copied().unwrap_or_default();
     for _ in 0..u8::MAX {

@@ -26,7 +26,7 @@ use control::cycle::Cycle;
 use control::cycle::turn::{Line, Shared, Timed};
 use model::table::Switch;
 
-/// Between two looks, until the loop begins.
+/// The polling period until the loop begins.
 pub(super) const LOOK: Duration = Duration::from_millis(5);
 
 /// The tag of requests to switch cells.
@@ -34,10 +34,10 @@ const SWITCH: u8 = 0x5E;
 
 /// One bus of a bench.
 #[derive(Debug)]
-pub(super) struct LinkId {
+pub(super) struct BusLink {
     pub(super) link: Arc<Link>,
     pub(super) format: Format,
-    /// What the loop has of the bus, until it begins.
+    /// The loop's end of the bus, until it begins.
     pub(super) line: Option<(Line, Slot)>,
     pub(super) view: Arc<Mutex<View>>,
     pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
@@ -46,8 +46,8 @@ pub(super) struct LinkId {
     pub(super) shared: Arc<Shared>,
 }
 
-impl LinkId {
-    /// Sends a message. A bus that is lost for a while does not take it, which is counted, and costs no run its end.
+impl BusLink {
+    /// Sends a message. A bus that is lost for a while does not take it, which is counted and does not end the run.
     pub(super) fn send(&self, message: &Message) -> Result<bool, BusError> {
         let frames: Vec<Frame> = message.encode().frames(self.format).collect();
         match self.link.send(&frames).map_err(BusError::from) {
@@ -59,7 +59,7 @@ impl LinkId {
         }
     }
 
-    /// Switches a cell, or all; who does not confirm it is told again.
+    /// Switches a cell, or all; it is repeated to cells that do not confirm it.
     pub(super) fn switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
         self.send(&Message::Configure { to, tag: SWITCH, request: Request::Write { number, words } })
     }
@@ -74,14 +74,14 @@ pub(super) struct Bench<'a> {
     /// What the kernel's backlog had dropped before the first bus was opened.
     pub(super) backlog_dropped: Option<u64>,
     pub(super) shared: Arc<Shared>,
-    pub(super) bus_links: Vec<LinkId>,
+    pub(super) bus_links: Vec<BusLink>,
     pub(super) bus_event: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
     /// The epoch of the first broadcast.
     pub(super) first_epoch: Epoch,
     pub(super) recorder: Option<Recorder>,
-    /// Where the loop's records go that are to be recorded.
+    /// The queue of loop records to be recorded.
     pub(super) recorded: Option<rtrb::Producer<Timed>>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
@@ -99,24 +99,24 @@ impl Bench<'_> {
         self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str())
     }
 
-    /// What each receiver shows.
-    pub(super) fn views(&self) -> impl Iterator<Item = (&LinkId, MutexGuard<'_, View>)> {
+    /// The view of each receiver.
+    pub(super) fn views(&self) -> impl Iterator<Item = (&BusLink, MutexGuard<'_, View>)> {
         self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
-    /// The networks of the cells that answer with sums, with what their receivers show.
+    /// The networks of the cells that answer with sums, with the views of their receivers.
     pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
         self.bus_links
             .iter_mut()
-            .filter_map(|LinkId { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
+            .filter_map(|BusLink { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
     }
 
-    /// How many cells are so.
+    /// How many cells satisfy this.
     pub(super) fn count(&self, is: impl Fn(&CellView) -> bool) -> usize {
         self.views().map(|(_, view)| view.cells.iter().filter(|cell| is(cell)).count()).sum()
     }
 
-    /// The names of some cells, for people: `1, 2, 5 on vcan0`.
+    /// The names of some cells as text: `1, 2, 5 on vcan0`.
     pub(super) fn names(&self, target: impl Fn(&CellView) -> bool) -> String {
         let names = self.views().filter_map(|(bus_link, view)| {
             let nodes: Vec<_> = view.cells.iter().filter(|cell| target(cell)).map(|cell| cell.node).collect();

@@ -1,4 +1,4 @@
-//! The end of a bench: last words of the cells, the recording, the summary.
+//! The end of a bench: final reports of the cells, the recording, the summary.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
@@ -10,7 +10,7 @@ use protocol::skin::Cell;
 use protocol::time::Micros;
 
 use super::RunError;
-use super::bench::{Bench, LinkId};
+use super::bench::{Bench, BusLink};
 use super::measured::Measured;
 use super::progress::say;
 use super::realtime::wall;
@@ -24,7 +24,7 @@ use model::quantiles::Quantiles;
 use model::table::{Accuracy, Said};
 use trace::recording::account::Recording;
 
-/// How long the cells may take to say their last words; a machine that is overloaded needs it.
+/// How long the cells may take to send their final reports; an overloaded machine needs it.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
 impl Bench<'_> {
@@ -53,7 +53,7 @@ impl Bench<'_> {
         Ok(self.summarise(summary, &Measured::new(), &received).rated(Some(error.to_string())))
     }
 
-    /// Where the frames are that were heard before a failure.
+    /// Reports where the frames received before a failure are.
     fn say_what_is_kept(&self, recording: Option<&Recording>) {
         if self.options.quiet {
             return;
@@ -63,7 +63,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Lets late replies come in, and asks all cells for their counters and a last heartbeat.
+    /// Waits for late replies, and requests all cells' counters and a last heartbeat.
     pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
         thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
         self.wait_until(Self::has_caught_up);
@@ -72,14 +72,14 @@ impl Bench<'_> {
         if interrupted {
             self.say(&Message::Halt)?;
         }
-        // Last of all, so that each cell's own count covers everything else that it has sent.
+        // Last, so that each cell's own count covers everything else that it has sent.
         self.say(&Message::Sync)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
         Ok(())
     }
 
-    /// Whether the receivers have read everything that was sent; what came before it they have read too. Of a bus
-    /// that is lost nothing is waited for.
+    /// Whether the receivers have read everything that was sent; what came before it they have read too. A lost
+    /// bus is not waited for.
     fn has_caught_up(&self) -> bool {
         self.bus_links.iter().all(|bus_link| {
             let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
@@ -87,7 +87,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Whether all cells have said it that can be expected to, on buses that work.
+    /// Whether all cells that can be expected to have reported it, on buses that work.
     fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
         self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
             let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
@@ -95,7 +95,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Waits for something, but not for ever; what is missing then shows in the accounts.
+    /// Waits for something until the timeout; what is missing then shows in the accounts.
     fn wait_until(&self, done: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + LAST_WORDS;
         while !done(self) && Instant::now() < give_up {
@@ -103,14 +103,14 @@ impl Bench<'_> {
         }
     }
 
-    /// Lets the receivers end and takes what they leave.
+    /// Ends the receivers and takes their results.
     fn stop_receivers(&mut self) -> Vec<Option<ReceiverResult>> {
         self.shared.stop.store(true, Ordering::Relaxed);
-        let end = |bus_link: &mut LinkId| bus_link.receiver.take().and_then(|thread| thread.join().ok());
+        let end = |bus_link: &mut BusLink| bus_link.receiver.take().and_then(|thread| thread.join().ok());
         self.bus_links.iter_mut().map(end).collect()
     }
 
-    /// Ends the recording, when nobody hands over more.
+    /// Ends the recording once no thread hands over more.
     fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<Recording> {
         let add = |all: Unrecorded, one: &ReceiverResult| Unrecorded {
             frames: all.frames + one.unrecorded.frames,
@@ -181,7 +181,7 @@ impl Bench<'_> {
         measured: &Measured,
     ) -> Vec<BusSummary> {
         let now = Micros(wall() / 1_000);
-        let summary = |(index, (bus_link, received)): (usize, (&LinkId, &Option<ReceiverResult>))| {
+        let summary = |(index, (bus_link, received)): (usize, (&BusLink, &Option<ReceiverResult>))| {
             let ReceiverResult { table, outages, dropped, .. } = received.as_ref()?;
             let link = &bus_link.link;
             let network = bus_link.network.as_ref().map(|network| NetworkSummary {
@@ -204,7 +204,7 @@ impl Bench<'_> {
         };
         let mut summaries: Vec<_> =
             self.bus_links.iter().zip(received).enumerate().filter_map(summary).collect();
-        // Nobody knows of which bus they were, but of the kernel's own.
+        // Their bus is unknown, except that it was one of the kernel's.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
             backlog -= summary.uplink.explain_by_backlog(backlog);

@@ -14,14 +14,14 @@ use crate::record::OutputError;
 use crate::signals::SignalError;
 use control::external::SocketError;
 
-/// How benches on embedded buses keep out of each other's way.
+/// How benches on embedded buses avoid each other.
 const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
 
 /// Why a run did not come to its end.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
-    /// A file says something that cannot be.
+    /// A file has an invalid value.
     #[error(transparent)]
     Document(#[from] DocumentError),
     /// A bus does not open.
@@ -30,7 +30,7 @@ pub enum RunError {
     /// A program does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
-    /// There is nowhere to record.
+    /// No recording can be made.
     #[error(transparent)]
     Output(#[from] OutputError),
     /// There is no socket for an external controller.
@@ -42,13 +42,13 @@ pub enum RunError {
     /// Cells cannot keep their parameters there.
     #[error("--flash {}: there is no such directory; make it first", .0.display())]
     NoFlash(PathBuf),
-    /// A scenario asks for what only a simulated bus does.
+    /// A scenario requests what only a simulated bus can do.
     #[error(
         "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, restart, \
-         cut, mend, stuck and drift it can"
+         link_down, link_up, stuck and drift it can"
     )]
     BusFault,
-    /// Simulated wires have no place on a real bus.
+    /// Simulated wires must not be used on a real bus.
     #[error(
         "{0} is real hardware, and the wires between cells that answer with sums are simulated by frames that may not \
          go there: use a vcan or the embedded bus, or reply = \"torque\""
@@ -88,7 +88,7 @@ pub enum RunError {
         /// Whether the bus is an embedded one.
         embedded: bool,
     },
-    /// Cells have nothing to compute with.
+    /// Cells have no parameters.
     #[error(
         "cells without parameters: {0}; write them with `gateway commission`, or delete their flash files if these are \
          damaged"
@@ -129,12 +129,12 @@ pub enum RunError {
     #[error("{0}")]
     BrokenTree(String),
     /// Cells do not answer with sums.
-    #[error("cells that do not take up sums (parameter 6): {0}; give them firmware that does")]
+    #[error("cells that do not switch to sums (parameter 6): {0}; give them firmware that does")]
     NoSums(String),
     /// A thread panicked.
     #[error("the {0} panicked")]
     Panicked(&'static str),
-    /// Nobody receives any more.
+    /// A receiver has ended.
     #[error("a receiver ended while the loop ran")]
     ReceiverEnded,
 }

@@ -1,4 +1,4 @@
-//! When and why the robot was halted, and what the ticks before were like.
+//! When and why the robot was halted, and the ticks before.
 //!
 //! The main thread fills the ring with the records that the loop hands on, so that the loop does nothing for it.
 
@@ -14,7 +14,7 @@ use control::cycle::turn::Timed;
 
 /// Ticks that are kept: 0.4 s at 500 Hz.
 const TICKS: usize = 200;
-/// Halts that are told one by one.
+/// Halts that are listed one by one.
 const HALTS: usize = 100;
 
 /// What is known of halts.
@@ -25,7 +25,7 @@ pub(super) struct Halts {
     /// The ticks up to the last halt.
     before: Vec<Timed>,
     halts: Vec<Halted>,
-    /// Halts beyond those that are told one by one.
+    /// Halts beyond those that are listed one by one.
     pub(super) further: u64,
     /// The halt that lasts.
     lasting: Option<Halted>,
@@ -83,7 +83,7 @@ impl Halts {
     }
 }
 
-/// A tick in words and numbers.
+/// A tick as it is reported.
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
 fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
     let record = &timed.record;
@@ -141,7 +141,7 @@ mod tests {
         }
     }
 
-    /// A loop without a machine, whose records go to what is tested.
+    /// A loop without a machine, whose records go to the tested code.
     struct Bench {
         cycle: Cycle,
         sums: Sums,
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ticks_before_a_halt_stay_whatever_comes_after_it() {
+    fn the_ticks_before_a_halt_are_kept_after_it() {
         let limit = u64::from(testing::skin().safety.bad_cycles);
         let mut bench = Bench::new(1_000);
         bench.ticks(1_000 + limit - 1);

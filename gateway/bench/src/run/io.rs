@@ -1,4 +1,4 @@
-//! Two calls that no safe wrapper has. They decide nothing.
+//! Two calls that have no safe wrapper, without any logic.
 
 /// Asks for `SCHED_FIFO` for the calling thread; returns whether it was granted.
 pub(super) fn set_fifo(priority: i32) -> bool {

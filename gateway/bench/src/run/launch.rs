@@ -1,5 +1,5 @@
 //! The processes of a bench: embedded buses and cells. All of them end with the gateway, however it
-//! ends: each follows its parent's death by itself, and a [`Processes`] that is dropped ends them.
+//! ends: each ends at its parent's death by itself, and a [`Processes`] that is dropped ends them.
 
 use std::fmt::{self, Display, Formatter};
 use std::fs::File;
@@ -23,13 +23,13 @@ use model::scenario::ProcessAction;
 
 /// Two gateways on one bus notice each other in this time.
 pub const LISTEN: Duration = Duration::from_millis(500);
-/// Cells that were started and make no progress for so long are given up.
+/// Timeout of started cells without progress.
 pub const STARTING: Duration = Duration::from_secs(15);
 /// Files that a gateway or a server of a bus has open beside buses and clients.
 const OTHER_FILES: usize = 24;
 /// Files of a gateway for one bus.
 const FILES_OF_A_BUS: usize = 4;
-/// How long processes may take to end when asked to.
+/// How long processes may take to end after SIGTERM.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Why a process could not be started.
@@ -37,9 +37,7 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 #[non_exhaustive]
 pub enum LaunchError {
     /// There is no such program.
-    #[error(
-        "{name} is not at {path}: build it with `cargo build --release`, or say where it is with --{name}"
-    )]
+    #[error("{name} is not at {path}: build it with `cargo build --release`, or name its path with --{name}")]
     Missing {
         /// The program.
         name: &'static str,
@@ -97,7 +95,7 @@ pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
 pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, LaunchError> {
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
     let path = given.map(Path::to_owned).or_else(beside).unwrap_or_else(|| PathBuf::from(name));
-    // A bare name would be looked for in PATH, and not here.
+    // A bare name would be searched in PATH, and not here.
     let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
@@ -164,7 +162,7 @@ impl ServedBus {
     }
 }
 
-/// Opens a bus; an embedded one that nobody serves is served, by `vcan_setup` if that is named.
+/// Opens a bus; an embedded one without a server is served, by `vcan_setup` if that is named.
 ///
 /// # Errors
 /// When it does not open, or is not served.
@@ -227,11 +225,11 @@ impl Display for Ended {
 #[derive(Debug, Default)]
 pub struct Processes {
     all: Vec<Process>,
-    /// Set by SIGCHLD, so that hundreds of processes are asked how they are only when one has changed.
+    /// Set by SIGCHLD, so that hundreds of processes are polled only when one has changed.
     changed: Arc<AtomicBool>,
 }
 
-/// How cells are started.
+/// How to start cells.
 #[derive(Clone, Copy, Debug)]
 pub struct Plan<'a> {
     /// The program.
@@ -251,7 +249,7 @@ pub struct Plan<'a> {
 }
 
 impl Processes {
-    /// Starts all cells of a skin. Call it from the thread that lives as long as the cells shall.
+    /// Starts all cells of a skin. Call it from a thread that lives as long as the cells must.
     ///
     /// # Errors
     /// When a process does not start; those before it are ended again.
@@ -271,7 +269,7 @@ impl Processes {
         Ok(processes)
     }
 
-    /// The processes' numbers.
+    /// The process ids.
     pub fn pids(&self) -> impl Iterator<Item = u32> {
         self.all.iter().filter(|process| !process.ended).map(|process| process.child.id())
     }
@@ -325,7 +323,7 @@ impl Process {
 impl Drop for Processes {
     fn drop(&mut self) {
         for process in &self.all {
-            // A stopped process would not hear the other signal.
+            // A stopped process would not handle the other signal.
             process.signal(Signal::CONT);
             process.signal(Signal::TERM);
         }
@@ -361,8 +359,8 @@ fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
 }
 
-/// Ctrl-C on a terminal goes to everyone in its process group, and is meant for the gateway alone: cells and
-/// buses have to outlive it until the last words are said. They find embedded buses where it does.
+/// Ctrl-C on a terminal signals the whole process group, and is meant for the gateway alone: cells and buses
+/// have to outlive it until the final reports. They find embedded buses where it does.
 fn apart(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {

@@ -1,7 +1,7 @@
-//! One bus as the threads of a run share it: lost, and had again, without anybody waiting for it.
+//! One bus as the threads of a run share it: it may be lost and reopened, and no thread waits for it.
 //!
-//! The receiver opens a bus that is gone anew. The loop finds the new one in a triple buffer, where it neither waits nor
-//! frees anything; whoever has more time asks [`Link::send`].
+//! The receiver reopens a bus that is gone. The loop finds the new one in a triple buffer, where it neither waits nor
+//! frees anything; threads that may wait use [`Link::send`].
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,7 +21,7 @@ pub struct Link {
     pub kind: BusKind,
     /// How many bytes may wait unread, as they were granted when it was first opened.
     pub receive_buffer: usize,
-    /// How it is.
+    /// Its state.
     pub state: Arc<BusState>,
     /// How it was opened, and is again.
     target: Options,
@@ -43,7 +43,7 @@ pub struct ReceiveEnd {
 }
 
 impl Link {
-    /// A bus that was opened so.
+    /// The link of a bus that was opened with these options.
     #[must_use]
     pub fn new(bus: Bus, target: Options) -> (Arc<Self>, ReceiveEnd, Slot) {
         let bus = Arc::new(bus);
@@ -60,7 +60,7 @@ impl Link {
         (Arc::clone(&link), ReceiveEnd { link, bus, slot }, output)
     }
 
-    /// Whether it has to be opened anew.
+    /// Whether it has to be reopened.
     #[must_use]
     pub fn is_gone(&self) -> bool {
         self.gone.load(Ordering::Relaxed)
@@ -76,25 +76,25 @@ impl Link {
     }
 }
 
-/// Whether a bus that says so may be had again, by waiting or by opening it anew.
+/// Whether a bus with this error may be used again, by waiting or by reopening it.
 #[must_use]
 pub const fn may_return(error: &BusError) -> bool {
     error.may_pass() || error.is_closed()
 }
 
 impl ReceiveEnd {
-    /// Notes that it does not work; `gone` if it has to be opened anew. Whether that is news.
+    /// Notes that it does not work; `gone` if it has to be reopened. Whether that is a change.
     pub fn lose(&self, gone: bool) -> bool {
         let bus_event = gone && !self.link.gone.swap(true, Ordering::Relaxed);
         self.link.state.works.swap(false, Ordering::Relaxed) || bus_event
     }
 
-    /// Notes that it works. Whether that is news.
+    /// Notes that it works. Whether that is a change.
     pub fn regain(&self) -> bool {
         !self.link.state.works.swap(true, Ordering::Relaxed)
     }
 
-    /// Opens a bus that is gone anew, and hands it to everybody.
+    /// Reopens a bus that is gone, and hands it to all threads.
     ///
     /// # Errors
     /// When it does not open yet.
@@ -113,7 +113,7 @@ impl ReceiveEnd {
 pub struct Outages {
     /// How often.
     pub times: u64,
-    /// For how long, all times together, but for the one that lasts.
+    /// For how long in total, without the present outage.
     lost: Duration,
     /// Since when it is lost.
     since: Option<Instant>,
@@ -153,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn outages_are_counted_and_add_up_also_one_that_lasts() {
+    fn outages_are_counted_and_added_up_including_the_present_one() {
         let (start, second) = (Instant::now(), Duration::from_secs(1));
         let mut outages = Outages::default();
         outages.end(start);

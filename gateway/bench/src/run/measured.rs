@@ -1,4 +1,4 @@
-//! What the loop's records add up to.
+//! The sums of the loop's records.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ use super::halts::Halts;
 use control::cycle::turn::Timed;
 use model::quantiles::{Quantiles, histogram};
 
-/// What the loop's records add up to.
+/// The sums of the loop's records.
 #[derive(Debug)]
 pub(super) struct Measured {
     pub(super) late: Histogram<u64>,
@@ -68,7 +68,7 @@ impl Measured {
         }
     }
 
-    /// How it goes: what matters most first, for a narrow terminal shows no more.
+    /// The progress: the most important first, as a narrow terminal shows no more.
     pub(super) fn line(
         &self,
         elapsed: Duration,
@@ -94,7 +94,7 @@ impl Measured {
     }
 }
 
-/// A histogram that is made without a bound grows by itself; it cannot refuse.
+/// A histogram without a bound resizes itself, so recording cannot fail.
 fn record(histogram: &mut Histogram<u64>, value: u64) {
     let _ = histogram.record(value);
 }

@@ -3,12 +3,12 @@
 //! ```text
 //!   main thread ── starts ──> cells, embedded buses (processes)
 //!       │  ▲
-//!       │  └── news, view, records, captured frames ──┐
-//!       │                                             │
-//!       ├─ stimuli ─> bus ─> receiver (one a bus) ────┤
+//!       │  └── events, view, records, captured frames ─┐
+//!       │                                              │
+//!       ├─ stimuli ─> bus ─> receiver (one a bus) ─────┤
 //!       │              ▲         └─ snapshot ─> control loop (SCHED_FIFO)
-//!       │              └──────────── joints ────────────┘
-//!       └─ progress line, summary              recorder: what all of them hand over, into files
+//!       │              └──────────── joints ───────────┘
+//!       └─ progress line, summary              recorder: writes what all of them hand over
 //! ```
 
 mod begin;
@@ -72,7 +72,7 @@ pub struct Options {
     pub quiet: bool,
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM. Of a run that fails there is a summary too, which says why.
+/// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason.
 ///
 /// # Errors
 /// When it cannot begin because of wrong use or configuration; cells and buses that were started are ended again.

@@ -1,4 +1,4 @@
-//! The networks of a run's cells, as the main thread sees them: who has no way, and who is to be told when to speak.
+//! The networks of a run's cells, as the main thread sees them: unreachable cells, and cells that need their slots.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,9 +17,9 @@ use model::repeat::Repeats;
 
 use crate::view::View;
 
-/// A cell that does not answer is told again after this.
+/// The retry period for a cell that does not answer.
 const AGAIN: Span = Span::from_millis(200);
-/// Cells have so long to find another way before people hear of it.
+/// Cells have so long to find another route before they are reported.
 const GRACE: Span = Span::from_millis(300);
 
 /// The network of one bus.
@@ -29,25 +29,25 @@ pub(super) struct Network {
     wires: Wires,
     slots: Slots,
     period_us: u16,
-    /// Cells that are told when they speak.
+    /// Cells to which their slots were sent.
     announced: Repeats<CellId>,
-    /// Ports that are to hear nothing, a bit each, and cells that are told so.
+    /// Ports whose links are to be down, a bit each, and cells to which that was sent.
     deaf: BTreeMap<CellId, u8>,
     reported_links_down: Repeats<CellId>,
-    /// Cells that speak and have no way, and since when.
+    /// Cells that send and are unreachable, and since when.
     without: BTreeMap<CellId, Micros>,
-    /// Cells that people have heard of as without a way, and since when they are; until they have one again.
+    /// Cells that were reported as unreachable, and since when they are; until they have a route again.
     said: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
-    /// How long a cell was without a way, at most.
+    /// The longest time that a cell was unreachable.
     pub(super) longest: Span,
-    /// From the time when all cells were ready until all had a way.
+    /// From the time when all cells were ready until all had a route.
     pub(super) tree_ready: Option<Span>,
-    /// What was different from the description at the start.
+    /// Differences from the description at the start.
     pub(super) differences: Vec<Difference>,
 }
 
-/// A tree for which there is no time between two joints.
+/// A tree that is too deep for the time between two joints.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "the tree of {bus} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the {period_us} us \
@@ -69,12 +69,12 @@ pub struct TooDeep {
     pub period_us: u32,
 }
 
-/// What a look at a network comes to.
+/// The result of a check of a network.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Look {
-    /// What is to be said to cells.
+    /// Messages for cells.
     pub(super) messages: Vec<Message>,
-    /// What people are to know.
+    /// Messages for the user.
     pub(super) notes: Vec<String>,
 }
 
@@ -100,7 +100,7 @@ impl Network {
         })
     }
 
-    /// The depth of the deepest cell that there is a slot for.
+    /// The largest depth for which there is a slot.
     pub(super) const fn deepest(&self) -> u8 {
         self.slots.deepest
     }
@@ -110,7 +110,7 @@ impl Network {
         &self.name
     }
 
-    /// Cells that speak and have no way, at the last look.
+    /// Cells that send and are unreachable, at the last check.
     pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
         self.without.keys().map(|cell| cell.get())
     }
@@ -119,13 +119,13 @@ impl Network {
         places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
     }
 
-    /// How many cells have a way, and whether all do that speak, with pages that agree.
+    /// How many cells have a route, and whether all that send have one, with pages that agree.
     pub(super) fn progress(view: &View) -> (usize, bool) {
         let places = Self::places(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
 
-    /// What is different from the description.
+    /// Differences from the description.
     pub(super) fn check(&self, view: &View) -> Vec<Difference> {
         check::differences(&self.wires, &view.network)
     }
@@ -133,7 +133,7 @@ impl Network {
     /// Makes slots for the tree as it is.
     ///
     /// # Errors
-    /// When they do not fit between two joints; says what would.
+    /// When they do not fit between two joints, with what would.
     pub(super) fn fit(&mut self, view: &View) -> Result<(), TooDeep> {
         let deepest = Self::places(view).deepest().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
@@ -154,26 +154,26 @@ impl Network {
         Message::Configure { to, tag: self.slots.deepest, request }
     }
 
-    /// Tells everyone how deep the tree is.
+    /// Announces the depth of the tree to all cells.
     pub(super) fn announce(&mut self, now: Micros) -> Message {
         self.announced.said_to_all(now);
         self.tell(Node::Everyone)
     }
 
-    /// The cells that do not speak in slots for this tree and could.
-    pub(super) fn untold(&self, view: &View) -> Vec<CellId> {
+    /// The cells that do not use the slots of this tree and could.
+    pub(super) fn unconfirmed(&self, view: &View) -> Vec<CellId> {
         let words = Some(self.words());
-        let untold = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
-        untold.map(|cell| cell.node).collect()
+        let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
+        unconfirmed.map(|cell| cell.node).collect()
     }
 
-    /// What is to be said to those who have not answered for a while.
+    /// Messages for cells that have not answered in time.
     pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
-        let due = self.announced.due(now, self.untold(view));
+        let due = self.announced.due(now, self.unconfirmed(view));
         due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
     }
 
-    /// Cuts the wires from one cell to another, or mends them.
+    /// Takes the links from one cell to another down, or up again.
     pub(super) fn set_link_down(&mut self, link_down: bool, from: CellId, to: CellId) {
         let ends = (0_u8..)
             .zip(0..PORTS)
@@ -184,7 +184,7 @@ impl Network {
         self.reported_links_down.renew(to);
     }
 
-    /// What is to be said to those whose ports are to hear nothing, or to hear again.
+    /// Messages for cells whose links are to go down, or up again.
     fn report_links_down(&mut self, now: Micros, view: &View) -> Vec<Message> {
         let target = |node: &CellId| self.deaf.get(node).copied();
         let ready = view.cells.iter().filter(|cell| cell.ready);
@@ -199,7 +199,7 @@ impl Network {
         due.into_iter().filter_map(message).collect()
     }
 
-    /// Looks at the network while the loop runs.
+    /// Checks the network while the loop runs.
     pub(super) fn look(&mut self, now: Micros, view: &View) -> Look {
         let mut look = Look::default();
         let places = Self::places(view);
@@ -208,7 +208,7 @@ impl Network {
                 Ok(()) => look.messages.push(self.announce(now)),
                 Err(why) if !self.said_too_deep => {
                     self.said_too_deep = true;
-                    look.notes.push(format!("{why}; what is deeper speaks too early, and is late"));
+                    look.notes.push(format!("{why}; deeper cells send too early, and their sums are late"));
                 }
                 Err(_) => {}
             }
@@ -238,9 +238,9 @@ impl Network {
         if let Some(oldest) = bus_event.iter().map(|(_, since)| now.since(*since)).max() {
             self.said.extend(bus_event.iter().copied());
             let cells: Vec<_> = bus_event.into_iter().map(|(cell, _)| cell).collect();
-            let (has, them) = if cells.len() == 1 { ("has", "it") } else { ("have", "them") };
+            let is = if cells.len() == 1 { "is" } else { "are" };
             look.notes.push(format!(
-                "{} on {} {has} no way to a root: no sum holds {them} since {:.1} s",
+                "{} on {} {is} unreachable: no route to a root, in no sum for {:.1} s",
                 check::names(&cells),
                 self.name,
                 oldest.seconds()
@@ -250,7 +250,7 @@ impl Network {
             let cells: Vec<_> = back.into_iter().map(|(cell, _)| cell).collect();
             let has = if cells.len() == 1 { "has" } else { "have" };
             look.notes.push(format!(
-                "{} on {} {has} a way to a root again, after {:.1} s",
+                "{} on {} {has} a route to a root again, after {:.1} s",
                 check::names(&cells),
                 self.name,
                 longest.seconds()
@@ -281,7 +281,7 @@ mod tests {
         Network::of(&Skin::parse("skin.toml", &text).unwrap(), 0).unwrap()
     }
 
-    /// Cells that say who their parents are and how deep they are; one that says nothing is dead.
+    /// Cells that report their parents and depths; one that reports nothing is dead.
     fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
         let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
@@ -327,13 +327,13 @@ mod tests {
         let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
         assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
         assert_eq!(network.deepest(), 2);
-        // Who has not answered is told alone, and not at once.
+        // A cell that has not answered is notified alone, and not at once.
         assert_eq!(network.look(now, &view(&deep, words)), Look::default());
         let look = network.look(at(2), &view(&deep, words));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         let new = Some(network.words());
         assert_eq!(network.look(at(3), &view(&deep, new)), Look::default());
-        // A cell that started anew has forgotten it.
+        // A restarted cell has lost it.
         let look = network.look(at(4), &view(&deep, None));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         // 4 slots of 5 ms are more than 16 ms.
@@ -344,12 +344,12 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_is_told_to_the_end_that_is_to_hear_nothing_until_it_says_so_and_again_after_a_start() {
+    fn a_link_down_is_sent_to_its_receiving_end_until_confirmed_and_after_a_restart() {
         let mut network = network();
         let trees = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&trees, None)).unwrap();
         let words = Some(network.words());
-        let cell = |number| CellId::new(number).unwrap();
+        let cell = |node| CellId::new(node).unwrap();
         let mut now = Micros(0);
         let mut look = |network: &mut Network, deaf| {
             now = now + AGAIN;
@@ -377,11 +377,11 @@ mod tests {
         network.set_link_down(false, cell(3), cell(2));
         assert_eq!(look(&mut network, 0b11), [(2, 0b01)]);
         assert_eq!(look(&mut network, 0b01), []);
-        assert_eq!(look(&mut network, 0), [(2, 0b01)], "it started anew");
+        assert_eq!(look(&mut network, 0), [(2, 0b01)], "it restarted");
     }
 
     #[test]
-    fn who_is_unreachable_is_named_once_and_again_when_it_has_one() {
+    fn an_unreachable_cell_is_reported_once_and_when_it_has_a_route_again() {
         let mut network = network();
         let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&whole, None)).unwrap();
@@ -397,15 +397,18 @@ mod tests {
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(
             look(&mut network, &link_down),
-            ["cells 2, 3 on vcan0 have no way to a root: no sum holds them since 0.4 s"]
+            ["cells 2, 3 on vcan0 are unreachable: no route to a root, in no sum for 0.4 s"]
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(network.unreachable().collect::<Vec<_>>(), [2, 3]);
-        // One dies, which somebody else says; the other is there again.
-        let segment = [Some((Some(0), 0)), None, Some((Some(1), 1))];
-        assert_eq!(look(&mut network, &segment), ["cell 3 on vcan0 has a way to a root again, after 0.8 s"]);
+        // One dies, which is reported elsewhere; the other has a route again.
+        let partial = [Some((Some(0), 0)), None, Some((Some(1), 1))];
+        assert_eq!(
+            look(&mut network, &partial),
+            ["cell 3 on vcan0 has a route to a root again, after 0.8 s"]
+        );
         assert_eq!(network.unreachable().count(), 0);
-        assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a way to a root again, after 1.0 s"]);
+        assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a route to a root again, after 1.0 s"]);
         assert_eq!(network.longest, Span::from_millis(800));
     }
 }

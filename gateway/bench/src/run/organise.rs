@@ -1,5 +1,5 @@
 //! Before the loop begins: cells that answer with sums become a tree, the tree is compared with the description, and
-//! everyone is told when to speak.
+//! all cells get their slots.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -14,11 +14,11 @@ use super::network::Network;
 use super::progress::say;
 use crate::view::View;
 
-/// Differences that stay for so long are there: a hello and a heartbeat come four times a second.
+/// Differences that last so long are real: a hello and a heartbeat come four times a second.
 const SETTLING: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
-    /// Waits until cells that answer with sums are a tree, and tells them when to speak.
+    /// Waits until cells that answer with sums are a tree, and sends them their slots.
     pub(super) fn organise(&mut self) -> Result<(), RunError> {
         self.shared.explore.store(true, Ordering::Relaxed);
         let began = self.now();
@@ -45,14 +45,14 @@ impl Bench<'_> {
         {
             let (name, deepest) = (network.name(), network.deepest());
             let tree_ready = network.tree_ready.unwrap_or_default().seconds();
-            say(&format!("the cells of {name} are a tree, {deepest} wires deep, after {tree_ready:.2} s"));
+            say(&format!("the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"));
         }
         Ok(())
     }
 
-    /// Names what is different from the description.
+    /// Reports differences from the description.
     fn check_networks(&mut self) -> Result<(), RunError> {
-        // Pages of ports come with heartbeats, if they are not asked for.
+        // Pages of ports come with heartbeats, unless they are requested.
         self.say(&Message::Report)?;
         let mut changes = 0;
         self.wait(SETTLING, |bench, timeout| {
@@ -80,26 +80,27 @@ impl Bench<'_> {
         broken.filter(|_| self.options.spawn).map_or(Ok(()), |line| Err(RunError::BrokenTree(line)))
     }
 
-    /// Tells all cells in which slots they speak, and sees that they have heard it.
+    /// Sends all cells their slots, and waits for confirmations.
     fn tell_networks(&mut self) -> Result<(), RunError> {
         self.send_to_networks(|network, now, _| vec![network.announce(now)])?;
-        let mut untold = Vec::new();
+        let mut unconfirmed = Vec::new();
         self.wait(SHOWING, |bench, timeout| {
-            untold.clear();
+            unconfirmed.clear();
             for (network, view) in bench.networks() {
-                untold
-                    .extend(network.untold(&view).iter().map(|cell| format!("{cell} on {}", network.name())));
+                unconfirmed.extend(
+                    network.unconfirmed(&view).iter().map(|cell| format!("{cell} on {}", network.name())),
+                );
             }
-            let is_last = untold.is_empty() || timeout.is_over(0);
+            let is_last = unconfirmed.is_empty() || timeout.is_over(0);
             if !is_last {
                 bench.send_to_networks(Network::tell_again)?;
             }
             Ok(is_last)
         })?;
-        if untold.is_empty() {
+        if unconfirmed.is_empty() {
             return Ok(());
         }
-        let error = RunError::NoSums(untold.join(", "));
+        let error = RunError::NoSums(unconfirmed.join(", "));
         if self.options.spawn {
             return Err(error);
         }
@@ -107,7 +108,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Looks at each network with what its receiver shows, and sends what that comes to.
+    /// Checks each network with its receiver's view, and sends the resulting messages.
     fn send_to_networks(
         &mut self,
         mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,
@@ -125,7 +126,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Looks at all networks while the loop runs: what people are to know.
+    /// Checks all networks while the loop runs: messages for the user.
     pub(super) fn watch_networks(&mut self) -> Result<Vec<String>, RunError> {
         let mut notes = Vec::new();
         self.send_to_networks(|network, now, view| {

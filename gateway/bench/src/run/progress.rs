@@ -1,4 +1,4 @@
-//! One line that says how a run goes: rewritten in place on a terminal, as wide as that is, now and then elsewhere.
+//! The progress line of a run: rewritten in place on a terminal, as wide as that is, printed periodically elsewhere.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -9,9 +9,9 @@ use protocol::stop::Stoppable;
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
-/// Writes a line on standard error in one piece, for the cells write there too.
+/// Writes a line on standard error in one piece, as the cells write there too.
 pub fn say(line: &str) {
-    // Whoever closed it needs no progress.
+    // If it is closed, progress is not needed.
     let _ = Stoppable::new(std::io::stderr()).write_all(format!("{line}\n").as_bytes());
 }
 
@@ -73,7 +73,7 @@ impl Progress {
         }
     }
 
-    /// Takes the line away.
+    /// Removes the line.
     pub fn clear(&self) {
         self.bar.finish_and_clear();
     }

@@ -1,5 +1,5 @@
-//! The clock of the control loop: absolute deadlines, and what the machine allows a thread that keeps
-//! them.
+//! The clock of the control loop: absolute deadlines, and the privileges that the machine grants its
+//! thread.
 
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -38,7 +38,7 @@ pub struct Granted {
 pub fn prepare() -> Granted {
     let granted = Granted {
         fifo: io::set_fifo(PRIORITY),
-        // Only what is touched is locked, or every thread's whole stack would count.
+        // Only touched pages are locked, or every thread's whole stack would count.
         locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
     };
     io::set_timer_slack(1);
@@ -64,7 +64,7 @@ pub fn wall() -> u64 {
     u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Sleeps until the monotonic clock reads `deadline` ns; a signal wakes nobody early.
+/// Sleeps until the monotonic clock reads `deadline` ns; a signal does not end it early.
 pub(crate) fn sleep_until(deadline: u64) {
     let seconds = i64::try_from(deadline / 1_000_000_000).unwrap_or(i64::MAX);
     let nanos = i64::try_from(deadline % 1_000_000_000).unwrap_or(0);
@@ -82,7 +82,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
         for _ in 0..IDLE_WAKEUPS {
             deadline += period_ns;
             sleep_until(deadline);
-            // It grows by itself; it cannot refuse.
+            // It resizes itself, so recording cannot fail.
             let _ = histogram.record(now().saturating_sub(deadline));
         }
         histogram
@@ -90,7 +90,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
     thread::spawn(measure).join().unwrap_or_else(|_| histogram())
 }
 
-/// Runs ticks until there were `ticks` of them or someone says stop. Whole periods that were missed are
+/// Runs ticks until there were `ticks` of them or it is stopped. Whole periods that were missed are
 /// skipped; the phase is never reset.
 pub fn run(
     turn: &mut Turn,

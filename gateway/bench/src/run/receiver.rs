@@ -20,14 +20,14 @@ use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
 use model::table::{Notice, Snapshot, Table};
 
-/// How often time is let pass when nothing comes, and the view is renewed.
+/// How often timeouts are checked if nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(50);
 /// From one try to open a bus that is gone to the next.
 const REOPEN: Duration = Duration::from_millis(100);
 
-/// What a receiver tells the main thread at once.
+/// What a receiver reports to the main thread at once.
 #[derive(Debug)]
 pub enum BusEvent {
     /// Of a cell, or another gateway.
@@ -36,7 +36,7 @@ pub enum BusEvent {
     Down(BusError),
     /// It works again.
     Up,
-    /// The bus is gone: it has to be opened anew, which its receiver tries.
+    /// The bus is gone: it has to be reopened, which its receiver tries.
     Lost(BusError),
     /// It is there and cannot be opened.
     Refused(BusError),
@@ -45,11 +45,11 @@ pub enum BusEvent {
 /// One bus, as its receiver sees it.
 #[derive(Debug)]
 pub struct Receiver {
-    /// Where this bus stands among the skin's.
+    /// The index of this bus in the skin.
     pub index: usize,
     /// The bus.
     pub receive_end: ReceiveEnd,
-    /// So long frames are left to gather, so that one wake-up takes many: a tick, as nobody looks more often.
+    /// How long frames gather, so that one wake-up takes many: a tick, as the loop reads no more often.
     pub gather: Duration,
     /// What is known of it.
     pub table: Table,
@@ -59,22 +59,22 @@ pub struct Receiver {
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
     pub positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
-    /// Where everything goes that is to be recorded, if it is.
+    /// Where everything to be recorded goes, if it is recorded.
     pub outlet: Option<Outlet>,
-    /// What everyone looks at.
+    /// What all threads share.
     pub shared: Arc<Shared>,
     /// What the main thread sees.
     pub view: Arc<Mutex<View>>,
-    /// What it is told at once.
+    /// What is reported to it at once.
     pub bus_event: Sender<(usize, BusEvent)>,
 }
 
-/// What a receiver leaves at the end.
+/// The result of a receiver.
 #[derive(Debug)]
 pub struct ReceiverResult {
     /// All that is known of the bus.
     pub table: Table,
-    /// Frames that the bus dropped because we did not take them in time.
+    /// Frames that the bus dropped because they were not read in time.
     pub dropped: u64,
     /// What did not fit into the recorder's queues.
     pub unrecorded: Unrecorded,
@@ -87,21 +87,21 @@ pub struct ReceiverResult {
 struct Account {
     /// Frames that the bus dropped on sockets before this one.
     dropped_before: u64,
-    /// What this socket had dropped when it was last told to the recorder.
+    /// What this socket had dropped at the last report to the recorder.
     announced: u32,
-    /// The newest joints whose feelings the recorder has.
+    /// The newest joints whose contact states the recorder has.
     newest: Option<u64>,
     outages: Outages,
     /// Commands that the bus took and did not carry, because it was lost.
     unread: u64,
     /// When a bus that is gone is to be opened again.
     retry: Option<Instant>,
-    /// Why it could not be, for people.
+    /// Why it could not be, as text.
     refused: String,
 }
 
 impl Receiver {
-    /// Receives until someone says stop. A bus that is lost is waited for, and opened again when it is gone.
+    /// Receives until it is stopped. A lost bus is waited for, and reopened if it is gone.
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         super::realtime::prepare_receiver();
@@ -172,14 +172,14 @@ impl Receiver {
             return self.table.interrupt();
         }
         std::thread::sleep(DOWN);
-        // What stood on it before is no sign that it works again.
+        // Frames from before are no sign that it works again.
         loop {
             match self.receive_end.bus.receive(inbox) {
                 Ok(1..) => {
                     self.hear(inbox);
                     self.record(inbox, account);
                 }
-                // An interface goes down before it is removed, and each is said once.
+                // An interface goes down before it is removed, and each is reported once.
                 Err(error) if !error.may_pass() => return self.lose(inbox, account, error),
                 Ok(0) | Err(_) => break,
             }
@@ -188,7 +188,7 @@ impl Receiver {
         self.table.interrupt();
     }
 
-    /// Tries to open a bus that is gone, when it is time; time passes for the cells all the same.
+    /// Tries to open a bus that is gone, when it is time; the cells' timeouts run all the same.
     fn retry(&mut self, inbox: &mut Inbox, account: &mut Account, retry: Instant) {
         let now = Instant::now();
         if now < retry {
@@ -234,7 +234,7 @@ impl Receiver {
         }
     }
 
-    /// Hands on what is no frame: what the bus dropped, and once an epoch what cells feel.
+    /// Hands on what is no frame: what the bus dropped, and once an epoch the contact states.
     fn record(&mut self, inbox: &Inbox, account: &mut Account) {
         let Some(outlet) = &mut self.outlet else { return };
         let more = inbox.dropped().wrapping_sub(account.announced);
@@ -255,7 +255,7 @@ impl Receiver {
         self.snapshots.publish();
     }
 
-    /// Lets time pass, and shows the main thread how things are.
+    /// Checks timeouts, and renews the main thread's view.
     fn look(&mut self, account: &mut Account) {
         let now = Micros(wall() / 1_000);
         self.table.handle_time(now);
@@ -278,7 +278,7 @@ impl Receiver {
     }
 
     fn tell(&self, bus_event: BusEvent) {
-        // Nobody listens any more when the run ends.
+        // At the end of the run there is no receiver any more.
         let _ = self.bus_event.send((self.index, bus_event));
     }
 }
@@ -295,7 +295,7 @@ const fn is_absent(error: &BusError) -> bool {
     )
 }
 
-/// Says what did not fit; the recorder makes room as long as a receiver is there.
+/// Reports what did not fit; the recorder makes room as long as a receiver runs.
 fn last_words(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
     while !outlet.tell(wall()) && Instant::now() < give_up {

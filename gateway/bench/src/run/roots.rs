@@ -13,19 +13,19 @@ use protocol::wire::{FLAG, LinkId};
 
 use model::network::Uplinks;
 
-/// The wires of a bus' roots, and what is said over them.
+/// The wires of a bus' roots, and the protocol on them.
 #[derive(Debug)]
 pub struct Roots {
     uplinks: Uplinks,
-    /// Each root, with the lane on which the gateway speaks to it, and whether its sums are for the gateway.
+    /// Each root, with the link on which the gateway sends to it, and whether its sums are for the gateway.
     roots: Vec<(CellId, LinkId, bool)>,
     began: Instant,
-    /// Whether the gateway speaks: where it begins before its cells are all there, the first ones make a tree
-    /// that is deeper than it has to be.
+    /// Whether the gateway sends: if it begins before all its cells are there, the first ones make a tree that
+    /// is deeper than necessary.
     explores: bool,
 }
 
-/// A bus' roots and the lanes on which the gateway speaks to them; none where cells answer with their own torques.
+/// A bus' roots and the links on which the gateway sends to them; none if cells answer with their own torques.
 fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
     if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
@@ -41,8 +41,8 @@ pub struct ReceiveFilter {
 }
 
 impl ReceiveFilter {
-    /// Everything, but of simulated wires only those that lead to the gateway; and unless `everything` is wanted, of
-    /// sums only those of roots.
+    /// Everything, but of simulated wires only those that lead to the gateway; and unless `everything`, of sums only
+    /// those of roots.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize, everything: bool) -> Self {
         let roots = roots(skin, bus);
@@ -57,7 +57,7 @@ impl ReceiveFilter {
             let roots = roots.iter().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(*root))));
             kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
         };
-        // Identifiers of 29 bits that are no wire's are nobody's here, and are to be seen.
+        // Identifiers of 29 bits that are no wire's are foreign, and pass so that they are counted.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
         let wires = roots.iter().map(|(_, link_id)| Filter::link_id(link_id.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
@@ -74,7 +74,7 @@ impl Roots {
     pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
         let roots: Vec<_> =
             roots(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
-        // Whoever was there before counted its walks too, and nobody knows how far; process ids are often neighbours.
+        // An earlier gateway counted its walks too, to an unknown count; process ids are often neighbours.
         let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
         (!roots.is_empty()).then(|| Self {
             uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
@@ -84,12 +84,12 @@ impl Roots {
         })
     }
 
-    /// What of the wires has to pass to hear the roots.
+    /// The wire frames that have to pass to receive the roots.
     pub fn filters(&self) -> impl Iterator<Item = Filter> {
         self.roots.iter().map(|(_, link_id, _)| Filter::link_id(link_id.reversed()))
     }
 
-    /// The gateway speaks from now on.
+    /// The gateway sends from now on.
     pub const fn explore(&mut self) {
         self.explores = true;
     }
@@ -107,7 +107,7 @@ impl Roots {
         since(self.began)
     }
 
-    /// Takes a frame that came from the bus; whether it was one of a wire, which nobody else is to see.
+    /// Takes a frame that came from the bus; whether it was one of a wire, which is handled here alone.
     pub fn take(&mut self, frame: &Frame) -> bool {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
@@ -127,7 +127,7 @@ impl Roots {
         true
     }
 
-    /// Says what there is to say.
+    /// Sends what is due.
     pub fn speak(&mut self, bus: &Bus) {
         if !self.explores {
             return;
@@ -136,13 +136,13 @@ impl Roots {
         self.uplinks.handle_time(now);
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if let Some((_, link_id, _)) = self.roots.get(root) {
-                // What the bus does not take is asked for again.
+                // What the bus does not take is requested again.
                 let _ = bus.offer(&[link_id.frame(message)]);
             }
         }
     }
 
-    /// How long nothing has to be said, if nothing comes.
+    /// How long nothing has to be sent, if nothing comes.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         if !self.explores {
@@ -214,12 +214,12 @@ mod tests {
     }
 
     #[test]
-    fn a_roots_question_is_answered_and_other_wires_are_kept_from_the_table() {
+    fn a_roots_request_is_answered_and_wire_frames_are_kept_from_the_table() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         let mut roots = Roots::of(&skin, 0).unwrap();
         let leave = LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
         assert!(roots.take(&leave));
-        assert_eq!(roots.uplinks.poll_transmit(), None, "it does not speak yet");
+        assert_eq!(roots.uplinks.poll_transmit(), None, "it does not send yet");
         roots.explore();
         assert!(roots.take(&LinkId { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
         assert_eq!(roots.uplinks.poll_transmit(), None);

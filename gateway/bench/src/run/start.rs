@@ -12,7 +12,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::skin::{self, Reply};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
-use super::bench::{Bench, LinkId};
+use super::bench::{Bench, BusLink};
 use super::launch::{Processes, ServedBus, allow_files, open_or_serve, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
@@ -39,7 +39,7 @@ use trace::recording::series::Head;
 const SEND_TIMEOUT: Duration = Duration::from_millis(10);
 /// Frames gather for a tick, and no longer than this.
 const GATHER: Duration = Duration::from_millis(10);
-/// Said when a receive buffer is smaller than it should be.
+/// Reported when a receive buffer is smaller than it should be.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
@@ -48,7 +48,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     refuse(options)?;
     let skin = &options.skin;
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
-    // A file that may have no more bytes is an error like others, and no end.
+    // A file at its size limit is an error like others, not a signal.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
     let outputs = Outputs::claim(&options.record, &signalled, say).map_err(|refused| {
@@ -58,7 +58,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     if let Some(log) = outputs.log().filter(|_| numbered && !options.quiet) {
         say(&format!("frames are recorded in {}", log.display()));
     }
-    // An external controller can find its socket from now on, so that it is there when the loop begins.
+    // From now on an external controller can connect, so that it is ready when the loop begins.
     let controller = controller_of(skin, &options.scenario.motion)?;
     let arm = SimulatedArm::new(skin, options.scenario.motion.start_rad);
     let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
@@ -100,7 +100,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     })
 }
 
-/// What a description may say and this program cannot do, and what it needs and is not there.
+/// Checks for what a description allows and this program cannot do, and for what is missing.
 fn refuse(options: &Options) -> Result<(), RunError> {
     if options.spawn {
         program("cell-node", options.cell_node.as_deref())?;
@@ -117,7 +117,7 @@ fn refuse(options: &Options) -> Result<(), RunError> {
     Ok(allow_files(buses, clients.max().unwrap_or(0))?)
 }
 
-/// Opens a bus; an embedded one that nobody serves is served.
+/// Opens a bus; an embedded one without a server is served.
 fn open(
     options: &Options,
     described: &skin::Bus,
@@ -152,8 +152,8 @@ fn open(
 fn record(
     options: &Options,
     outputs: Outputs,
-    bus_links_of_feed: Vec<feed::LinkId>,
-    bus_links: &[LinkId],
+    bus_feeds: Vec<feed::BusFeed>,
+    bus_links: &[BusLink],
     idle: &Histogram<u64>,
 ) -> Result<(Option<Recorder>, Option<rtrb::Producer<Timed>>), RunError> {
     if outputs.is_empty() {
@@ -162,19 +162,19 @@ fn record(
     let (recorded, ticks) = outputs.wants_all().then(|| rtrb::RingBuffer::new(feed::TICKS)).unzip();
     let head =
         options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
-    let feed = Feed { bus_feeds: bus_links_of_feed, ticks };
+    let feed = Feed { bus_feeds, ticks };
     Ok((Some(outputs.start(feed, Layout::new(&options.skin), head)?), recorded))
 }
 
 /// What each file of a recording begins with.
-fn head(options: &Options, mcap: &Mcap, bus_links: &[LinkId], idle: &Histogram<u64>) -> Head {
+fn head(options: &Options, mcap: &Mcap, bus_links: &[BusLink], idle: &Histogram<u64>) -> Head {
     let nanos = realtime::wall();
     let mut run = vec![
         ("duration_s".to_owned(), options.scenario.duration.seconds().to_string()),
         ("spawn".to_owned(), options.spawn.to_string()),
         ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
     ];
-    run.extend(bus_links.iter().map(|LinkId { link, format, .. }| {
+    run.extend(bus_links.iter().map(|BusLink { link, format, .. }| {
         let format = format.name();
         let how = format!("{}, {format}, receive buffer {} bytes", link.kind, link.receive_buffer);
         (format!("bus/{}", link.name), how)
@@ -197,7 +197,7 @@ fn listen(
     outlet: Option<Outlet>,
     shared: &Arc<Shared>,
     bus_event: mpsc::Sender<(usize, BusEvent)>,
-) -> Result<LinkId, RunError> {
+) -> Result<BusLink, RunError> {
     let skin = &options.skin;
     let (link, shared) = (Arc::clone(&receive_end.link), Arc::clone(shared));
     let mut table = Table::new(skin, index);
@@ -223,5 +223,5 @@ fn listen(
     };
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::of(skin, index);
-    Ok(LinkId { link, format, line: Some((line, slot)), view, receiver, network, shared })
+    Ok(BusLink { link, format, line: Some((line, slot)), view, receiver, network, shared })
 }

@@ -1,5 +1,5 @@
-//! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, news and
-//! progress for people, frames into the log.
+//! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, events and
+//! progress for the user, frames into the log.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -30,7 +30,7 @@ use control::cycle::turn::{Timed, Turn};
 use model::scenario::{FaultKind, Stimulus, Touches};
 use model::table::Notice;
 
-/// Stimuli are sent so many epochs before the one from which they hold; cells let 8 wait.
+/// Stimuli are sent so many epochs before the one at which they are latched; cells queue 8.
 const LEAD: u64 = 5;
 /// The main thread's rhythm.
 pub(super) const LOOK: Duration = Duration::from_millis(10);
@@ -91,7 +91,7 @@ impl Bench<'_> {
         summary.processor = Spent::by(&self.processes, &self.served).since(&before, summary.duration_s);
         summary.cell_private_kib = self.processes.pids().filter_map(super::usage::private_kib).max();
         if failure.is_some() || ended.is_err() {
-            // Nobody commands the cells any more.
+            // The cells get no more commands.
             let _ = self.say(&Message::Halt);
         }
         let (granted, controller) = ended.map_err(|_| RunError::Panicked("control loop"))?;
@@ -123,7 +123,7 @@ impl Bench<'_> {
         })
     }
 
-    /// One look around.
+    /// One poll of everything.
     fn step(
         &mut self,
         script: &mut Script,
@@ -137,7 +137,7 @@ impl Bench<'_> {
             .iter()
             .any(|bus_link| bus_link.receiver.as_ref().is_some_and(JoinHandle::is_finished))
         {
-            // One that loses its bus stays; one that has gone without a word must not be missed.
+            // A receiver that loses its bus stays; one that ended without a message must be noticed.
             return Err(RunError::ReceiverEnded);
         }
         self.inject_faults(script, progress)?;
@@ -151,7 +151,7 @@ impl Bench<'_> {
         measured.take(records, self.began);
         match (was_halted, measured.halts.why()) {
             (false, Some(why)) => {
-                // One bus is enough: what is heard on it is said on the others.
+                // One bus is enough: what is received on it is repeated on the others.
                 let bus_link = self
                     .bus_links
                     .iter()
@@ -160,7 +160,7 @@ impl Bench<'_> {
                 let (bus, kind) = bus_link.map_or(("BUS", BusKind::SocketCan), |bus_link| {
                     (bus_link.link.name.as_str(), bus_link.link.kind)
                 });
-                let hint = format!("`gateway ack {bus} --bus-kind {kind}` lets it go on");
+                let hint = format!("`gateway ack {bus} --bus-kind {kind}` resumes it");
                 progress.note(&format!("the robot is halted: {why}; {hint}"));
             }
             (true, None) => progress.note("the robot goes on"),
@@ -183,7 +183,7 @@ impl Bench<'_> {
     fn press(&self, script: &mut Script) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
         while script.epoch < broadcasts + LEAD {
-            // Epochs that have passed while this thread was away cannot be made good one by one.
+            // Epochs that have passed while this thread was delayed cannot be made up for one by one.
             let epoch = script.epoch.max(broadcasts);
             let from = From::Epoch(self.first_epoch.plus(epoch.to_le_bytes()[0]));
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
@@ -194,7 +194,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Tells some cells again what the scenario makes them feel; what others feel is not its business.
+    /// Resends to some cells the stimuli of the scenario; stimuli of others are not its business.
     fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
@@ -208,12 +208,12 @@ impl Bench<'_> {
     fn stimulate(&self, stimulus: &Stimulus, from: From) -> Result<(), RunError> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
-        // What the cells feel is what the bus carried.
+        // The cells' contact state follows what the bus carried.
         self.bus_links.get(stimulus.bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
         Ok(())
     }
 
-    /// Does to processes what the scenario says, when it is time.
+    /// Injects the scenario's faults into processes at their times.
     fn inject_faults(&mut self, script: &mut Script, progress: &Progress) -> Result<(), RunError> {
         let options = self.options;
         while let Some(fault) = options.scenario.faults.get(script.fault) {
@@ -222,7 +222,7 @@ impl Bench<'_> {
             }
             script.fault += 1;
             if let FaultKind::Wire { link_down, from, to, both_ways } = fault.kind {
-                self.break_wire(link_down, (from, to), both_ways, progress);
+                self.switch_link(link_down, (from, to), both_ways, progress);
             }
             let FaultKind::Process { action, cells } = &fault.kind else { continue };
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
@@ -235,8 +235,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Cuts the wires between two cells, or mends them; the next look at their network tells them.
-    fn break_wire(
+    /// Takes the links between two cells down, or up again; the next check of their network sends it.
+    fn switch_link(
         &mut self,
         link_down: bool,
         (from, to): (usize, usize),
@@ -251,13 +251,13 @@ impl Bench<'_> {
         if both_ways {
             network.set_link_down(link_down, to.node, from.node);
         }
-        let what = if link_down { "Cut" } else { "Mend" };
-        let way = if both_ways { "between" } else { "one way, from" };
+        let what = if link_down { "link down" } else { "link up" };
+        let (begin, end) = if both_ways { ("between", "and") } else { ("from", "to") };
         let (from, to, bus) = (from.node, to.node, network.name());
-        progress.note(&format!("scenario: {what} the wires {way} cell {from} and cell {to} on {bus}"));
+        progress.note(&format!("scenario: {what} {begin} cell {from} {end} cell {to} on {bus}"));
     }
 
-    /// What the receivers and the processes have to say.
+    /// Handles the events of receivers and processes.
     fn hear(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let bus_event: Vec<_> = self.bus_event.try_iter().collect();
         let mut returned = BTreeSet::new();
@@ -269,11 +269,11 @@ impl Bench<'_> {
                     changed.entry((bus, "fallen silent")).or_default().push(cell)
                 }
                 BusEvent::Notice(Notice::Back(cell)) => {
-                    changed.entry((bus, "spoken again")).or_default().push(cell)
+                    changed.entry((bus, "come back")).or_default().push(cell)
                 }
                 BusEvent::Notice(Notice::Restarted(cell)) => {
-                    progress.note(&format!("cell {cell} on {} started anew", self.name(bus)));
-                    // It has forgotten what it felt.
+                    progress.note(&format!("cell {cell} on {} restarted", self.name(bus)));
+                    // It has lost its contact state.
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 BusEvent::Notice(Notice::Returned(cell)) => {
@@ -281,7 +281,7 @@ impl Bench<'_> {
                 }
                 BusEvent::Notice(Notice::Duplicate(cell)) => {
                     progress.note(&format!(
-                        "cell {cell} on {} hears another cell under its number: stop one of the two",
+                        "cell {cell} on {} shares its node id with another cell: stop one of the two",
                         self.name(bus)
                     ));
                 }
@@ -289,7 +289,7 @@ impl Bench<'_> {
                 BusEvent::Up => {
                     progress.note(&format!("{} works again", self.name(bus)));
                 }
-                // Who has no bus left feels nothing.
+                // Without any bus there is no torque.
                 BusEvent::Lost(why) if self.bus_links.iter().all(|bus_link| bus_link.link.is_gone()) => {
                     return Err(RunError::Lost(why));
                 }
@@ -303,7 +303,7 @@ impl Bench<'_> {
             }
         }
         if !returned.is_empty() {
-            // What was to change while they were away did not come to them.
+            // Changes during their absence have not reached them.
             self.remind(script, |it| returned.contains(&(it.bus, it.node)))?;
             for bus_link in returned.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
                 bus_link.link.state.returned.store(true, Ordering::Relaxed);

@@ -13,7 +13,7 @@ pub enum Outcome {
     Interrupted,
     /// The robot was halted when it ended, also if a signal ended it.
     Halted,
-    /// It did not come to its end, a bus was lost at its end, or its recording is not whole.
+    /// It did not come to its end, a bus was lost at its end, or its recording is incomplete.
     Failed,
 }
 
@@ -43,7 +43,7 @@ pub struct Halted {
     pub until_s: Option<f64>,
 }
 
-/// What a tick before a halt was like.
+/// The record of a tick before a halt.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TickBefore {
     /// Its number.
@@ -78,7 +78,7 @@ pub struct TickBefore {
     pub lost_buses: Vec<String>,
     /// Why the cycle was bad; none: the controller had an answer.
     pub bad_cycle: Option<String>,
-    /// The joint velocities that the robot was told.
+    /// The commanded joint velocities.
     pub command_rad_s: Vec<f64>,
     /// Whether the robot was halted.
     pub halted: bool,

@@ -1,17 +1,17 @@
-//! What of a bus' torque counts in a tick.
+//! The part of a bus' torque that counts in a tick.
 //!
-//! Torques are let go by the broadcasts that a bus carries. On one that carries none nothing would ever be let go, so
-//! the loop itself does it, by the same rule as for a cell that is silent: held for some epochs, then less and less.
+//! The torque of a silent cell decays with the broadcasts that its bus carries. On a bus that carries none it would never
+//! decay, so the loop itself does it, by the same rule: held for some epochs, then decaying to zero.
 
 use protocol::packet::Epoch;
 use protocol::skin::Safety;
 
 use model::table::Sums;
 
-/// One bus, as a tick is told of it.
+/// One bus, as input of a tick.
 #[derive(Clone, Copy, Debug)]
 pub struct Heard<'a> {
-    /// What its table knows.
+    /// The state of its table.
     pub sums: &'a Sums,
     /// Whether it works, as its receiver sees it.
     pub works: bool,
@@ -23,7 +23,7 @@ pub fn bit(bus: usize) -> u32 {
     1 << bus.min(31)
 }
 
-/// How far a bus has carried the broadcasts.
+/// How many of the broadcasts a bus has carried.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Carried {
     /// The last one that was read back.
@@ -36,7 +36,7 @@ impl Carried {
     /// Broadcasts that should have been read back and were not, when `last` is the last one that was, and `epoch` the
     /// newest of `broadcasts`. The newest one may still be on its way.
     pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
-        // Epochs come round again, so they are compared once, when they are new.
+        // Epochs wrap around, so they are compared once, when they are new.
         if let Some(read) = last.filter(|_| last != self.last) {
             self.number = broadcasts.saturating_sub(u64::try_from(epoch.since(read)).unwrap_or(0));
             self.last = last;

@@ -50,7 +50,7 @@ fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     bus.resumes = 1;
     let after = cycle.tick(tick(99), 0, [works(&bus)]);
     assert_eq!((after.record.halted, after.record.bad), (None, Some(BadCycle::NoAnswer)));
-    assert_eq!(after.command, Some(Command::Resume), "the other buses have not heard it");
+    assert_eq!(after.command, Some(Command::Resume), "the other buses have not received it");
     bus.halts = 1;
     let halted = cycle.tick(tick(100), 0, [works(&bus)]);
     assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
@@ -70,7 +70,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
 }
 
-/// Two buses in a loop of eight ticks an epoch; each feels 1 Nm.
+/// Two buses in a loop of eight ticks an epoch; the torque of each is 1 Nm.
 struct Two {
     cycle: Cycle,
     buses: [Sums; 2],
@@ -108,7 +108,7 @@ impl Two {
 }
 
 #[test]
-fn a_lost_bus_is_released_by_the_rule_for_cells_and_the_others_go_on() {
+fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
     let mut two = Two::new(LostBus::GoOn);
     for _ in 0..5 {
         let record = two.epoch([true, true]);
@@ -124,7 +124,10 @@ fn a_lost_bus_is_released_by_the_rule_for_cells_and_the_others_go_on() {
         assert_eq!((record.contributing, record.age), if held { (2, unanswered) } else { (1, 0) });
     }
     assert_eq!(torques[..8], [2.0, 2.0, 2.0, 1.75, 1.5, 1.25, 1.0, 1.0]);
-    assert!(torques[8..].iter().all(|&torque| torque == 1.0), "epochs come round, a lost torque does not");
+    assert!(
+        torques[8..].iter().all(|&torque| torque == 1.0),
+        "epochs wrap around, a lost torque does not return"
+    );
     two.works[1] = true;
     two.epoch([true, true]);
     let back = two.epoch([true, true]);
@@ -132,12 +135,12 @@ fn a_lost_bus_is_released_by_the_rule_for_cells_and_the_others_go_on() {
 }
 
 #[test]
-fn a_bus_that_carries_nothing_is_lost_also_when_nobody_says_so() {
+fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
     let mut two = Two::new(LostBus::GoOn);
     two.epoch([true, true]);
     let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
     assert_eq!(missing[..7], [0; 7]);
-    assert_eq!(missing[7..], [0b10; 293], "also when the same epoch comes round again");
+    assert_eq!(missing[7..], [0b10; 293], "also when epochs wrap around");
 }
 
 #[test]
@@ -165,7 +168,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
 }
 
 #[test]
-fn a_halted_robot_stands_whatever_is_requested() {
+fn a_halted_robot_stands_whatever_is_commanded() {
     let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
     bus.torque = [5.0; WORDS];
     for number in 0..50 {

@@ -1,4 +1,4 @@
-//! What happens in one tick outside the pure cycle: reading what the receivers left, encoding, sending,
+//! What happens in one tick outside the pure cycle: reading the receivers' snapshots, encoding, sending,
 //! and handing a record on. Nothing here allocates, locks, logs or waits.
 
 use std::sync::Arc;
@@ -15,17 +15,17 @@ use model::central::ReferenceTorque;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
-/// While the robot is halted, cells are told again before every so many joints.
+/// While the robot is halted, the halt is resent before every so many joints.
 const HALT_AGAIN: u8 = 8;
 
-/// What all threads of a run look at.
+/// What all threads of a run share.
 #[derive(Debug, Default)]
 pub struct Shared {
     /// Set once: the loop ends.
     pub stop_loop: AtomicBool,
     /// Set once, after the loop's end: the receivers end.
     pub stop: AtomicBool,
-    /// Set once, when all cells are there: the gateway speaks to roots.
+    /// Set once, when all cells are there: the gateway sends to roots.
     pub explore: AtomicBool,
     /// Whether torques are compared with central ones.
     pub comparing: AtomicBool,
@@ -44,7 +44,7 @@ pub struct Shared {
 /// A record and its times.
 #[derive(Clone, Copy, Debug)]
 pub struct Timed {
-    /// What the tick was like.
+    /// The record.
     pub record: Record,
     /// When it should have begun, in ns of the monotonic clock.
     pub due_ns: u64,
@@ -56,14 +56,14 @@ pub struct Timed {
     pub central: Option<(u64, ReferenceTorque)>,
 }
 
-/// How a bus is, for all threads.
+/// The state of a bus, for all threads.
 #[derive(Debug)]
 pub struct BusState {
     /// Whether it works, as its receiver sees it.
     pub works: AtomicBool,
     /// Commands that it took, joints among them.
     pub commands: AtomicU64,
-    /// Set when cells are back on it after it was lost; the loop then says whether the robot is halted.
+    /// Set when cells are back on it after it was lost; the loop then resends whether the robot is halted.
     pub returned: AtomicBool,
 }
 
@@ -86,15 +86,15 @@ impl BusState {
 pub struct Line {
     /// One FD frame a packet, or two classic ones.
     pub format: Format,
-    /// What the receiver left.
+    /// The receiver's snapshot.
     pub snapshot: triple_buffer::Output<Snapshot>,
     /// Positions in rad of each broadcast, for the receiver to compare with.
     pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
-    /// How it is.
+    /// Its state.
     pub state: Arc<BusState>,
 }
 
-/// The control loop between two looks at the clock.
+/// The control loop between two readings of the clock.
 #[derive(Debug)]
 pub struct Turn {
     cycle: Cycle,
@@ -104,7 +104,7 @@ pub struct Turn {
     records: rtrb::Producer<Timed>,
     /// The same for the recorder, if there is one.
     recorded: Option<rtrb::Producer<Timed>>,
-    /// The halt or resume that each bus has not taken yet: its cells would else not be as the robot is.
+    /// The halt or resume that each bus has not taken yet: its cells have to follow the robot's state.
     owed: Vec<Option<Message>>,
     /// Whether each bus worked in the tick before.
     worked: Vec<bool>,
@@ -131,14 +131,14 @@ impl Turn {
         self
     }
 
-    /// What the controller has counted, by name.
+    /// The controller's counters, by name.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.cycle.counts()
     }
 
     /// One tick. `now` is a monotonic clock in ns, `due` when the tick should have begun by it; `send`
-    /// puts frames on the bus of an index and says whether it took them.
+    /// puts frames on the bus of an index and returns whether it took them.
     pub fn turn(
         &mut self,
         tick: Tick,
@@ -162,12 +162,12 @@ impl Turn {
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
             let reference_torque = self.cycle.central(snapshots());
-            // Nobody else needs the result, and without anybody the compiler could leave out the work.
+            // The result may be unused, and then the compiler could leave out the work.
             (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
         self.owe_to_returned_buses(outcome.record.halted.is_some());
         if let Some((epoch, joints)) = outcome.joints {
-            // A cell that started anew, or did not hear it, would go on answering.
+            // A cell that restarted, or did not receive it, would go on answering.
             if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
                 self.owed.fill(Some(Message::Halt));
             }
@@ -202,8 +202,8 @@ impl Turn {
         }
     }
 
-    /// What a bus took just before it was lost, or before its cells were back on it, they have not heard: once it works
-    /// and once more when they are heard they are told to be as the robot is.
+    /// Cells have not received what a bus took just before it was lost, or before they were back on it: the halt or resume
+    /// is resent once it works, and once more when they send again.
     fn owe_to_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
             let works = line.state.is_there();
@@ -215,7 +215,7 @@ impl Turn {
         }
     }
 
-    /// Tells every bus to halt or to resume; one that does not take it is told before each of its next joints.
+    /// Sends a halt or resume on every bus; if one does not take it, it is retried before each of its next joints.
     fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         self.owed.fill(Some(message));
         self.say_what_is_owed(send);

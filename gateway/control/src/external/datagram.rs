@@ -25,10 +25,10 @@ pub(super) const STATE_BYTES: usize = 184;
 /// Bytes of an answer, the longest that the gateway takes.
 pub(super) const ANSWER_BYTES: usize = 72;
 
-/// What the gateway says in every tick.
+/// What the gateway sends in every tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct State {
-    /// What every controller is told.
+    /// The input of every controller.
     pub input: Input,
     /// Joints of the robot.
     pub joints: u32,
@@ -39,11 +39,11 @@ pub struct State {
 pub struct Answer {
     /// The tick that it answers.
     pub tick: u64,
-    /// What it wants.
+    /// Its command.
     pub command: Command,
 }
 
-/// What the robot shall do until the next tick.
+/// The robot's command until the next tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Command {
     /// 1: joint velocities in rad/s.
@@ -69,7 +69,7 @@ pub enum Nonsense {
     /// It does not begin with `SKBC`.
     #[error("wrong magic")]
     Magic,
-    /// A version that this program does not speak.
+    /// A version that this program does not support.
     #[error("wrong version")]
     Version,
     /// A kind that the gateway does not take.

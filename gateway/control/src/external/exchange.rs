@@ -1,4 +1,4 @@
-//! Who owes an answer, and what a tick makes of what came: no socket, no clock.
+//! The pending answer, and a tick's handling of received datagrams: no socket, no clock.
 
 use super::datagram::{Command, Heard, Nonsense};
 use crate::controller::{BadCycle, Input, Pace, Step};
@@ -12,17 +12,17 @@ pub(super) struct Counts {
     pub(super) answers: u64,
     /// Ticks that the peer left without an answer.
     pub(super) missing: u64,
-    /// Answers to a tick whose time was over.
+    /// Answers to a tick that had ended.
     pub(super) late: u64,
     /// Second answers to the same tick.
     pub(super) repeated: u64,
     /// Datagrams of others than the peer.
-    pub(super) unknown_nodes: u64,
+    pub(super) other_senders: u64,
     /// States that did not fit into the peer's queue.
     pub(super) unsent: u64,
-    /// Peers that went away.
+    /// Peers that ended.
     pub(super) gone: u64,
-    /// Datagrams that could not be received, and hellos that nobody can answer.
+    /// Datagrams that could not be received, and hellos of unnamed senders.
     pub(super) failed: u64,
     /// The peer's nonsense, in the order of [`Nonsense::ALL`].
     pub(super) nonsense: [u64; Nonsense::ALL.len()],
@@ -37,7 +37,7 @@ impl Counts {
             ("missing", self.missing),
             ("late", self.late),
             ("repeated", self.repeated),
-            ("strangers", self.unknown_nodes),
+            ("other senders", self.other_senders),
             ("unsent", self.unsent),
             ("gone", self.gone),
             ("failed", self.failed),
@@ -56,14 +56,14 @@ impl Counts {
     }
 }
 
-/// Who sent a datagram.
+/// The sender of a datagram.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sender {
     Peer,
-    UnknownSender,
+    Other,
 }
 
-/// What became of a state.
+/// The result of sending a state.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sent {
     Taken,
@@ -88,15 +88,15 @@ impl Exchange {
         let answer = match (Heard::decode(bytes), sender) {
             (Ok(Heard::Hello), _) => {
                 let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
-                // A peer that says hello again keeps what it owes.
-                if sender == Sender::UnknownSender || !self.connected {
+                // A second hello of the peer leaves its pending answer.
+                if sender == Sender::Other || !self.connected {
                     *self = Self::default();
                 }
                 (self.connected, self.counts) = (true, counts);
                 return true;
             }
-            (_, Sender::UnknownSender) => {
-                self.counts.unknown_nodes += 1;
+            (_, Sender::Other) => {
+                self.counts.other_senders += 1;
                 return false;
             }
             (Err(why), Sender::Peer) => {
@@ -123,7 +123,7 @@ impl Exchange {
         false
     }
 
-    /// What the tick does, when all that came has been taken in.
+    /// The command of the tick, when all datagrams have been taken in.
     pub(super) fn step(&mut self, input: &Input, pace: &Pace) -> Step {
         let (due, answer) = (self.due.take(), self.answer.take());
         let nonsense = core::mem::take(&mut self.nonsense);
@@ -141,7 +141,7 @@ impl Exchange {
         }
     }
 
-    /// Takes in what became of this tick's state.
+    /// Takes in the result of sending this tick's state.
     pub(super) fn sent(&mut self, tick: u64, sent: Sent) {
         match sent {
             Sent::Taken => self.due = Some(tick),

@@ -1,13 +1,13 @@
-//! `kind = "external"`: somebody else's program closes the loop, behind a Unix datagram socket.
+//! `kind = "external"`: another program closes the loop, behind a Unix datagram socket.
 //!
 //! ```text
 //!   tick n     ── state n ──>                      one datagram a tick from the gateway,
-//!              <── answer n ──   before tick n+1   one back; what it asks for is done in tick n+1
+//!              <── answer n ──   before tick n+1   one back; its command is executed in tick n+1
 //! ```
 //!
 //! The answer to the last tick must be there when the next one begins, else the cycle is bad. The other
-//! program says hello first; who said it last is the peer, and only the peer is listened to. Nothing
-//! that anybody sends can stop a tick: it is counted, by reason. The bytes are in
+//! program sends a hello first; the sender of the last hello is the peer, and only its answers count. No
+//! datagram can stop a tick: others are counted, by reason. The bytes are in
 //! `docs/reference/external-controller.md`.
 
 mod datagram;

@@ -1,4 +1,4 @@
-//! The socket: receives, sends, and decides nothing.
+//! The socket: receives and sends, without any logic.
 
 use std::io::{self, ErrorKind};
 use std::os::linux::net::SocketAddrExt;
@@ -13,7 +13,7 @@ use super::datagram::{ANSWER_BYTES, State};
 use super::exchange::{Exchange, Sender, Sent};
 use crate::controller::{Controller, Input, Pace, Step};
 
-/// Datagrams taken in one tick: what is more waits, so that nobody can hold the tick up.
+/// Datagrams taken in one tick: the rest waits, so that no sender can delay the tick.
 const PER_TICK: usize = 16;
 
 /// A controller in another program.
@@ -33,7 +33,7 @@ pub struct External {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// Somebody listens there.
+    /// Another program listens there.
     #[error("{}: another program listens on this socket; end it, or name another path", path.display())]
     Live {
         /// The socket's path.
@@ -56,10 +56,10 @@ pub enum SocketError {
 }
 
 impl External {
-    /// Listens at a path, and replaces the file of a socket on which nobody listens any more.
+    /// Listens at a path, and replaces the file of a socket without a listener.
     ///
     /// # Errors
-    /// When somebody listens there already, something else has that name, or the system refuses.
+    /// When another program listens there, something else has that name, or the system refuses.
     pub fn listen(path: &Path, skin: &Skin) -> Result<Self, SocketError> {
         Ok(Self {
             socket: bind(path)?,
@@ -89,7 +89,7 @@ impl External {
                 continue;
             }
             let known = self.peer.as_ref().is_some_and(|peer| same(peer, &from));
-            let sender = if known { Sender::Peer } else { Sender::UnknownSender };
+            let sender = if known { Sender::Peer } else { Sender::Other };
             if self.exchange.handle(bytes.get(..length).unwrap_or(&bytes), sender) {
                 self.peer = Some(from);
             }
@@ -127,7 +127,7 @@ impl Controller for External {
 impl Drop for External {
     fn drop(&mut self) {
         if self.file.is_some() && file(&self.path) == self.file {
-            // Nothing is to be done when that fails: the next gateway replaces a dead socket.
+            // An error is ignored: the next gateway replaces a dead socket.
             let _ = std::fs::remove_file(&self.path);
         }
     }

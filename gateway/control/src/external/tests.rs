@@ -93,12 +93,12 @@ fn an_answer_is_the_bytes_of_the_documented_table() {
 }
 
 #[test]
-fn what_the_answer_asks_for_is_done_in_the_next_tick() {
+fn an_answer_is_executed_in_the_next_tick() {
     let (folder, _, mut gateway) = gateway();
     assert_eq!(gateway.step(&input(0)), Step::Bad(BadCycle::NoPeer));
     let program = program(&folder, "program");
     program.send(HELLO).unwrap();
-    assert_eq!(gateway.step(&input(1)), Step::Bad(BadCycle::NoPeer), "it was not asked yet");
+    assert_eq!(gateway.step(&input(1)), Step::Bad(BadCycle::NoPeer), "it has not got a state yet");
     assert_eq!(state(&program), State { input: input(1), joints: 6 });
     program.send(&velocity(1, 0.5)).unwrap();
     assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
@@ -164,11 +164,11 @@ fn nonsense_is_counted_by_reason_and_makes_the_cycle_bad() {
         assert_eq!(count(&gateway, &format!("nonsense: {why}")), before + 1);
     }
     program.send(&velocity(10, 0.5)).unwrap();
-    assert!(matches!(gateway.step(&input(11)), Step::Move(_)), "and then it goes on");
+    assert!(matches!(gateway.step(&input(11)), Step::Move(_)), "valid answers still work");
 }
 
 #[test]
-fn who_says_hello_last_is_the_peer_and_nobody_else_is_heard() {
+fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     let (folder, _, mut gateway) = gateway();
     let [first, second] = ["first", "second"].map(|name| program(&folder, name));
     first.send(HELLO).unwrap();
@@ -177,10 +177,10 @@ fn who_says_hello_last_is_the_peer_and_nobody_else_is_heard() {
     second.send(&velocity(1, 1.0)).unwrap();
     first.send(&velocity(1, 0.5)).unwrap();
     assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
-    assert_eq!(count(&gateway, "strangers"), 2);
+    assert_eq!(count(&gateway, "other senders"), 2);
     second.send(HELLO).unwrap();
     first.send(&velocity(2, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer), "the new one was not asked yet");
+    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer), "the new one has not got a state yet");
     second.send(HELLO).unwrap();
     second.send(&velocity(3, 0.25)).unwrap();
     let step = gateway.step(&input(4));
@@ -206,7 +206,7 @@ fn a_peer_that_goes_away_is_noticed_and_may_come_back() {
 }
 
 #[test]
-fn a_peer_that_does_not_read_holds_nothing_up() {
+fn a_peer_that_does_not_read_delays_nothing() {
     let (folder, _, mut gateway) = gateway();
     let program = program(&folder, "program");
     program.send(HELLO).unwrap();

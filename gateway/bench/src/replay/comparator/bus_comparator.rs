@@ -1,4 +1,4 @@
-//! What is known of one bus: its cells, the joints that they were asked, and what they answered.
+//! What is known of one bus: its cells, the joints sent to them, and their replies.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -17,19 +17,19 @@ use crate::replay::touched::Touched;
 
 /// Unanswered requests of a cell that are remembered.
 const ANNOUNCED: usize = 256;
-/// What was asked within so many joints of the end may be answered after it.
+/// Requests within so many joints of the end may be answered after it.
 const AT_THE_END: u64 = 8;
 
 /// A cell as it is on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Present {
-    /// Who it is, and its last heartbeat.
+    /// Its identity, and its last heartbeat.
     pub claim: Claim,
     /// Its counters when they came first, and last.
     pub heard: Option<(Heard, Heard)>,
-    /// Whether it is waited for no longer: it did not answer.
+    /// Whether it is not waited for any more, because it did not answer.
     pub is_given_up: bool,
-    /// The latest joints that it has told to be done with, by number of announcement.
+    /// The latest joints that it has reported as done, by number of announcement.
     pub(super) done: u64,
     /// Heartbeats since the last announcement.
     pub(super) heartbeats: u32,
@@ -62,11 +62,11 @@ pub(super) struct Round {
     pub(super) replies: BTreeMap<(CellId, What), Both<Option<[i16; WORDS]>>>,
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
-    /// The epoch under which these joints were asked last.
+    /// The epoch under which these joints were sent last.
     pub(super) announced_as: Epoch,
     /// How often they were; 0 before they are sent.
     pub(super) announced: u32,
-    /// Who is touched at these joints and at the ones before, by what the recording says that was sent.
+    /// The cells touched at these joints and at the ones before, by the recorded stimuli.
     pub(super) touched: [Touched; 2],
     /// Whether a pass begins with them.
     pub(super) is_first: bool,
@@ -78,7 +78,7 @@ impl Round {
         self.touched.last().and_then(|touched| touched.is(cell))
     }
 
-    /// Whether a cell that takes these joints has anything to say: a torque, or the end of what it felt before.
+    /// Whether a cell that takes these joints has a reply: a torque, or the end of its contact.
     pub(super) fn may_answer(&self, cell: CellId) -> bool {
         self.touched.iter().any(|touched| touched.is(cell) == Some(true))
     }
@@ -88,9 +88,9 @@ impl Round {
 #[derive(Debug)]
 pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
-    /// It said the end of a contact earlier now, because it took joints that it had not taken then.
+    /// It sent the end of a contact earlier now, because it took joints that it had not taken then.
     pub(super) ended_earlier: bool,
-    /// Whether its last recorded torque was no end of a contact; none when it has said none yet.
+    /// Whether its last recorded torque was no end of a contact; none when it has sent none yet.
     pub(super) speaks: Option<bool>,
 }
 
@@ -99,7 +99,7 @@ pub(super) struct KnownCell {
 pub(super) struct Answers {
     /// With the number of rounds before it.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
-    /// What was asked in the recording and not answered yet.
+    /// Recorded requests that are not answered yet.
     announced: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
 }
@@ -121,14 +121,14 @@ struct Pass {
     touched: Touched,
     /// The number of its first round.
     first_round: u64,
-    /// Whether something was said before that, and the last joints of that time.
+    /// Whether there were messages before that, and the last joints of that time.
     begins_later: bool,
     earlier: Option<Epoch>,
 }
 
 /// One bus.
 #[derive(Debug, Default)]
-pub(super) struct LinkId {
+pub(super) struct BusComparator {
     pub(super) name: String,
     pub(super) present: BTreeMap<CellId, Present>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
@@ -143,12 +143,12 @@ pub(super) struct LinkId {
     /// Whose children cells are, recorded and now.
     pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
-    /// Cells whose last recorded sum was no end of a contact: they have to go on, or say the end.
+    /// Cells whose last recorded sum was no end of a contact: they have to go on, or send the end.
     pub(super) speaking: BTreeSet<CellId>,
-    /// Whether somebody had cells say what they feel without being asked: then that comes at times of their own.
+    /// Whether cells were switched to unrequested sensors frames, which come at times of their own.
     pub(super) senses: bool,
-    /// Cells that had taken no joints when they last told their counters, with the epoch that they say until they have:
-    /// it is of no joints.
+    /// Cells that had taken no joints when they last reported their counters, with the epoch that they send until they
+    /// have: it belongs to no joints.
     pub(super) untouched: Both<BTreeMap<CellId, Epoch>>,
     pass: Pass,
     /// Rounds that were announced.
@@ -158,7 +158,7 @@ pub(super) struct LinkId {
     pub(super) is_down: bool,
 }
 
-impl LinkId {
+impl BusComparator {
     pub(super) fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
         let known_cell = |(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None });
         Self {
@@ -170,7 +170,7 @@ impl LinkId {
         }
     }
 
-    /// Whether something was said before the first round of this pass.
+    /// Whether there were messages before the first round of this pass.
     pub(super) const fn begins_later(&self) -> bool {
         self.pass.begins_later
     }
@@ -191,7 +191,7 @@ impl LinkId {
         self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
-    /// The round that was asked last under an epoch, and its number.
+    /// The round that was sent last under an epoch, and its number.
     pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
         let number = self.announced(epoch)?.round?;
         Some((number, self.round(number)?))
@@ -206,14 +206,14 @@ impl LinkId {
         }
     }
 
-    /// All that was announced so far is to be done with another word of each cell.
+    /// Everything announced so far has to be confirmed by another message of each cell.
     pub(super) fn announce(&mut self) {
         self.announcements += 1;
         self.present.values_mut().for_each(|present| present.heartbeats = 0);
     }
 
-    /// Forgets recorded replies to what was not sent. What was sent after the last joints nobody knows, so replies to
-    /// that are not missed.
+    /// Drops recorded replies to what was not sent. Whether something was sent after the last joints is unknown, so
+    /// replies to that are not expected.
     pub(super) fn forget_the_unsent(&mut self) {
         let sent = self.sent;
         for answers in self.answers.values_mut() {
@@ -224,7 +224,7 @@ impl LinkId {
         }
     }
 
-    /// Takes in that the capture begins anew.
+    /// Takes in that the capture begins again.
     pub(super) fn begin(&mut self) {
         self.recorded.fill(None);
         self.pass = Pass { first_round: self.rounds_so_far(), ..Pass::default() };
@@ -234,7 +234,7 @@ impl LinkId {
         self.base + self.rounds.len() as u64
     }
 
-    /// Takes in that joints stood on the bus in the capture; returns the number of their round, if they will be sent.
+    /// Takes in that joints were on the bus in the capture; returns the number of their round, if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
         let is_first = number == self.pass.first_round;
@@ -266,7 +266,7 @@ impl LinkId {
         std::mem::replace(&mut self.pass.touched, self.pass.state.touched())
     }
 
-    /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
+    /// Takes in the capture's other messages. `is_in_part`: whether it is in the part that is replayed.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
         self.pass.begins_later |= !is_in_part && self.rounds_so_far() == self.pass.first_round;
         if let Message::Joints { epoch, .. } = *message {
@@ -287,7 +287,7 @@ impl LinkId {
         }
     }
 
-    /// Whether the cell that has a node id in the capture claims it only.
+    /// Whether the cell with a node id in the capture only claims it.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
         self.pass.state.claim(cell).is_some_and(|claim| !claim.is_settled())
     }
@@ -301,7 +301,7 @@ impl LinkId {
             && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
     }
 
-    /// Takes in a recorded answer to `configure`; whether what it answers stands in the part.
+    /// Takes in a recorded answer to `configure`; whether its request is in the part.
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
         let rounds = self.rounds_so_far();
         let answers = self.answers.entry(from).or_default();
@@ -314,7 +314,7 @@ impl LinkId {
         true
     }
 
-    /// Takes in where a cell's sums go, as it said in the capture. Its page tells the last joints that it has taken:
+    /// Takes in where a cell's sums go, as it reported in the capture. Its page has the last joints that it has taken:
     /// from the next ones on they go there.
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
@@ -322,7 +322,7 @@ impl LinkId {
         self.trees.recorded.say(cell, parent, last.map_or(next, |last| last + 1));
     }
 
-    /// Where its sums go as it says now.
+    /// Where its sums go by its present report.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.announced(epoch).and_then(|announced| announced.round);
         self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
@@ -355,7 +355,7 @@ impl LinkId {
     }
 
     /// Whether a cell is done with the joints announced last. One that does not take them, because they are those of
-    /// another robot, tells the epoch before; after two heartbeats it has looked at them: one of the two is the
+    /// another robot, reports the epoch before; after two heartbeats it has processed them: one of the two is the
     /// answer to the sync that came after them.
     pub(super) const fn has_done(&self, present: &Present) -> bool {
         present.done >= self.announcements || present.heartbeats >= 2
@@ -370,7 +370,7 @@ impl LinkId {
 }
 
 impl Answers {
-    /// Whether the recording says why it has the question of this tag and not the answer; `rounds` are all there were.
+    /// Whether the recording explains why it has the request of this tag and not the answer; `rounds` are all there were.
     pub(super) fn explain_extra(
         &mut self,
         lacking: &mut Lacking,
@@ -401,7 +401,7 @@ impl Answers {
     }
 }
 
-/// Takes in what a message tells of whether its cell has taken any joints yet.
+/// Takes in what a message shows of whether its cell has taken any joints yet.
 pub(super) fn take_first_joints(untouched: &mut BTreeMap<CellId, Epoch>, message: &Message) {
     if let Message::Torque { from, .. } = *message {
         untouched.remove(&from);
@@ -425,7 +425,7 @@ pub(super) fn take_first_joints(untouched: &mut BTreeMap<CellId, Epoch>, message
     }
 }
 
-/// Whether the recording says why it has no such reply.
+/// Whether the recording explains why it has no such reply.
 pub(super) fn explain_extra(
     lacking: &mut Lacking,
     known_cell: Option<&mut KnownCell>,
@@ -461,7 +461,7 @@ pub(super) fn explain_extra(
     } else {
         return false;
     }
-    // Counters say how many, and not which: whatever it is that is lacking, the end may have been said later then.
+    // Counters tell how many are missing, and not which: the end may have been sent later then.
     known_cell.ended_earlier = now == [0; WORDS];
     true
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use protocol::id::CellId;
 use protocol::packet::WORDS;
 
-use super::bus_comparator::{Both, KnownCell, LinkId, Round, explain_extra};
+use super::bus_comparator::{Both, BusComparator, KnownCell, Round, explain_extra};
 use super::sums::{Outcome, ROUNDING, Side, Why, compare};
 use super::{Comparator, First, Tally};
 use crate::replay::difference::{How, Said, What};
@@ -39,8 +39,8 @@ impl Comparator {
     }
 }
 
-impl LinkId {
-    /// Compares a reply to joints with the recorded one; how it is another, unless the recording says why.
+impl BusComparator {
+    /// Compares a reply to joints with the recorded one; how they differ, unless the recording explains it.
     fn compare_reply(
         &mut self,
         number: u64,
@@ -76,8 +76,8 @@ impl LinkId {
             (Some(_), None) if round.is_unsent => Some(How::Missing),
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded == [0; WORDS];
-                // What was over before, by what was sent, or began before the part: the cell had not taken the
-                // joints at which it ended.
+                // The contact had ended before, by the recorded stimuli, or began before the part: the cell had not taken
+                // the joints at which it ended.
                 let was_over = spoke.map_or(begins_later, |spoke| spoke && !round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
@@ -88,7 +88,7 @@ impl LinkId {
                 tally.lacking.said_later += 1;
                 None
             }
-            // Reports may be asked for by this replay.
+            // Reports may be requested by this replay.
             (None, Some(now)) => {
                 let counts =
                     is_torque && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now);
@@ -148,12 +148,12 @@ impl LinkId {
                 }
                 Outcome::Different => How::Different,
                 Outcome::Missing => How::Missing,
-                // It had to go on then, or to say the end: it did not come to its slot in time.
+                // It had to go on then, or to send the end: it did not come to its slot in time.
                 Outcome::Extra if self.speaking.contains(&cell) => {
                     lacking.slot_skipped += 1;
                     continue;
                 }
-                // The words only say whether a contact has ended, which a sum does not tell.
+                // The words only tell whether a contact has ended, which a sum does not show.
                 Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, [1; WORDS]) => {
                     continue;
                 }

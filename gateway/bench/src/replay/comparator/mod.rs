@@ -1,14 +1,14 @@
-//! Who is on the buses, whether they have done what they were last asked for, and whether what they answer is what
-//! the capture says.
+//! Which cells are on the buses, whether they are done with the last joints, and whether their replies are those of
+//! the capture.
 //!
 //! ```text
-//!   recorded joints, replies ─> record_joints, record ─┐             ┌─> is_done, unanswered ─> lockstep
-//!          joints to be sent ─> announce ──────────────┼─ [ Judge ] ─┼─> present, rival
-//!        frames on the buses ─> hear ──────────────────┘             └─> tally, first difference
+//!   recorded joints, replies ─> record_joints, record ─┐                  ┌─> is_done, unanswered ─> lockstep
+//!          joints to be sent ─> announce ──────────────┼─ [ Comparator ] ─┼─> present, other_gateway
+//!        frames on the buses ─> hear ──────────────────┘                  └─> tally, first difference
 //! ```
 //!
-//! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus each
-//! for itself. Rounds of joints are judged when 100 more have been sent, or at the end.
+//! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus
+//! separately. Rounds of joints are compared when 100 more have been sent, or at the end.
 
 mod bus_comparator;
 mod close;
@@ -23,7 +23,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Sensing};
 
 pub use bus_comparator::Present;
-use bus_comparator::{Announced, Both, LinkId, take_first_joints};
+use bus_comparator::{Announced, Both, BusComparator, take_first_joints};
 pub use sums::Own;
 use sums::{Side, Sum};
 pub use tally::{Lacking, Steps, Tally};
@@ -66,7 +66,7 @@ impl First {
 /// All buses.
 #[derive(Debug)]
 pub struct Comparator {
-    bus_comparators: Vec<LinkId>,
+    bus_comparators: Vec<BusComparator>,
     /// By how many steps a torque's words may differ from the recorded ones; none when replies are not compared.
     tolerance: Option<u16>,
     /// While a state is restored, replies are not those of the capture.
@@ -77,7 +77,7 @@ pub struct Comparator {
 }
 
 impl Comparator {
-    /// For some buses, by what they are called now and their cells in the capture. Replies are compared if there is
+    /// For some buses, by their present names and their cells in the capture. Replies are compared if there is
     /// a tolerance, in steps of torques, once it is no longer muted.
     #[must_use]
     pub fn new(
@@ -85,7 +85,8 @@ impl Comparator {
         first_nanos: u64,
         tolerance: Option<u16>,
     ) -> Self {
-        let bus_comparators = buses.into_iter().map(|(name, cells)| LinkId::new(name, cells)).collect();
+        let bus_comparators =
+            buses.into_iter().map(|(name, cells)| BusComparator::new(name, cells)).collect();
         Self {
             bus_comparators,
             tolerance,
@@ -108,7 +109,7 @@ impl Comparator {
         self.bus_comparators.get_mut(bus_comparator)?.record_joints(nanos, epoch, is_sent)
     }
 
-    /// Takes in what else the capture says. `is_in_part` says whether it stands in the part that is replayed.
+    /// Takes in the capture's other messages. `is_in_part`: whether it is in the part that is replayed.
     pub fn record(&mut self, bus_comparator: usize, message: &Message, is_in_part: bool) {
         let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
@@ -141,7 +142,7 @@ impl Comparator {
         take_first_joints(&mut bus_comparator.untouched.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         if what != What::Torque && bus_comparator.untouched.recorded.get(&cell) == Some(&epoch) {
-            // Of no joints, even if joints of that epoch stood on the bus by then.
+            // Of no joints, even if joints of that epoch were on the bus by then.
             return;
         }
         let measured = bus_comparator.known.get(&cell).is_some_and(|known_cell| known_cell.cell.measured);
@@ -156,9 +157,9 @@ impl Comparator {
         }
     }
 
-    /// Takes in that the capture begins anew: replies before its first joints answer none of the last pass.
+    /// Takes in that the capture begins again: replies before its first joints answer none of the last pass.
     pub fn record_begin(&mut self) {
-        self.bus_comparators.iter_mut().for_each(LinkId::begin);
+        self.bus_comparators.iter_mut().for_each(BusComparator::begin);
     }
 
     /// Takes in that the capture has no more joints.
@@ -181,7 +182,7 @@ impl Comparator {
         it.sent = it.sent.max(number + 1);
         if let Some(round) = it.round(number) {
             round.is_unsent = false;
-            // Asked again, all cells say their sums again.
+            // When joints are repeated, all cells resend their sums.
             round.sums.now.clear();
             round.announced_as = epoch;
             round.announced += 1;
@@ -195,7 +196,7 @@ impl Comparator {
         }
     }
 
-    /// Takes in that all that was sent so far shall be done: a sync without joints.
+    /// Takes in that everything sent so far is to be confirmed: a sync without joints.
     pub fn announce_again(&mut self, bus_comparator: usize) {
         let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
         it.announce();
@@ -218,7 +219,7 @@ impl Comparator {
         }
     }
 
-    /// Takes in a message of somebody else on a bus.
+    /// Takes in a message of another sender on a bus.
     pub fn hear(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.bus_comparators.get_mut(index) else { return };
         bus_comparator.is_down = false;
@@ -250,9 +251,9 @@ impl Comparator {
         let (epoch, nanos) = (round.epoch, round.nanos);
         match pair.now {
             None => pair.now = Some(words),
-            // The same joints may be asked twice, and are then answered twice.
+            // The same joints may be sent twice, and are then answered twice.
             Some(before) if before == words => {}
-            // The last word counts, as in the capture.
+            // The last reply counts, as in the capture.
             Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
@@ -278,7 +279,7 @@ impl Comparator {
         })
     }
 
-    /// Gives up those that are not done; returns who they are.
+    /// Gives up the cells that are not done; returns them.
     pub fn give_up(&mut self, bus_comparator: usize) -> Vec<CellId> {
         let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) else { return Vec::new() };
         let late: Vec<_> = bus_comparator.undone().collect();
@@ -315,7 +316,7 @@ impl Comparator {
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
-    /// Takes in that a bus is down, so that nobody on it is waited for; it ends with the next message.
+    /// Takes in that a bus is down, so that none of its cells is waited for; the next message ends this.
     pub fn is_down(&mut self, bus_comparator: usize) {
         if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
             bus_comparator.is_down = true;
@@ -334,7 +335,7 @@ impl Comparator {
         }
     }
 
-    /// The bus on which another gateway has spoken.
+    /// The bus on which another gateway has sent.
     #[must_use]
     pub const fn other_gateway(&self) -> Option<usize> {
         self.other_gateway
@@ -353,7 +354,7 @@ impl Comparator {
         self.present(bus_comparator).filter(|(_, present)| present.claim.is_settled())
     }
 
-    /// Cells that have not said where their sums go, or have no way up.
+    /// Cells that have not reported where their sums go, or are unreachable.
     #[must_use]
     pub fn unreachable(&self, bus_comparator: usize) -> Vec<CellId> {
         let settled = self.settled(bus_comparator);
@@ -361,7 +362,7 @@ impl Comparator {
         settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
     }
 
-    /// Judges all that has been sent, and hears no more; `is_whole` says whether that was all that the capture has.
+    /// Compares all that has been sent, and receives no more; `is_whole`: whether that was all that the capture has.
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
         for bus_comparator in self.bus_comparators.iter_mut().filter(|_| !is_whole) {
@@ -381,7 +382,7 @@ impl Comparator {
         }
     }
 
-    /// How it went so far.
+    /// The counts so far.
     #[must_use]
     pub const fn tally(&self) -> &Tally {
         &self.tally
@@ -394,12 +395,12 @@ impl Comparator {
     }
 }
 
-/// Whether an answer is the same whenever it is asked for: who a cell is tells its state too.
+/// Whether an answer does not depend on when it is requested: that to `identify` has the cell's state too.
 fn is_compared(answer: Answer) -> bool {
     !matches!(answer, Answer::Value { number, .. } if number == Parameter::Identity.number())
 }
 
-/// A reply that says which joints it answers, or came after.
+/// A reply that has the epoch of the joints that it answers, or came after.
 fn reply(message: &Message) -> Option<(CellId, Epoch, What, [i16; WORDS])> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
         (from, epoch, What::Torque)

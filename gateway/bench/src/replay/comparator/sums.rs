@@ -6,9 +6,9 @@
 //!   sums of one epoch, the last of each ──────┘        recorded and now: compare
 //! ```
 //!
-//! A sum adds whole steps, so the difference is exact, and in it nothing is left of the tree. Two cells that feel the
-//! same may differ by one step, because rounding carries what it took away into the next value. Whose children are
-//! not certain in an epoch is left out, and so is a sum that does not hold all its children's.
+//! A sum adds whole steps, so the difference is exact and does not depend on the tree. Two cells in the same contact
+//! state may differ by one step, because rounding carries its remainder into the next value. A cell whose children are
+//! not certain in an epoch is left out, and so is a sum that does not contain all its children's.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -24,12 +24,12 @@ pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
 #[derive(Clone, Copy, Debug)]
 struct Step {
     since: u64,
-    /// A cell's number, 0 for the gateway's side; none without a way up.
+    /// A cell's node id, 0 for the gateway's side; none if the cell is unreachable.
     parent: Option<u8>,
 }
 
 impl Trees {
-    /// Takes in where a cell's sums go from a round on, as it says itself.
+    /// Takes in where a cell's sums go from a round on, as it reports.
     pub(super) fn say(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
         if steps.back().is_none_or(|last| last.parent != parent) {
@@ -37,7 +37,7 @@ impl Trees {
         }
     }
 
-    /// Whether a cell's sums go anywhere, by its last word.
+    /// Whether a cell's sums go anywhere, by its last report.
     pub(super) fn is_reachable(&self, cell: CellId) -> bool {
         self.0.get(&cell).and_then(VecDeque::back).is_some_and(|step| step.parent.is_some())
     }
@@ -48,9 +48,9 @@ impl Trees {
         steps.iter().rev().find(|step| step.since <= round).map(|step| step.parent)
     }
 
-    /// Cells that had another parent before a round, or have one after it, with these parents. Their pages tell the
+    /// Cells that had another parent before a round, or have one after it, with these parents. Their pages have the
     /// epoch of the last joints, which are the ones before the change or those at it. A cell between two parents
-    /// says nothing; one that finds none any more is not between two.
+    /// sends no page; one that has lost its parent for good is not between two.
     fn affected(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
@@ -69,10 +69,10 @@ impl Trees {
         all
     }
 
-    /// Forgets what was before a round.
+    /// Drops what was before a round.
     pub(super) fn forget_before(&mut self, round: u64) {
         for steps in self.0.values_mut() {
-            // The step before a change tells from whom the cell came.
+            // The entry before a change has the former parent.
             while steps.get(2).is_some_and(|third| third.since < round) {
                 steps.pop_front();
             }
@@ -130,20 +130,20 @@ const FINER: u16 = 16;
 /// What one cell put into its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Own {
-    /// The sum as it was said.
+    /// The sum as it was sent.
     pub sum: [Q7_8; WORDS],
     /// Cells in it.
     pub count: u8,
     /// The children whose sums are in it.
     pub children: Vec<CellId>,
-    /// The sum less theirs, in steps of Q7.8; none where a word is saturated.
+    /// The sum minus theirs, in steps of Q7.8; none where a word is saturated.
     pub steps: [Option<i32>; WORDS],
-    /// The count less theirs: 1 of a cell that feels something, 0 of one that passes on what others feel.
+    /// The count minus theirs: 1 of a cell in contact, 0 of one that only forwards its children's sums.
     pub cells: i32,
 }
 
 impl Own {
-    /// Whether no word is left.
+    /// Whether all words are saturated.
     fn is_nothing(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
     }
@@ -162,7 +162,7 @@ pub(super) struct Side<'a> {
     affected: BTreeSet<CellId>,
     /// Of cells that changed it: all parents that are remembered.
     parents: BTreeMap<CellId, BTreeSet<u8>>,
-    /// Whether it is known of all whose children they are.
+    /// Whether the parents of all cells are known.
     is_known: bool,
 }
 
@@ -171,16 +171,16 @@ pub(super) struct Side<'a> {
 pub(super) enum Why {
     /// The cell, or one that is or was its child, was changing its parent.
     Changing,
-    /// Some cell has not said where its sums go.
+    /// Some cell has not reported where its sums go.
     Unknown,
-    /// It does not hold all its children's sums, or others than were heard.
+    /// It does not contain all its children's sums, or others than were received.
     NotTaken,
 }
 
 /// How a cell's sums compare.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Outcome {
-    /// The cell itself had nothing to say then, nor now.
+    /// The cell itself contributed nothing then, nor now.
     Nothing,
     Equal,
     Different,
@@ -207,7 +207,7 @@ impl<'a> Side<'a> {
         self.children.get(&cell.get()).map_or(&[], Vec::as_slice)
     }
 
-    /// What a cell put into its sum; none when it said none.
+    /// What a cell put into its sum; none if it sent none.
     pub(super) fn own(&self, cell: CellId) -> Option<Own> {
         let Sum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
@@ -223,8 +223,8 @@ impl<'a> Side<'a> {
         Some(Own { sum, count, children, steps, cells })
     }
 
-    /// Whether what is left of a cell's sum cannot be its own, by whether it was touched: then its children were others
-    /// than their pages say. Where joints were asked again, sums of two times may be mixed too.
+    /// Whether the remainder of a cell's sum cannot be its own contribution, by whether it was touched: then it had other
+    /// children than their pages report. Where joints were sent again, sums of two times may be mixed too.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
         self.own(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_nothing();
@@ -232,27 +232,27 @@ impl<'a> Side<'a> {
         })
     }
 
-    /// Whether a cell feels something itself.
+    /// Whether a cell is in contact itself.
     pub(super) fn feels(&self, cell: CellId) -> bool {
         self.own(cell).is_some_and(|own| own.cells > 0)
     }
 
-    /// Whether what a cell said holds the sums of all its children, as they were heard: then what is left is its own.
+    /// Whether a cell's sum contains the received sums of all its children: then the remainder is its own contribution.
     fn is_whole(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own(cell) else { return true };
         let adds_up = match own.cells {
-            // Its own is in it, and a child's of one cell is not.
+            // Its own contribution is in it, and that of a child of one cell is not.
             0 => own.is_nothing() || !other.feels(cell),
             1 => true,
             _ => false,
         };
-        // Of a child that is heard on one side only, nobody knows whether it is in this.
+        // Whether a child that is received on one side only is in this sum is unknown.
         let silent = |child: &CellId| !self.sums.has(*child) && other.feels(*child);
         adds_up && !self.children(cell).iter().any(silent)
     }
 
-    /// Whether what a cell said has more in it than on the other side, and that is the sum of a cell which is or was its
-    /// child, but by its page is not in this epoch: pages come after the change that they tell of. It may be in no other
+    /// Whether a cell's sum contains more than on the other side, and that is the sum of a cell which is or was its
+    /// child, but by its page is not in this epoch: pages come after the change that they report. It may be in no other
     /// sum then.
     fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
@@ -307,7 +307,7 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId, toleran
     let (then, today) = (recorded.own(cell), now.own(cell));
     match (then, today) {
         (Some(then), Some(today)) => {
-            // A word is saturated by all that is below: of another tree, by other cells.
+            // A word is saturated by the whole subtree: in another tree, by other cells.
             let alike = |then: Q7_8, today: Q7_8| {
                 then.is_saturated() == today.is_saturated() || recorded.below(cell) != now.below(cell)
             };
@@ -331,7 +331,7 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId, toleran
         }
         (Some(then), None) if then.cells > 0 => Outcome::Missing,
         (None, Some(today)) if today.cells > 0 => Outcome::Extra,
-        // Whether a cell passes on what others feel depends on the tree; but it adds nothing to that.
+        // Whether a cell forwards others' sums depends on the tree; but it adds nothing to them.
         (Some(own), None) | (None, Some(own)) if !own.is_nothing() => Outcome::Different,
         (Some(_), None) | (None, Some(_) | None) => Outcome::Nothing,
     }

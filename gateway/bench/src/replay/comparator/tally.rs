@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use crate::replay::difference::How;
 
-/// How replies and recorded ones compare.
+/// Counts of compared replies.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Tally {
     /// Replies that came back as they were recorded.
@@ -14,7 +14,7 @@ pub struct Tally {
     pub different: u64,
     /// Recorded replies that did not come back.
     pub missing: u64,
-    /// Replies that were not recorded, and nothing says why.
+    /// Replies that were not recorded, and the recording does not explain it.
     pub extra: u64,
     /// Recorded replies to joints that a bus did not take from this replay.
     pub not_requested: u64,
@@ -56,10 +56,10 @@ impl Steps {
     }
 }
 
-/// Replies that were not recorded, or not with their joints, by what the recording says of why.
+/// Replies that were not recorded, or not with their joints, by the reason that the recording shows.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Lacking {
-    /// The cell was silent then: not there, killed, hung, or claiming its number.
+    /// The cell was silent then: absent, killed, hung, or claiming its node id.
     pub silent: u64,
     /// The cell did not take so many joints, by its own counters.
     pub untaken: u64,
@@ -67,28 +67,28 @@ pub struct Lacking {
     pub unrecorded: u64,
     /// The last joints, or the last `configure`, of the recording: it ended before they were answered.
     pub ended: u64,
-    /// The end of a contact, said later because the cell did not take the joints at which it was.
+    /// The end of a contact, sent later because the cell did not take the joints at which it was.
     pub said_later: u64,
-    /// Replies of touched cells, at joints for which no counters say how many the cell took: in a part of a recording
+    /// Replies of touched cells, at joints for which no counters tell how many the cell took: in a part of a recording
     /// before the first report and after the last one.
     pub uncounted: u64,
     /// Recorded replies whose joints were not recorded.
     pub joints_unrecorded: u64,
-    /// Recorded replies whose joints stood on the bus before the part began.
+    /// Recorded replies whose joints were on the bus before the part began.
     pub joints_earlier: u64,
-    /// Recorded answers to `configure` that was said before the part began.
+    /// Recorded answers to `configure` messages from before the part.
     pub requested_earlier: u64,
-    /// Recorded replies of cells that measured: what they felt was not recorded.
+    /// Recorded replies of cells that measured: their measured forces were not recorded.
     pub measured: u64,
-    /// What cells felt, said without being asked at another time than now.
+    /// Unrequested sensors frames, sent at another time than now.
     pub sensed_otherwise: u64,
-    /// Sums of cells that had spoken, had not said the end, and did not come to their slot in time.
+    /// Sums of cells that had sent one, had not sent the end, and did not come to their slot in time.
     pub slot_skipped: u64,
     /// Sums of cells that, or whose children, were changing their parent in that epoch, then or now.
     pub parent_changing: u64,
-    /// Sums of epochs in which a cell had not said where its sums go, then or now.
+    /// Sums of epochs in which a cell had not reported where its sums go, then or now.
     pub tree_unknown: u64,
-    /// Sums that do not hold all their children's, then or now.
+    /// Sums that do not contain all their children's, then or now.
     pub sums_not_taken: u64,
 }
 
@@ -118,7 +118,7 @@ impl Tally {
         is_equal
     }
 
-    /// Whether there are sums, and not one of them could be compared, because nothing tells whose children they hold.
+    /// Whether there are sums, and not one of them could be compared, because nothing tells which children they contain.
     #[must_use]
     pub const fn lacks_the_tree(&self) -> bool {
         self.sums == 0 && self.lacking.tree_unknown > 0

@@ -9,42 +9,42 @@ use protocol::parameters::Parameter as P;
 
 const MS: u64 = 1_000_000;
 
-fn cell(number: i64) -> CellId {
-    CellId::new(number).unwrap()
+fn cell(node: i64) -> CellId {
+    CellId::new(node).unwrap()
 }
 
-fn torque(number: i64, epoch: u8, bits: i16) -> Message {
+fn torque(node: i64, epoch: u8, bits: i16) -> Message {
     let mut torque = [Q3_12::ZERO; WORDS];
     torque[0] = Q3_12::from_bits(bits);
-    Message::Torque { from: cell(number), epoch: Epoch(epoch), torque }
+    Message::Torque { from: cell(node), epoch: Epoch(epoch), torque }
 }
 
-fn heartbeat(number: i64, epoch: u8, sent: u16, state: Flags) -> Message {
+fn heartbeat(node: i64, epoch: u8, sent: u16, state: Flags) -> Message {
     let page = NetworkPage::Heartbeat(Heartbeat { sent, state, configuration: 7, ..Heartbeat::default() });
-    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(epoch), page }
+    Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
-fn heard(number: i64, joints: u16) -> Message {
+fn heard(node: i64, joints: u16) -> Message {
     let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
-    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(0), page }
+    Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page }
 }
 
-fn sum(number: i64, epoch: u8, bits: i16, count: u8) -> Message {
+fn sum(node: i64, epoch: u8, bits: i16, count: u8) -> Message {
     let mut torque = [Q7_8::ZERO; WORDS];
     torque[0] = Q7_8::from_bits(bits);
-    Message::Sum { from: cell(number), epoch: Epoch(epoch), torque, count }
+    Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count }
 }
 
-fn tree(number: i64, epoch: u8, parent: Option<u8>) -> Message {
+fn tree(node: i64, epoch: u8, parent: Option<u8>) -> Message {
     let page = NetworkPage::Tree(Tree { parent, ..Tree::default() });
-    Message::Network { from: Node::Cell(cell(number)), epoch: Epoch(epoch), page }
+    Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
 fn joints(epoch: u8) -> Message {
     Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } }
 }
 
-/// A recording, 1 ms from one message to the next, and what is heard now to the same joints.
+/// A recording, 1 ms from one message to the next, and the present replies to the same joints.
 fn rated(recording: &[Message], now: &[Message]) -> Comparator {
     rated_within(0, recording, now)
 }
@@ -110,9 +110,9 @@ fn run() -> Vec<Message> {
 }
 
 #[test]
-fn the_same_again_is_equal_in_whatever_order_cells_speak() {
+fn the_same_again_is_equal_in_any_order_of_cells() {
     assert_eq!(counts(&rated(&run(), &run())), [3, 0, 0, 0]);
-    // Late, but it says which joints it answers.
+    // Late, but it has the epoch of its joints.
     let mut late = run();
     late.swap(3, 4);
     assert_eq!(counts(&rated(&run(), &late)), [3, 0, 0, 0]);
@@ -131,7 +131,7 @@ fn one_step_is_a_difference() {
 }
 
 #[test]
-fn a_reply_that_does_not_come_and_one_that_nobody_recorded_are_told_apart() {
+fn missing_and_extra_replies_are_distinguished() {
     let mut now = run();
     now.remove(5);
     let comparator = rated(&run(), &now);
@@ -150,12 +150,12 @@ fn a_reply_that_does_not_come_and_one_that_nobody_recorded_are_told_apart() {
 
 #[test]
 fn what_the_recording_lost_is_not_blamed_on_the_cell() {
-    // The heartbeats say that it had sent one packet more.
+    // By its heartbeats it had sent one packet more.
     let mut lossy = run();
     lossy.remove(5);
     let comparator = rated(&lossy, &run());
     assert_eq!((counts(&comparator), comparator.tally.lacking.unrecorded), ([2, 0, 0, 0], 1));
-    // But only as many as they say.
+    // But only as many as they count.
     lossy.remove(3);
     lossy[7] = heartbeat(1, 4, 13, Flags::TEST_MODE);
     let comparator = rated(&lossy, &run());
@@ -164,7 +164,7 @@ fn what_the_recording_lost_is_not_blamed_on_the_cell() {
 
 #[test]
 fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
-    // It did not take joints 3, and so said the end of the contact one later.
+    // It did not take joints 3, and so sent the end of the contact one later.
     let recording = [
         Message::Report,
         heard(1, 100),
@@ -189,7 +189,7 @@ fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
 }
 
 #[test]
-fn a_cell_that_was_silent_then_may_speak_now() {
+fn a_cell_that_was_silent_then_may_send_now() {
     let mut recording = run();
     recording.extend(std::iter::repeat_n(Message::Sync, 700));
     recording.extend([joints(5), joints(6)]);
@@ -225,7 +225,7 @@ fn a_cell_that_measured_is_not_compared() {
 }
 
 #[test]
-fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
+fn unrequested_sensors_frames_are_not_expected() {
     let says = |bits| {
         let contact = [protocol::fixed::Q5_10::from_bits(bits); 3];
         let skin = protocol::message::SkinSensors { contact, ..Default::default() };
@@ -235,7 +235,7 @@ fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
     let mut recording = run();
     recording.insert(at, says(5));
     let comparator = rated(&recording, &run());
-    assert_eq!(counts(&comparator), [3, 0, 1, 0], "somebody had asked for it");
+    assert_eq!(counts(&comparator), [3, 0, 1, 0], "it had been requested");
     let request = Request::Write { number: 7, words: [2, 0, 0, 0, 0, 0] };
     recording.insert(0, Message::Configure { to: Node::Everyone, tag: 0, request });
     let comparator = rated(&recording, &run());
@@ -245,17 +245,17 @@ fn what_cells_say_of_themselves_at_times_of_their_own_is_not_missed() {
     assert_eq!(
         counts(&rated(&recording, &now)),
         [3, 1, 0, 0],
-        "but what is said at the same joints is compared"
+        "but what is sent at the same joints is compared"
     );
 }
 
 #[test]
-fn what_a_cell_contact_before_it_had_taken_any_joints_is_of_none() {
+fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
     let sensors = |epoch| {
         let page = SensorPage::Acceleration([Q3_12::from_bits(4), Q3_12::ZERO, Q3_12::ZERO]);
         Message::Sensors { from: cell(1), epoch: Epoch(epoch), page }
     };
-    // A report that was asked for before the first joints, and answered when they stood on the bus already.
+    // A report that was requested before the first joints, and answered when they were on the bus already.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 0), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 0, 0]);
@@ -264,11 +264,11 @@ fn what_a_cell_contact_before_it_had_taken_any_joints_is_of_none() {
         recording.splice(5..5, said.iter().copied());
         counts(&rated(&recording, &run()))
     };
-    // Its counters, its torque and another epoch say that it has taken joints since.
+    // Its counters, its torque and another epoch show that it has taken joints since.
     assert_eq!(late(&[heard(1, 1), sensors(0)]), [3, 0, 1, 0]);
     assert_eq!(late(&[torque(1, 0, 0), sensors(0)]), [3, 0, 2, 0]);
     assert_eq!(late(&[heartbeat(1, 1, 12, Flags::TEST_MODE), sensors(1)]), [3, 0, 1, 0]);
-    // And of a cell that had taken joints before, it is as ever.
+    // For a cell that had taken joints before, nothing changes.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 7), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 1, 0]);
@@ -299,13 +299,13 @@ fn answers_to_configure_are_compared_in_their_order() {
         [joints(0), says(value(P::Pose, 1)), says(value(P::Identity, 1)), says(value(P::Pose, 2))];
     let now = [joints(0), says(value(P::Identity, 9)), says(value(P::Pose, 1)), says(value(P::Pose, 3))];
     let comparator = rated(&recording, &now);
-    assert_eq!(counts(&comparator), [1, 1, 0, 0], "who a cell is, is not compared");
+    assert_eq!(counts(&comparator), [1, 1, 0, 0], "a cell's identity is not compared");
     let text = comparator.first().unwrap().text.clone();
     assert!(text.contains("recorded  configured 1 tag 3: wrote pose"), "{text}");
 }
 
 #[test]
-fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
+fn epochs_wrap_around_and_old_rounds_are_compared_on_the_way() {
     let mut all = Vec::new();
     for number in 0..1_000_i16 {
         let epoch = number.to_le_bytes()[0];
@@ -322,7 +322,7 @@ fn epochs_come_round_and_old_rounds_are_judged_on_the_way() {
     }
 }
 
-/// Cells 1 to 3 in a row, of which the first and the last feel something.
+/// Cells 1 to 3 in a row, of which the first and the last are in contact.
 fn row() -> Vec<Message> {
     let mut all = vec![
         heartbeat(1, 0, 10, Flags::TEST_MODE),
@@ -334,7 +334,7 @@ fn row() -> Vec<Message> {
     ];
     for epoch in 0..6 {
         all.extend([joints(epoch), sum(3, epoch, 30, 1), sum(2, epoch, 30, 1)]);
-        // The first time it did not wait for what came from below.
+        // The first time it did not wait for its children.
         all.extend([sum(1, epoch, 10, 1), sum(1, epoch, 40, 2)]);
     }
     all
@@ -355,7 +355,7 @@ fn beside(own: [i16; 2]) -> Vec<Message> {
 #[test]
 fn sums_less_their_children_are_equal_in_another_tree() {
     let comparator = rated(&row(), &row());
-    assert_eq!((counts(&comparator), comparator.tally.sums), ([18, 0, 0, 0], 18), "all three spoke");
+    assert_eq!((counts(&comparator), comparator.tally.sums), ([18, 0, 0, 0], 18), "all three sent");
     let comparator = rated(&row(), &beside([10, 30]));
     assert_eq!((counts(&comparator), comparator.tally.sums), ([12, 0, 0, 0], 12), "{:?}", comparator.first());
     assert!(comparator.tally.is_good());
@@ -384,18 +384,18 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
         |message| !matches!(message, Message::Sum { from, epoch, .. } if from.get() == 3 && epoch.0 == 4),
     );
     let comparator = rated(&row(), &now);
-    // The parent then may have taken it or not: nobody knows.
+    // The parent then may have taken it or not: this is unknown.
     assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
 }
 
 #[test]
-fn a_cell_that_spoke_and_did_not_say_the_end_did_not_come_to_its_slot() {
+fn a_cell_that_stopped_without_the_end_did_not_come_to_its_slot() {
     let mut late = row();
     let silent = |epoch| move |message: &Message| matches!(message, Message::Sum { from, epoch: of, .. } if from.get() == 1 && of.0 == epoch);
     late.retain(|message| !silent(3)(message));
     let comparator = rated(&late, &row());
     assert_eq!((counts(&comparator), comparator.tally.lacking.slot_skipped), ([17, 0, 0, 0], 1));
-    // One that had said the end would have had to say the beginning.
+    // One that had sent the end would have had to send the beginning.
     let mut ended = row();
     ended.retain(|message| !silent(2)(message) && !silent(3)(message));
     let at = ended.iter().position(|message| *message == joints(3)).unwrap();
@@ -410,7 +410,7 @@ fn a_cell_that_spoke_and_did_not_say_the_end_did_not_come_to_its_slot() {
 }
 
 #[test]
-fn who_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
+fn a_cell_that_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
     let mut now = row();
     let at = now.iter().position(|message| *message == joints(3)).unwrap();
     // After joints 2: from joints 3 on it is a root.
@@ -425,7 +425,7 @@ fn who_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
         }
     }
     let comparator = rated(&row(), &now);
-    // Cells 2 and 3 in the epoch before the change and in the one after it; later cell 2 has nothing to pass on.
+    // Cells 2 and 3 in the epoch before the change and in the one after it; later cell 2 has nothing to forward.
     assert_eq!((comparator.tally.lacking.parent_changing, counts(&comparator)), (4, [6 + 2 + 4, 0, 0, 0]));
     assert!(comparator.tally.is_good());
 }
@@ -465,18 +465,18 @@ fn joints_that_are_retried_have_the_sums_of_the_last_time() {
 #[test]
 fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
-    let beat = |number, epoch| heartbeat(number, epoch, 0, Flags::TEST_MODE);
+    let beat = |node, epoch| heartbeat(node, epoch, 0, Flags::TEST_MODE);
     comparator.hear(0, &beat(1, 0));
     comparator.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
-    assert!(comparator.is_done(0), "nothing was asked");
+    assert!(comparator.is_done(0), "nothing was sent");
     comparator.announce(0, None, Epoch(9));
     assert!(!comparator.is_done(0));
     comparator.hear(0, &beat(1, 8));
-    assert!(!comparator.is_done(0), "said before it took them");
+    assert!(!comparator.is_done(0), "sent before it took them");
     comparator.hear(0, &beat(1, 9));
-    assert!(comparator.is_done(0), "who claims its number is not waited for");
+    assert!(comparator.is_done(0), "a cell that claims its node id is not waited for");
     comparator.announce(0, None, Epoch(10));
-    // One that refuses these joints says its old epoch: once because its time had come, once because of the sync.
+    // One that refuses these joints sends its old epoch: once as its periodic heartbeat, once because of the sync.
     comparator.hear(0, &beat(1, 9));
     assert!(!comparator.is_done(0));
     comparator.hear(0, &beat(1, 9));
@@ -485,13 +485,13 @@ fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     assert_eq!(comparator.give_up(0), [cell(1)]);
     assert!(comparator.is_done(0), "given up");
     comparator.hear(0, &beat(1, 10));
-    assert!(!comparator.is_done(0), "it speaks again");
+    assert!(!comparator.is_done(0), "it sends again");
     comparator.is_down(0);
-    assert!(comparator.is_done(0), "nobody is waited for on a bus that is down");
+    assert!(comparator.is_done(0), "no cell is waited for on a bus that is down");
 }
 
 #[test]
-fn somebody_else_who_sends_joints_is_a_other_gateway() {
+fn another_sender_of_joints_is_another_gateway() {
     let mut comparator =
         Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
     comparator.hear(1, &Message::Resume);

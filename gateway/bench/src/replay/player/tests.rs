@@ -10,7 +10,7 @@ struct Fake {
     clock: u64,
     /// How long a send takes.
     takes: u64,
-    /// What the next sends come to; then all is taken.
+    /// The results of the next sends; then all is taken.
     outcomes: Vec<Result<(), SendError>>,
     /// What was sent, when and where.
     sent: Vec<(u64, usize, Vec<Frame>)>,
@@ -200,7 +200,7 @@ fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
 }
 
 #[test]
-fn what_is_older_than_what_was_sent_does_not_wait_and_is_not_late() {
+fn frames_older_than_the_last_one_are_sent_at_once_and_are_not_late() {
     let late = Due { at: 9_000_000, bus_link: 0, frame: frame(9), role: Role::Plain, is_late: true };
     let mut stage = Fake::default();
     let played =
@@ -209,7 +209,7 @@ fn what_is_older_than_what_was_sent_does_not_wait_and_is_not_late() {
 }
 
 #[test]
-fn somebody_may_say_stop() {
+fn a_replay_can_be_stopped() {
     let mut stage = Fake { stops_at: Some(5_000_000), ..Fake::default() };
     let played =
         play(Player::new(1, Pace::Timed(1.0), None), &mut stage, (0..100).map(|n| plain(n * 1_000, 0, 1)));

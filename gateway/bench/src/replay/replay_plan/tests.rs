@@ -88,7 +88,7 @@ fn share_of(
     }
     let due = |step| match step {
         Step::Frame(due) => due,
-        Step::Restore(_) => panic!("nobody asked for it"),
+        Step::Restore(_) => panic!("no restore was requested"),
     };
     (steps.into_iter().map(due).collect(), replay_plan.into_summary())
 }
@@ -125,7 +125,7 @@ fn inputs_and_replies_are_the_two_sides() {
 
 #[test]
 fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are() {
-    // Somebody else's frames under identifiers of joints, of a torque and of a stimulus, among halves of ours.
+    // Foreign frames under identifiers of joints, of a torque and of a stimulus, among segments of ours.
     let data = |id: u32, byte| Frame::classic(id, &[byte; 8]).unwrap();
     let classic = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
     let page = SensorPage::Skin(SkinSensors::default());
@@ -148,21 +148,21 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
 }
 
 #[test]
-fn what_cells_said_over_their_wires_is_never_sent() {
+fn wire_messages_are_never_sent() {
     let survey = Survey::new(Part::default());
     for only in [Only::All, Only::Inputs, Only::Replies] {
         let selection = Selection { only, pick: Pick::default(), bus_links: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
         let frame = wire::LinkId { wire: 9, back: false }.frame(wire::PortMessage::Join);
         assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
-        // Damaged it proves nothing, and is somebody else's.
+        // A damaged one proves nothing, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
         assert_ne!(replay_plan.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
     }
 }
 
 #[test]
-fn a_part_begins_and_ends_at_its_times_and_buses_go_where_they_shall() {
+fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
     let part = Part { from: MS, to: Some(6 * MS) };
     let (due, plan_summary) = plan_summary(part, |selection| selection.bus_links = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);

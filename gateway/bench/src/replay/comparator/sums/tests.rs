@@ -1,14 +1,14 @@
 use super::*;
 use proptest::prelude::*;
 
-fn cell(number: u8) -> CellId {
-    CellId::new(number.into()).unwrap()
+fn cell(node: u8) -> CellId {
+    CellId::new(node.into()).unwrap()
 }
 
-/// What each cell itself feels, in steps; cells from 1.
+/// What each cell itself contributes, in steps; cells from 1.
 type Contact = Vec<Option<[i16; WORDS]>>;
 
-/// A tree: the parent of each cell, 0 for the gateway's side. Only cells of a lesser place are parents.
+/// A tree: the parent of each cell, 0 for the gateway's side. Only cells before it are parents.
 fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
     let (mut sums, mut trees) = (Sums::default(), Trees::default());
     let mut totals = vec![([0_i32; WORDS], 0_u8); contact.len()];
@@ -22,11 +22,11 @@ fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
             totals[above].1 += count;
             (0..WORDS).for_each(|word| totals[above].0[word] += total[word]);
         }
-        let number = cell(u8::try_from(place + 1).unwrap());
-        trees.say(number, Some(parents[place]), 0);
+        let id = cell(u8::try_from(place + 1).unwrap());
+        trees.say(id, Some(parents[place]), 0);
         if count > 0 {
             let torque = total.map(|word| Q7_8::from_bits(word.try_into().unwrap()));
-            sums.take(number, Sum { torque, count });
+            sums.take(id, Sum { torque, count });
         }
     }
     (sums, trees)
@@ -34,7 +34,7 @@ fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
 
 fn outcomes(then: &(Sums, Trees), today: &(Sums, Trees), cells: usize) -> Vec<Outcome> {
     let (then, today) = (Side::new(&then.0, &then.1, 5), Side::new(&today.0, &today.1, 5));
-    (1..=u8::try_from(cells).unwrap()).map(|number| compare(&then, &today, cell(number), 0)).collect()
+    (1..=u8::try_from(cells).unwrap()).map(|node| compare(&then, &today, cell(node), 0)).collect()
 }
 
 fn words(first: i16) -> Option<[i16; WORDS]> {
@@ -42,8 +42,8 @@ fn words(first: i16) -> Option<[i16; WORDS]> {
 }
 
 #[test]
-fn the_same_contributions_are_equal_in_whatever_tree() {
-    // 1 - 2 - 3 and 1 - (2, 3); cell 2 only passes on in the first.
+fn the_same_contributions_are_equal_in_any_tree() {
+    // 1 - 2 - 3 and 1 - (2, 3); cell 2 only forwards in the first.
     let contact = vec![words(10), None, words(30)];
     let both = (sums(&contact, &[0, 1, 2]), sums(&contact, &[0, 1, 1]));
     assert_eq!(outcomes(&both.0, &both.1, 3), [Outcome::Equal, Outcome::Nothing, Outcome::Equal]);
@@ -63,18 +63,18 @@ fn one_step_is_rounding_and_two_are_a_difference() {
 }
 
 #[test]
-fn who_feels_nothing_now_is_missing_and_who_did_not_then_is_extra() {
+fn a_cell_without_contact_now_is_missing_and_one_without_contact_then_is_extra() {
     let then = sums(&vec![words(10), words(20), None], &[0, 0, 0]);
     let today = sums(&vec![words(10), None, words(1)], &[0, 0, 0]);
     assert_eq!(outcomes(&then, &today, 3), [Outcome::Equal, Outcome::Missing, Outcome::Extra]);
-    // One that passes on what another feels speaks all the same: its own count tells.
+    // One that forwards another's sum sends one all the same: its own count tells.
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
     assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
 }
 
 #[test]
-fn who_only_passes_on_must_not_add_anything() {
+fn a_forwarding_cell_must_not_add_anything() {
     let contact = vec![None, words(20)];
     let (then, other) = (sums(&contact, &[0, 1]), sums(&contact, &[0, 0]));
     let mut today = sums(&contact, &[0, 1]);
@@ -85,7 +85,7 @@ fn who_only_passes_on_must_not_add_anything() {
 }
 
 #[test]
-fn whose_children_are_not_certain_is_omitted() {
+fn a_cell_with_uncertain_children_is_omitted() {
     let contact = vec![words(10), words(20), words(30), words(40)];
     let then = sums(&contact, &[0, 0, 1, 0]);
     let mut today = sums(&contact, &[0, 0, 1, 0]);
@@ -93,13 +93,13 @@ fn whose_children_are_not_certain_is_omitted() {
     today.1.say(cell(3), Some(2), 6);
     let changing = Outcome::Omitted(Why::Changing);
     assert_eq!(outcomes(&then, &today, 4), [changing, changing, changing, Outcome::Equal]);
-    // Nobody knows whose child the third is.
+    // The third cell's parent is unknown.
     today.1.0.remove(&cell(3));
     assert_eq!(outcomes(&then, &today, 4), [Outcome::Omitted(Why::Unknown); 4]);
 }
 
 #[test]
-fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice() {
+fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
     // The third goes to the second by its page, and to the first in fact.
     let contact = vec![None, words(20), words(30), None];
     let then = sums(&contact, &[0, 1, 1, 0]);
@@ -113,15 +113,15 @@ fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice(
         (&[2, 1], true, Outcome::Different),
     ] {
         let mut today = (Sums(today.0.0.clone()), Trees::default());
-        for number in 1..=4 {
-            today.1.say(cell(number), Some([0, 1, 2, 0][usize::from(number) - 1]), 0);
+        for node in 1..=4 {
+            today.1.say(cell(node), Some([0, 1, 2, 0][usize::from(node) - 1]), 0);
         }
         for (parent, since) in parents.iter().zip([0, 9]) {
             today.1.say(cell(3), Some(*parent), since);
         }
         if counted_twice {
-            for (number, count) in [(1, 3), (2, 2)] {
-                let sum = today.0.0.get_mut(&cell(number)).unwrap();
+            for (node, count) in [(1, 3), (2, 2)] {
+                let sum = today.0.0.get_mut(&cell(node)).unwrap();
                 sum.count = count;
                 sum.torque = std::array::from_fn(|word| {
                     let [second, third] = [1, 2].map(|at: usize| contact[at].unwrap()[word]);
@@ -134,7 +134,7 @@ fn what_a_late_page_says_of_a_child_is_no_difference_unless_it_is_counted_twice(
 }
 
 #[test]
-fn a_cell_between_two_parents_is_omitted_and_one_that_finds_none_is_not() {
+fn a_cell_between_two_parents_is_omitted_and_an_unreachable_one_is_not() {
     let contact = vec![words(10), words(20)];
     let then = sums(&contact, &[0, 1]);
     let mut today = sums(&vec![words(10), None], &[0, 1]);
@@ -173,8 +173,8 @@ fn of_two_sums_the_one_with_more_cells_counts() {
 #[test]
 fn saturated_words_are_compared_as_saturated() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
-    let saturate = |mut side: (Sums, Trees), number| {
-        side.0.0.get_mut(&cell(number)).unwrap().torque[0] = Q7_8::MAX;
+    let saturate = |mut side: (Sums, Trees), node| {
+        side.0.0.get_mut(&cell(node)).unwrap().torque[0] = Q7_8::MAX;
         side
     };
     let whole = |contact: &Contact, parents: &[u8]| saturate(sums(contact, parents), 1);
@@ -193,7 +193,7 @@ fn saturated_words_are_compared_as_saturated() {
 }
 
 #[test]
-fn trees_forget_what_is_over() {
+fn trees_drop_past_rounds() {
     let mut trees = Trees::default();
     for round in 0..1_000_u64 {
         trees.say(cell(1), Some((round % 2).to_le_bytes()[0]), round);
@@ -204,8 +204,8 @@ fn trees_forget_what_is_over() {
 }
 
 proptest! {
-    /// Any two trees over cells that feel the same: nothing differs. And where one cell feels something else, that
-    /// cell alone differs.
+    /// Any two trees over cells with the same contributions: nothing differs. If one cell contributes something else,
+    /// that cell alone differs.
     #[test]
     fn the_tree_leaves_no_trace(
         contact in proptest::collection::vec(proptest::option::of([-60_i16..=60, -60..=60, -60..=60, -60..=60, -60..=60, -60..=60]), 1..40),

@@ -1,22 +1,22 @@
-//! Another cell claims the number of one that is there.
+//! Another cell claims the node id of one that is there.
 
 use super::*;
 
-/// What another cell says that claims cell 1's number.
+/// The heartbeat of another cell that claims cell 1's node id.
 fn claim() -> Message {
     let intruder = Heartbeat { serial: 99, state: Flags::CLAIMING, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page: NetworkPage::Heartbeat(intruder) }
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_known_nothing_and_leaves_the_cell_there() {
+fn a_claim_of_a_taken_node_id_explains_nothing_and_leaves_the_cell_there() {
     let with_claim = |at| {
         let mut said = run();
         said.insert(at, claim());
         said
     };
     for at in 1..run().len() {
-        // An extra reply is no less one.
+        // An extra reply remains one.
         let mut now = run();
         now.insert(9, torque(1, 4, 9));
         let extra = |recorded: &[Message]| rated(&[recorded, &[joints(5)]].concat(), &now).tally;
@@ -28,7 +28,7 @@ fn a_claim_of_a_number_that_is_taken_known_nothing_and_leaves_the_cell_there() {
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_leaves_the_tree_as_it_is() {
+fn a_claim_of_a_taken_node_id_leaves_the_tree_as_it_is() {
     let owner = heartbeat(1, 0, 10, Flags::TEST_MODE);
     let said = [
         owner,
@@ -48,7 +48,7 @@ fn a_claim_of_a_number_that_is_taken_leaves_the_tree_as_it_is() {
 }
 
 #[test]
-fn a_claim_of_a_number_that_is_taken_is_no_packet_and_no_silence_of_its_cell() {
+fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
     let surveyed = |said: &[Message]| {
         let mut survey = Survey::new(Part::default());
         for (at, message) in (1_u64..).zip(said) {
