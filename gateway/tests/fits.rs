@@ -173,7 +173,7 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
         let [ours, load] =
             [&finding["ours"]["value"], &row["load"]["total"]].map(|value| value.as_f64().unwrap());
         assert!((ours - 100.0 * load).abs() < 1e-9);
-        assert_eq!(finding["verdict"], "Told");
+        assert_eq!(finding["verdict"], "Stated");
     }
 }
 
