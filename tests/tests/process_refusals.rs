@@ -284,14 +284,14 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --nodes 9-3",
-            "invalid value '9-3' for '--nodes <A-B>': two numbers of 1 to 254, the lesser one first, such as 1-64; \
+            "invalid value '9-3' for '--nodes <A-B>': two node ids of 1 to 254, the smaller one first, such as 1-64; \
              try '--help'"
                 .to_owned(),
         ),
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --node 0",
-            "0 is no cell number: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
+            "0 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
         ),
     ] {
         let said = refusal(&place, program, words, 2);

@@ -95,7 +95,7 @@ fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
     // It might be half of a packet, and nobody says so but the time.
     let mut line = String::new();
     BufReader::new(dump.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other half\n"), "{line}");
+    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other segment\n"), "{line}");
     kill_process(Pid::from_child(&dump), Signal::INT).unwrap();
     assert_eq!(dump.wait().unwrap().code(), Some(0));
 }

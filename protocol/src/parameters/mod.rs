@@ -1,4 +1,4 @@
-//! What a cell knows by heart: the robot's table, its own pose, its gains and thresholds, as the words
+//! What a cell stores: the robot's table, its own pose, its gains and thresholds, as the words
 //! in which they travel and lie in flash.
 //!
 //! Each parameter is one packet's six words (unused words are 0 and are not looked at):
@@ -14,7 +14,7 @@
 //! | 6 | reply, volatile | 0: own torque, 1: sum; width of a slot in µs, unsigned; depth of the deepest cell; 1: carry what rounding took away |
 //! | 7 | sensing, volatile | 0: off, 1: continuous, 2: event; period in ms |
 //! | 8 | events, volatile | thresholds: contact N Q5.10, proximity Q1.14, temperature °C Q9.6, acceleration g Q3.12; hysteresis, a part of each, Q1.14 |
-//! | 9 | cuts, volatile | bit p: port p hears nothing (only in test mode) |
+//! | 9 | links_down, volatile | bit p: port p receives nothing (only in test mode) |
 //! | 16..=21 | Denavit-Hartenberg row of joint 1..=6 | a, d in m, Q1.14; alpha, theta offset in quarter turns, Q1.14 |
 //! | 127 | commit, write only | hash that the written parameters must have |
 //!
@@ -54,7 +54,7 @@ pub enum Parameter {
     Sensing,
     /// 8: which changes are events.
     Events,
-    /// 9: which ports are cut, for tests.
+    /// 9: the ports whose links are down, for tests.
     LinksDown,
     /// 16 to 21: one row of the robot's table, counted from 0.
     Row(u8),
@@ -113,7 +113,7 @@ impl Parameter {
         NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
-    /// Whether it is in force as soon as it is written, is not stored, and is forgotten by a start.
+    /// Whether it applies as soon as it is written, is not stored, and is lost at a restart.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
         matches!(self, Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::LinksDown)

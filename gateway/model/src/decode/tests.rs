@@ -285,7 +285,7 @@ fn under_an_identifier_that_carries_packets_it_is_damaged() {
     }
     settler.finish();
     let last = std::iter::from_fn(|| settler.pop()).last().unwrap().1;
-    assert_eq!(last.to_string(), "incomplete torque 12: no other half");
+    assert_eq!(last.to_string(), "incomplete torque 12: no other segment");
 }
 
 #[test]
@@ -309,7 +309,7 @@ fn segments_meet_by_bus_and_identifier() {
     for (comment, text) in &all {
         segments += u32::from(text.starts_with("half    "));
         let expected: &[&str] = match comment.split(' ').next().unwrap() {
-            "waiting" | "incomplete" => &["half    ", "foreign no packet: no other half", "incomplete "],
+            "waiting" | "incomplete" => &["half    ", "foreign no packet: no other segment", "incomplete "],
             "whole" => {
                 packets += 1;
                 if comment.contains(" bad ") { &["meaning "] } else { &["ok      "] }
