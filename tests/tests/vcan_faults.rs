@@ -113,7 +113,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     let cells = bench.cells();
     vcan0.down();
     bench.hears(DOWN);
-    let hint = "`gateway ack vcan0 --bus-kind socketcan` lets it go on";
+    let hint = "`gateway ack vcan0 --bus-kind socketcan` resumes it";
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
         bench.tells(cell, "fallen silent");
@@ -248,7 +248,7 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     until("a stopped cell", || is_stopped(stopped).then_some(()));
     bench.tells(5, "fallen silent");
     let by_hand = place.start("cell-node", "--bus vcan0 --node 3 --skin skin.toml");
-    bench.hears("cell 3 on vcan0 started anew");
+    bench.hears("cell 3 on vcan0 restarted");
     // Its contact state is restored: the touch is as long as the run, and the bench resends it.
     place.test_client().waits_for("a torque of the new cell", torque_of(3));
     process::signal(stopped, Signal::CONT);
