@@ -18,7 +18,7 @@ use oracle::{Case, Errors};
 
 fn main() {
     println!("Sine over all 65 536 angles (Q1.14; rounding alone: mean 1.52e-5)\n");
-    println!("| function | mean error | greatest error |\n|---|---|---|");
+    println!("| function | mean error | max error |\n|---|---|---|");
     angles("sine, seventh order", sine, f64::sin);
     angles("cosine, seventh order", cosine, f64::cos);
     angles("sine, fifth order (paper)", paper_sine, f64::sin);
@@ -32,7 +32,7 @@ fn main() {
     println!("| paper, Eq. 27 | 6 | 103 | 57 | 6 | 6 | | | |");
 
     println!("\nTorques of loaded joints on a UR5, Nm\n");
-    println!("| kernel and numbers | mean error | greatest error |\n|---|---|---|");
+    println!("| kernel and numbers | mean error | max error |\n|---|---|---|");
     let wrench = of_kernel::<Q1_14, Wrench>();
     torques("wrench, words", wrench);
     torques("projection, words", of_kernel::<Q1_14, Projection>());

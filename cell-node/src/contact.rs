@@ -1,4 +1,4 @@
-//! What a cell feels, and what that does to the joints: the paper's Algorithm 1 and `tau = J F_z`.
+//! From a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
 //! Integers only, exact up to three roundings that each have a name: [`Force`] (16 fraction bits),
 //! [`Torque::words`] (Q3.12), and whatever a sum does with [`Torque::exact`]. Never panics, bounded work.
@@ -19,7 +19,7 @@ impl Force {
     /// The contact force F_c is the exact sum of the three words. Contact and proximity below their
     /// thresholds count as none, as does a fused force below its own; comparisons are exact, and what
     /// equals its threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact at 24
-    /// fraction bits and rounded to 16 after the comparison, halves up. No touch pulls: a fused force
+    /// fraction bits and rounded to 16 after the comparison, ties up. A contact cannot pull: a fused force
     /// below zero is none, whatever the threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
@@ -76,8 +76,8 @@ impl Torque {
         self.exact
     }
 
-    /// The torques in Nm as words for the bus, rounded once, halves up; what does not fit in [-8, 8)
-    /// becomes the greatest or the least word, which mean *saturated*. The error of the others is at
+    /// The torques in Nm as words for the bus, rounded once, ties up; what does not fit in [-8, 8)
+    /// becomes the largest or the smallest word, which mean *saturated*. The error of the others is at
     /// most half a step, 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self) -> [Q3_12; MAX_JOINTS] {

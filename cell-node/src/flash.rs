@@ -1,7 +1,7 @@
-//! What a cell keeps when the power is off: its number and its parameters, as bytes with a version and a CRC.
+//! What a cell keeps when the power is off: its node id and its parameters, as bytes with a version and a CRC.
 //!
 //! ```text
-//!   byte 0..3  "SKIN"      4  version, 2      5  the cell's number, 0 for none
+//!   byte 0..3  "SKIN"      4  version, 2      5  the node id, 0 for none
 //!        6..9  serial number, little endian  10  1 when parameters follow, 0 when zeros do
 //!       11..   the parameters' image (see `protocol::parameters`)
 //!     last 2   CRC-16 over all bytes before it, little endian
@@ -24,9 +24,9 @@ pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
 /// What flash holds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Kept {
-    /// The cell's number, if it has one.
+    /// The node id, if the cell has one.
     pub number: Option<CellId>,
-    /// What it computes with, if it has been told.
+    /// The parameters, if the cell is configured.
     pub parameters: Option<Parameters>,
 }
 
@@ -35,7 +35,7 @@ pub struct Kept {
 pub enum Flash {
     /// Nothing yet.
     Empty,
-    /// Something that its CRC does not vouch for.
+    /// An image whose CRC does not match.
     Damaged,
     /// Sound parameters.
     Sound(Parameters),

@@ -1,11 +1,11 @@
-//! Who a cell is, and what it hears for that.
+//! A cell's identity, and the identifiers that it receives for that.
 
 use protocol::id::{CellId, Command, Id, Kind, Node as Address};
 
-/// Identifiers that every cell with a number hears.
+/// Identifiers that every cell with a node id receives.
 pub const OWN: usize = 10;
 
-/// Who a cell is, from the factory on.
+/// A cell's identity.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Identity {
     /// Its number on the bus; none until the network gives it one.
@@ -15,9 +15,9 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// The identifiers that this cell hears whatever the network is like: halt, joints, sync, resume, report;
+    /// The identifiers that this cell receives whatever the state of the network: halt, joints, sync, resume, report;
     /// its own heartbeats' (to notice another cell under its number); what configures and presses it, alone
-    /// or with everyone. A cell without a number hears nothing but its ports.
+    /// or with everyone. A cell without a node id receives only what comes in at its ports.
     #[must_use]
     pub fn hears(&self) -> [Option<Id>; OWN] {
         let all = |cell| {

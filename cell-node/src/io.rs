@@ -1,4 +1,4 @@
-//! The shell around the cells of a process: clock, bus, flash files. It decides nothing.
+//! The shell around the cells of a process: clock, bus, flash files. All decisions are in the core.
 
 mod clock;
 mod flash_file;
@@ -31,7 +31,7 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
-/// Lanes of a cell by port, those it sends on; the last one leads to the gateway's side.
+/// Link ids that a cell sends with, by port; the last one leads to the gateway's side.
 pub type LinkIds = [Option<LinkId>; PORTS + 1];
 
 /// Some cells that share a process and a socket.
@@ -41,9 +41,9 @@ pub struct Cells {
     format: Format,
     clock: Clock,
     subscriptions: Subscriptions,
-    /// What somebody hears may have changed since the filters were set.
+    /// The subscriptions may have changed since the filters were set.
     hears_changed: bool,
-    /// What waits in the socket has been heard since a timer was due.
+    /// What waits in the socket has been received since a timer was due.
     heard_first: bool,
     hearing: Hearing,
     outbox: Vec<Frame>,
@@ -70,7 +70,7 @@ pub enum Stopped {
         bus: String,
         /// The number.
         cell: u8,
-        /// Who has it.
+        /// The serial number of the owner.
         serial: u32,
     },
     /// Wires are simulated, and the bus is not.
@@ -120,11 +120,11 @@ impl Cells {
 
     /// Opens their bus.
     ///
-    /// Cells that are wired to each other hear each other's sums and wires. When they share a socket it has to
+    /// Cells that are wired to each other receive each other's sums and wires. When they share a socket it has to
     /// give them their own frames back.
     ///
     /// # Errors
-    /// When it cannot be used as it is asked for.
+    /// When it cannot be used as requested.
     pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         self.listen();
         let wired = self.cells.iter().any(|hosted_cell| hosted_cell.link_ids.iter().any(Option::is_some));
@@ -140,7 +140,7 @@ impl Cells {
     /// Opens it as soon as it is there.
     ///
     /// # Errors
-    /// When it cannot be used as it is asked for, and waiting would not help.
+    /// When it cannot be used as requested, and waiting would not help.
     pub fn open_again(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         loop {
             std::thread::sleep(AGAIN);
@@ -151,7 +151,7 @@ impl Cells {
         }
     }
 
-    /// Asks the cells what they hear, if that may have changed; what they heard until now, if it has.
+    /// Updates the subscriptions, if they may have changed; the filters until now, if they have.
     fn listen(&mut self) -> Option<Hearing> {
         if !core::mem::take(&mut self.hears_changed) {
             return None;
@@ -194,7 +194,7 @@ impl Cells {
     /// Lets time pass, sends, and waits for frames.
     fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
         let due = self.cells.iter().any(|hosted_cell| hosted_cell.node.poll_timeout() <= now);
-        // What came before a timer was due is heard first, once.
+        // What arrived before a timer was due is processed first, once.
         if due && !core::mem::replace(&mut self.heard_first, true) && sockets.look()? {
             return Ok(());
         }
@@ -208,7 +208,7 @@ impl Cells {
             next = next.min(hosted_cell.node.poll_timeout());
         }
         self.clock.keep(now);
-        // Before what is said now is answered.
+        // Before the answers to what is sent now.
         if let Some(before) = self.listen()
             && let Err(error) = sockets.set_filters(&self.hearing, &before)
         {
@@ -223,7 +223,7 @@ impl Cells {
         Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
     }
 
-    /// Gives a frame to the cells that hear it, and takes at once what they say to it.
+    /// Passes a frame to the cells that receive it, and takes their answers at once.
     fn take(&mut self, received: &Received, bus: &str, now: Micros) -> Result<(), Stopped> {
         let (frame, age) = (&received.frame, self.clock.age(now, received.at_nanos));
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
@@ -259,7 +259,7 @@ impl Cells {
 }
 
 impl HostedCell {
-    /// Writes what the cell has for flash, and takes what it has to send; whether what it hears has changed.
+    /// Writes what the cell has for flash, and takes what it has to send; whether its subscriptions have changed.
     fn collect(&mut self, format: Format, outbox: &mut Vec<Frame>) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());

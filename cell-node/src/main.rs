@@ -14,7 +14,7 @@ use protocol::id::CellId;
 use protocol::skin::{Reply, Skin, Wires};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
-/// A tactile skin cell: hears joint positions, answers with its joint torques.
+/// A tactile skin cell: receives joint positions, answers with its joint torques.
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -29,10 +29,10 @@ struct Arguments {
     /// The bus, one of the skin's
     #[arg(long, value_name = "NAME")]
     bus: String,
-    /// Which of the bus' cells it is, by its number there, 1 to 254
+    /// The cell's node id on the bus, 1 to 254
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
-    /// Several cells in one process over one socket: the first and the last number
+    /// Several cells in one process over one socket: the first and the last node id
     #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = range)]
     nodes: Option<(u8, u8)>,
     /// The skin's description; a cell whose flash is empty takes its parameters from it
@@ -41,8 +41,8 @@ struct Arguments {
     /// Keep parameters in files of this directory; without it a cell forgets them when it ends
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// As from the factory: without parameters, and on a bus with sums without a number, which the network and
-    /// `gateway commission` give it; what flash holds it has
+    /// As from the factory: without parameters, and on a bus with sums without a node id, which the network and
+    /// `gateway commission` assign; what flash holds is used
     #[arg(long)]
     fresh: bool,
     /// Open the bus again when it is gone, and wait for it at the start, instead of ending
@@ -61,12 +61,12 @@ fn range(text: &str) -> Result<(u8, u8), String> {
         text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
     node_ids
         .filter(|&(first, last)| 1 <= first && first <= last && last <= CellId::MAX.get())
-        .ok_or_else(|| "two numbers of 1 to 254, the lesser one first, such as 1-64".to_owned())
+        .ok_or_else(|| "two node ids of 1 to 254, the smaller one first, such as 1-64".to_owned())
 }
 
 /// One line in one piece, for hundreds of cells may share this standard error.
 fn say(text: impl core::fmt::Display) {
-    // When it is closed, nobody wants to know.
+    // When it is closed, there is no reader.
     let _ = std::io::stderr().write_all(format!("cell-node: {text}\n").as_bytes());
 }
 
@@ -85,7 +85,7 @@ fn main() -> ExitCode {
     match prepare(&arguments) {
         Ok((mut cells, sockets, line)) => {
             let Err(stopped) = cells.run(sockets, &line);
-            // Whoever started hundreds of cells says once that their bus is gone.
+            // The program that started hundreds of cells reports once that their bus is gone.
             if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
                 say(stopped);
             }
@@ -132,7 +132,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     };
     let sockets = match cells.open(&line) {
         Err(Stopped::Bus(error)) if line.reconnect && error.may_open_later() => {
-            // Whoever started hundreds of cells knows it.
+            // The program that started hundreds of cells reports it.
             if arguments.with_parent.is_none() {
                 say(format_args!("{error}; waiting for it"));
             }
@@ -155,7 +155,7 @@ fn start(
     let described = skin.cells_of(bus_index).find(|described| described.node == cell).with_context(|| {
         format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
     })?;
-    // Nobody gives a number to a cell without wires.
+    // A cell without wires is never assigned a node id.
     let is_nameless = arguments.fresh && wires.is_some();
     let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
     let file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
@@ -172,7 +172,7 @@ fn start(
         }
         Err(damage) => {
             let name = file.name();
-            say(format_args!("{name} is not used: {damage}; write it anew or delete the file"));
+            say(format_args!("{name} is not used: {damage}; write it again or delete the file"));
             Flash::Damaged
         }
     };

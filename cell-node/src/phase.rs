@@ -1,19 +1,19 @@
-//! When in a period a cell speaks: cells are spread over it, and keep their place.
+//! When in a period a cell sends: cells are spread over it, and keep their phase.
 
 use protocol::id::CellId;
 use protocol::time::{Micros, Span};
 
-/// By number: those of a bus speak one after the other.
+/// By node id: the cells of a bus send one after the other.
 pub(crate) const fn by_number(period: Span, cell: CellId) -> Span {
     Span(period.0 * cell.get() as u64 / 255)
 }
 
-/// By serial number, for cells whose numbers may be the same.
+/// By serial number, for cells whose node ids may be the same.
 pub(crate) const fn by_serial(period: Span, serial: u32) -> Span {
     Span(serial as u64 * 1_000 % period.0)
 }
 
-/// When to speak next after what was due: what was missed in a hang is skipped, and the phase is kept.
+/// When to send next after `due`: periods that passed during a hang are skipped, and the phase is kept.
 pub(crate) fn next(due: Micros, period: Span, now: Micros) -> Micros {
     let skipped = now.since(due).0.checked_div(period.0).unwrap_or(0);
     due + Span((skipped + 1) * period.0)

@@ -5,7 +5,7 @@
 //! are evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words
 //! also holds below -1. All products stay within 32 bits.
 //!
-//! | function | order | mean error | greatest error |
+//! | function | order | mean error | max error |
 //! |---|---|---|---|
 //! | [`sine`], [`cosine`] | 7 | 1.6e-5 | 6.1e-5 |
 //! | [`paper_sine`], [`paper_cosine`] | 5 | 1.9e-4 | 4.4e-4 |
@@ -24,8 +24,8 @@ pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 
 /// The odd polynomial of seventh order for a quarter turn: coefficients of z, z^3, z^5, z^7.
 ///
-/// Of the integers whose sum is one (so that the sine of a quarter turn is one) these leave the least
-/// mean error when every intermediate result is cut off, not rounded; found by search.
+/// Of the integers whose sum is one (so that the sine of a quarter turn is one) these have the smallest
+/// mean error when every intermediate result is truncated, not rounded; found by search.
 const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
 /// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such
@@ -84,7 +84,7 @@ fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) 
     let horner = |sum: i32, coefficient: i32| coefficient + (product(square, sum) >> 15);
     let factor = coefficients.into_iter().rev().reduce(horner).unwrap_or(0);
     let sine = product(z, factor); // 30 fraction bits, at most 2^30
-    let rounded = (sine + (1 << 15) + (sine >> 31)) >> 16; // halves away from zero, which is odd
+    let rounded = (sine + (1 << 15) + (sine >> 31)) >> 16; // ties away from zero, which is odd
     let [low, high, ..] = rounded.to_le_bytes(); // a sine is within 1
     Q1_14::from_bits(i16::from_le_bytes([low, high]))
 }
@@ -130,7 +130,7 @@ mod tests {
     use super::*;
     use protocol::fixed::Acc;
 
-    /// Mean and greatest error over all angles.
+    /// Mean and maximum error over all angles.
     fn errors(function: impl Fn(Q1_14) -> f64, oracle: impl Fn(f64) -> f64) -> (f64, f64) {
         let mut sum = 0.0;
         let mut max = 0.0_f64;
@@ -151,8 +151,8 @@ mod tests {
             ("paper's sine", errors(|z| paper_sine(z).to_f64(), f64::sin), (1.9e-4, 4.4e-4)),
             ("paper's cosine", errors(|z| paper_cosine(z).to_f64(), f64::cos), (1.9e-4, 4.4e-4)),
         ] {
-            println!("{name}: mean {mean:.3e}, greatest {max:.3e}");
-            assert!(mean <= bars.0 && max <= bars.1, "{name}: mean {mean:e}, greatest {max:e}");
+            println!("{name}: mean {mean:.3e}, max {max:.3e}");
+            assert!(mean <= bars.0 && max <= bars.1, "{name}: mean {mean:e}, max {max:e}");
         }
     }
 

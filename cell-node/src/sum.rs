@@ -1,15 +1,15 @@
 //! Sums of torques along a tree: the paper's Eq. 28, in Q7.8.
 //!
 //! ```text
-//!   joints ──> begin: own torque, exact      ┐                ┌─> due ──> when to speak next
+//!   joints ──> begin: own torque, exact      ┐                ┌─> due ──> when to send next
 //!   sum of a child ──> take: largest count ──┼─ [Sum] ────────┼─> say ──> six words and a count
-//!   a child's word ──> state                 ┘                └─> judge: children whose sums did not come
+//!   state of a child ──> state               ┘                └─> missing: children whose sums did not come
 //! ```
 //!
-//! A child's sums are taken while its *lease* runs: from the epoch for which it said that they are for this cell, as
-//! they come, epoch by epoch without a gap. So a child that fell silent for one epoch is free to send its sums to
-//! another, and one that is late loses nothing but that epoch.
-//! A sum of no cells, count 0, ends the lease: nothing is to come.
+//! A child's sums are taken while its *lease* runs: from the epoch that its state message names, epoch by epoch without
+//! a gap. So a child that was silent for one epoch is free to send its sums to another parent, and one that is late
+//! loses nothing but that epoch.
+//! A sum of no cells, count 0, ends the lease: nothing more is to come.
 
 use protocol::fixed::{Acc, Q7_8};
 use protocol::packet::{Epoch, WORDS};
@@ -17,12 +17,12 @@ use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
 
-/// A child whose sum did not come is told so in so many epochs: what it says to that may be lost too.
+/// A missing sum is NACKed in so many epochs, because the child's reply may be lost too.
 const MISSING: u8 = 4;
 /// Fraction bits that rounding takes away.
 const SHORTENED: u32 = 30 - 8;
 
-/// A sum as it stands on the bus.
+/// A sum as it is sent on the bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Words {
     /// Nm.
@@ -35,14 +35,14 @@ impl Words {
     /// Nothing is to come any more.
     const END: Self = Self { torque: [Q7_8::ZERO; WORDS], count: 0 };
 
-    /// Whether it says that nothing more is to come.
+    /// Whether it ends the lease: nothing more is to come.
     #[must_use]
     pub const fn is_end(&self) -> bool {
         self.count == 0
     }
 }
 
-/// What is known of the sums of one child.
+/// The state of one child's sums.
 #[derive(Clone, Copy, Debug, Default)]
 struct Child {
     /// The epoch of the last sum that came, while the lease runs.
@@ -51,13 +51,13 @@ struct Child {
     heard: bool,
     /// The sum of the present epoch.
     taken: Option<Words>,
-    /// One that came before its child said that it is for this cell.
+    /// One that came before the child's state message.
     waiting: Option<(Epoch, Words)>,
-    /// For so many epochs more it is told that nothing came, unless something does.
+    /// For so many epochs more a NACK is sent, unless a sum comes.
     missing: u8,
 }
 
-/// What one cell adds up.
+/// The sum of one cell and its children.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sum {
     slots: Option<Slots>,
@@ -67,22 +67,22 @@ pub struct Sum {
     begin: Begin,
     /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
     own: Option<[i32; WORDS]>,
-    /// It spoke in the epoch before: without anything to add it says so once.
+    /// It sent a sum in the epoch before: without anything to add it sends one end.
     ends: bool,
     /// What rounding took away, in steps of 2^-30 Nm.
     carry: [i64; WORDS],
     children: [Child; PORTS],
-    /// What is to be said waits for a sign of the parent.
+    /// The sum to be sent waits for a sign of the parent.
     pub(crate) held: bool,
     /// When it is to be sent.
     due: Option<Micros>,
     /// The last one that was sent, and its epoch.
     said: Option<(Epoch, Words)>,
-    /// The parent did not take the last sum, and has to be told anew whom they are for.
+    /// The parent did not take the last sum: the state is resent with the next.
     pub(crate) restate: bool,
-    /// Whether it has been looked who is missing in this epoch.
-    rated: bool,
-    /// When it is looked, if not only at the next joints.
+    /// Whether missing sums of this epoch have been checked.
+    is_checked: bool,
+    /// When they are checked, if not only at the next joints.
     check: Option<Micros>,
     /// Sums sent, resends among them.
     pub sent: u16,
@@ -97,20 +97,20 @@ pub struct Sum {
 pub struct Begin {
     /// Its number.
     pub epoch: Epoch,
-    /// When its joints stood on the bus.
+    /// When its joints were on the bus.
     pub at: Micros,
     /// From one broadcast to the next.
     pub period: Span,
-    /// Wires to the root; `None` without a way up.
+    /// Wires to the root; `None` where it is unreachable.
     pub depth: Option<u8>,
-    /// Whether sums may go up in this epoch.
+    /// Whether sums may be sent in this epoch.
     pub speaks: bool,
     /// Bit p: the cell at port p is a child.
     pub children: u8,
 }
 
 impl Sum {
-    /// Sums are said in these slots from the next joints on, or not at all.
+    /// Sums are sent in these slots from the next joints on, or not at all.
     pub fn set_slots(&mut self, slots: Option<Slots>) {
         if slots.is_none() {
             *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
@@ -118,12 +118,12 @@ impl Sum {
         self.slots = slots;
     }
 
-    /// Whether sums are said.
+    /// Whether sums are sent.
     pub(crate) const fn is_on(&self) -> bool {
         self.slots.is_some()
     }
 
-    /// New joints: `own` is this cell's torque at full width, `None` when it feels nothing.
+    /// New joints: `own` is this cell's torque at full width, `None` without contact.
     pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; WORDS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
@@ -140,24 +140,24 @@ impl Sum {
             self.carry = [0; WORDS];
         }
         self.own = own.map(|exact| self.round(exact, slots.carry));
-        // What was said last is not to be held for ever.
+        // The parent must not keep the last sum for ever.
         self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         self.due = None;
         self.plan(begin.at);
-        (self.rated, self.check) = (false, None);
+        (self.is_checked, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
             self.watch();
         }
     }
 
-    /// It is looked who is missing before the next joints come, while there is time to do something about it.
+    /// Missing sums are checked before the next joints, while there is time to react.
     pub(crate) fn watch(&mut self) {
-        if !self.rated && self.epoch.is_some() {
+        if !self.is_checked && self.epoch.is_some() {
             self.check = Some(self.begin.at + self.settles());
         }
     }
 
-    /// How long after joints all has been said that is said in an epoch.
+    /// How long after joints all sums of an epoch have been sent.
     const fn settles(&self) -> Span {
         Span(self.begin.period.0 * 7 / 8)
     }
@@ -174,7 +174,7 @@ impl Sum {
         words
     }
 
-    /// A child says that its sums from this epoch on are for this cell.
+    /// A child's state message: its sums from this epoch on are for this cell.
     pub fn state(&mut self, now: Micros, port: usize, epoch: Epoch) {
         let Some(child) = self.children.get_mut(port) else { return };
         child.last = Some(epoch.before());
@@ -205,9 +205,8 @@ impl Sum {
         self.plan(now);
     }
 
-    /// When to say what there is to say: at once when every child has spoken, else in this cell's slot, else, where
-    /// a child is late that spoke in the epoch before, as late as still helps; and what comes after that in the next
-    /// slot.
+    /// When to send: at once when the sum of every child is there; else in this cell's slot; where a child is late that
+    /// sent in the epoch before, as late as is still useful. What comes after that is sent in the next slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
         if self.words().is_none() {
@@ -234,13 +233,13 @@ impl Sum {
         self.due = Some(self.begin.at + Span(at));
     }
 
-    /// Wires to the root, as many as there may be where there is no way up.
+    /// Wires to the root; the maximum where it is unreachable.
     fn depth(&self) -> u8 {
         self.begin.depth.or_else(|| self.slots.map(|slots| slots.deepest)).unwrap_or(0)
     }
 
-    /// After joints, by when a sum that waits for a late child is said: half a slot for each wire to the root before all
-    /// is said, so that who waits above does not wait in vain.
+    /// After joints, by when a sum that waits for a late child is sent: half a slot earlier for each wire to the root,
+    /// so that the sum still reaches those above that wait for it.
     fn late(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
         Span(self.settles().0.saturating_sub(u64::from(self.depth()) * width / 2))
@@ -251,12 +250,12 @@ impl Sum {
         self.children.iter().any(|child| child.last.is_some())
     }
 
-    /// By when the sum of the next epoch has to be said that waits for a late child.
+    /// By when the sum of the next epoch has to be sent that waits for a late child.
     pub(crate) fn late_at_next(&self) -> Micros {
         self.begin.at + self.begin.period + self.late()
     }
 
-    /// A child is none any more.
+    /// The cell at a port is no child any more.
     pub(crate) fn disown(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
             // What was taken in this epoch stays: its sender sends no other for it.
@@ -266,7 +265,7 @@ impl Sum {
         }
     }
 
-    /// The way up is lost: nothing more of this epoch is said.
+    /// The parent is lost: nothing more of this epoch is sent.
     pub(crate) const fn fall_silent(&mut self) {
         self.begin.speaks = false;
         self.due = None;
@@ -277,8 +276,8 @@ impl Sum {
         self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
     }
 
-    /// The sum to be sent, when its time has come: cumulative, all that is known of this epoch. With it, whether the
-    /// parent has to be told that it is for it.
+    /// The sum to be sent, when its time has come: cumulative, all that is known of this epoch. With it, whether a
+    /// state message has to go before it.
     pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
         let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
@@ -296,7 +295,7 @@ impl Sum {
         Some((epoch, words, !goes_on))
     }
 
-    /// All that is known of this epoch; `None` when there is nothing to say.
+    /// All that is known of this epoch; `None` when there is nothing to send.
     fn words(&self) -> Option<Words> {
         let mut sums = self.own.unwrap_or_default().map(|own| (i64::from(own), false));
         let mut count = u32::from(self.own.is_some());
@@ -317,31 +316,31 @@ impl Sum {
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// Whether the last sum was said in this epoch.
+    /// Whether the last sum was sent in this epoch.
     pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
         self.said.is_some_and(|(of, _)| of == epoch)
     }
 
-    /// Whether a sum went up in this epoch or the one before, and others are to follow.
+    /// Whether a sum was sent in this epoch or the one before, and others are to follow.
     pub(crate) fn is_busy(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
         self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
     }
 
-    /// Joints that are not answered: whoever goes on after them has to be stated anew.
+    /// Joints that are not answered: the leases end, and children that go on have to state again.
     pub(crate) fn skip(&mut self) {
         self.epoch = None;
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
         self.held = false;
-        self.rated = true;
+        self.is_checked = true;
     }
 
-    /// Something was heard so long after it stood on the bus: when that is more than a quarter of a period, the machine
-    /// itself is late, nobody is to blame, and it is not looked who is missing in this epoch.
+    /// A frame was received so long after it was on the bus. Beyond a quarter of a period the machine itself is late,
+    /// and missing sums are not checked in this epoch.
     pub(crate) const fn heard_after(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
-            self.rated = true;
+            self.is_checked = true;
             self.check = None;
         }
     }
@@ -351,20 +350,20 @@ impl Sum {
         self.epoch.is_none() || now >= self.begin.at + self.settles()
     }
 
-    /// How late it is looked before the next joints, when the time for that has come.
+    /// When the check before the next joints is due: how late it is.
     pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
         self.check.take_if(|check| *check <= now).map(|check| now.since(check))
     }
 
-    /// Looks once in an epoch: bit p says that the sum of the child at port p should have come and did not. Such a
-    /// sum is not taken any more.
-    pub(crate) fn comparator(&mut self) -> Option<(Epoch, u8)> {
-        if core::mem::replace(&mut self.rated, true) {
+    /// Missing sums, once in an epoch: bit p is set when the sum of the child at port p should have come and did not.
+    /// The lease of such a child ends.
+    pub(crate) fn missing(&mut self) -> Option<(Epoch, u8)> {
+        if core::mem::replace(&mut self.is_checked, true) {
             return None;
         }
         let mut nack = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
-            // Nothing came, or what came was without a word whom it is for.
+            // Nothing came, or a sum without a state message.
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
             if unsaid || (child.last.is_some() && !child.heard) {
                 child.last = None;

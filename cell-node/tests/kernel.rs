@@ -115,7 +115,7 @@ fn the_operations_on_a_ur5_are_what_the_docs_say() {
 }
 
 #[test]
-fn what_nobody_reads_is_not_computed_behind_an_odd_twist_either() {
+fn unused_components_are_not_computed_behind_an_odd_twist_either() {
     // J_1 = sin(alpha) m_y + cos(alpha) m_z, and m_y takes two products after the turn of joint 2.
     let mut parameters = Case::all().into_iter().find(|case| case.joint == 2).unwrap().parameters();
     parameters.rows[0] = Row { alpha: Q1_14::nearest(0.3), ..Row::default() };
@@ -168,7 +168,7 @@ fn arm_in_reach() -> impl Strategy<Value = Parameters> {
     })
 }
 
-/// The greatest difference of two Jacobians.
+/// The largest difference of two Jacobians.
 fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
     lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
 }

@@ -24,18 +24,18 @@ fn words(bits: i16) -> Words {
     Words { torque: [Q7_8::from_bits(bits); WORDS], count: 1 }
 }
 
-/// What is said until half a period later.
+/// What is sent until half a period later.
 fn said(sum: &mut Sum, after: u64) -> Option<Words> {
     sum.say(Micros(after + 8_000)).map(|(_, words, _)| words)
 }
 
 // LEASE-1, LEASE-2
 #[test]
-fn a_sum_that_came_after_its_epoch_is_not_taken_for_that_of_another() {
+fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
     let mut sum = Sum::default();
     sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 129, 0);
-    // A machine that was away hands it on late; then the child says whom its sums are for from now on.
+    // A machine that was late delivers it late; then the child's state message arrives.
     sum.take(Micros(100), 0, Epoch(126), words(-154));
     sum.state(Micros(200), 0, Epoch(129));
     assert_eq!(said(&mut sum, 0), None, "nothing of this epoch has come");
@@ -45,7 +45,7 @@ fn a_sum_that_came_after_its_epoch_is_not_taken_for_that_of_another() {
 
 // LEASE-2
 #[test]
-fn a_sum_that_came_before_its_child_said_whom_it_is_for_is_taken_then() {
+fn a_sum_that_arrives_before_its_state_is_taken_when_the_state_arrives() {
     let mut sum = Sum::default();
     sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 7, 0);

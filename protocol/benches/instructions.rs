@@ -46,7 +46,7 @@ fn pair(id: Id, frames: [Frame; 2]) -> Packet {
     let waiting = segment.push(Micros(0), id, first.data());
     match (waiting, segment.push(Micros(134), id, second.data())) {
         (Ok(Reassembly::Waiting), Ok(Reassembly::Complete(packet))) => packet,
-        paired => unreachable!("two halves of one packet: {paired:?}"),
+        paired => unreachable!("two segments of one packet: {paired:?}"),
     }
 }
 

@@ -106,7 +106,7 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_timeout: Duration,
-    /// A sender was told that the interface is down, and the receiver is yet to hear it: the kernel tells a
+    /// A send failed because the interface is down, and the next receive will report it: the kernel reports to a
     /// socket once.
     down: AtomicBool,
 }
@@ -115,10 +115,10 @@ impl Bus {
     /// How long [`Bus::receive_one_patiently`] waits.
     pub const TIMEOUT: Duration = Duration::from_millis(100);
 
-    /// Opens a bus. When this returns, the filters are in force.
+    /// Opens a bus. When this returns, the filters are set.
     ///
     /// # Errors
-    /// When the bus cannot be used as asked; the error says what to do.
+    /// When the bus cannot be used as requested; the error has a hint.
     pub fn open(name: &str, choice: Choice, options: &Options) -> Result<Self, BusError> {
         check_name(name)?;
         check_count(name, &options.filters)?;
@@ -126,7 +126,7 @@ impl Bus {
         let (socket, receive_buffer) = kind.carrier().open(name, options)?;
         let Options { fd, send_timeout, .. } = *options;
         sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::TIMEOUT)).map_err(|errno| {
-            BusError::Io { name: name.to_owned(), doing: "set the patience of", source: errno.into() }
+            BusError::Io { name: name.to_owned(), doing: "set the timeout of", source: errno.into() }
         })?;
         Ok(Self {
             name: name.to_owned(),
@@ -154,7 +154,7 @@ impl Bus {
     /// Whether nothing real hangs on this bus: the embedded one, a vcan or a vxcan.
     ///
     /// # Errors
-    /// When the kernel does not say.
+    /// When the kernel does not report it.
     pub fn is_virtual(&self) -> Result<bool, BusError> {
         self.carrier().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
     }
@@ -163,7 +163,7 @@ impl Bus {
         self.kind.carrier()
     }
 
-    /// How many bytes may wait unread, as the kernel granted and counts them (twice what was asked for when
+    /// How many bytes may wait unread, as the kernel granted and counts them (twice what was requested when
     /// all was granted).
     #[must_use]
     pub const fn receive_buffer(&self) -> usize {
@@ -193,7 +193,7 @@ impl Bus {
     }
 
     /// The same, but waits up to [`Bus::TIMEOUT`] for one frame, and takes only this one: one system call
-    /// instead of two for whoever has nothing else to do and is woken for each frame.
+    /// instead of two for a receiver that has nothing else to do and is woken for each frame.
     ///
     /// # Errors
     /// As [`Bus::receive`].
@@ -244,7 +244,7 @@ impl Bus {
         self.fd || frames.iter().all(|frame| frame.format() == Format::Classic)
     }
 
-    /// Has everything sent, waiting for room in between; `some` sends from so many on, and says how many.
+    /// Has everything sent, waiting for room in between; `some` sends from so many on, and returns how many.
     fn patiently(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
         while sent < target {
@@ -274,7 +274,7 @@ impl Bus {
             return Err(BusError::Full { name: self.name.clone(), waited: self.send_timeout });
         }
         let waited = if interface {
-            // Its queue is shared and nothing tells when it has room, so look again soon.
+            // Its queue is shared and nothing signals when it has room, so look again soon.
             wait_on(&mut [], Some(left.min(RECHECK)))
         } else {
             self.poll(PollFlags::OUT, Some(left))
@@ -282,9 +282,9 @@ impl Bus {
         waited.map(|_| ()).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Sends frames, at most 64, if the bus takes them all at once, and says whether it did. Never waits,
-    /// never allocates, and does not say why not: for a loop that has its own deadline. That the interface is
-    /// down is what the next [`Bus::receive`] says.
+    /// Sends frames, at most 64, if the bus takes them all at once, and returns whether it did. Never waits,
+    /// never allocates, and returns no reason: for a loop that has its own deadline. That the interface is
+    /// down is reported by the next [`Bus::receive`].
     #[must_use]
     pub fn offer(&self, frames: &[Frame]) -> bool {
         if !self.carries(frames) {
@@ -297,7 +297,7 @@ impl Bus {
         sent.is_ok_and(|sent| sent == frames.len())
     }
 
-    /// Receives what passes these filters from now on, at most [`Filter::MAX`], in place of what was asked for
+    /// Receives what passes these filters from now on, at most [`Filter::MAX`], in place of what was requested
     /// before. What was sent on the bus before by this socket, or has come to it already, is not touched. For one
     /// thread at a time.
     ///

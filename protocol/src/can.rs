@@ -117,7 +117,7 @@ pub enum FrameError {
     /// More data than the format carries.
     #[error("{got} data bytes do not fit: at most {max}")]
     Length {
-        /// Bytes wanted.
+        /// Bytes given.
         got: usize,
         /// Bytes that fit.
         max: usize,
@@ -172,10 +172,10 @@ impl Frame {
         Ok(Self { id, format, flags, raw_dlc: 0, len, data })
     }
 
-    /// A remote frame that asks for `len` bytes.
+    /// A remote frame that requests `len` bytes.
     ///
     /// # Errors
-    /// When more than 8 bytes are asked for.
+    /// When more than 8 bytes are requested.
     pub fn remote(id: u32, len: u8) -> Result<Self, FrameError> {
         if len > 8 {
             return Err(FrameError::Length { got: usize::from(len), max: 8 });
@@ -210,7 +210,7 @@ impl Frame {
         self.id & EXTENDED != 0
     }
 
-    /// Whether this asks for data instead of bringing it.
+    /// Whether this requests data instead of carrying it.
     #[must_use]
     pub const fn is_remote(&self) -> bool {
         self.id & REMOTE != 0
@@ -240,7 +240,7 @@ impl Frame {
         self.raw_dlc
     }
 
-    /// How many bytes it carries, or asks for when remote.
+    /// How many bytes it carries, or requests when remote.
     #[must_use]
     pub const fn len(&self) -> u8 {
         self.len

@@ -32,7 +32,7 @@ pub struct Timestamp {
     pub nine_digits: bool,
 }
 
-/// Whether the frame was sent or received by whoever took the capture.
+/// Whether the frame was sent or received by the node that took the capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Direction {
     /// `T`.
@@ -50,7 +50,7 @@ pub struct Record<'a> {
     pub interface: &'a str,
     /// What.
     pub frame: Frame,
-    /// Which way, when the capture says so.
+    /// Which way, when the capture has it.
     pub direction: Option<Direction>,
 }
 

@@ -1,7 +1,7 @@
-//! Files that people write, in TOML, and what is said when something in them is wrong: one line that
+//! Files that people write, in TOML, and the errors when something in them is wrong: one line that
 //! names the file, the line and column, the key, the value and what is allowed.
 //!
-//! What the file says is read into a plain struct (`serde`, unknown keys refused); a `check` function
+//! The file is read into a plain struct (`serde`, unknown keys refused); a `check` function
 //! makes of it what it means, or a [`Fault`]. The file is read without positions, which is quick; only
 //! when something is wrong is it read again with them.
 

@@ -4,7 +4,7 @@
 //! literature does: Q1.14 spans [-2, 2). The crate `fixed` counts the sign bit in and calls the same
 //! format `I2F14`.
 //!
-//! A format says how fine a number is, not what it measures: [`crate::message`] says which word is a
+//! A format is the resolution of a number, not its quantity: [`crate::message`] defines which word is a
 //! force and which a torque. There are no overloaded operators, so that every place where bits can be
 //! lost has a name: [`Acc::round`] and the saturating operations.
 
@@ -26,13 +26,13 @@ pub type Q7_8 = Q<8>;
 /// Temperatures in degrees Celsius: [-512, 512) in steps of 1.6e-2.
 pub type Q9_6 = Q<6>;
 
-/// A real number that no `Q` of the wanted format can hold.
+/// A real number that is outside the range of a `Q` format.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("{got} is not in [{min}, {bound})")]
 pub struct OutOfRange {
     /// The number that does not fit.
     pub got: f64,
-    /// The least number of the format.
+    /// The smallest number of the format.
     pub min: f64,
     /// The first number above the format's range.
     pub bound: f64,
@@ -41,9 +41,9 @@ pub struct OutOfRange {
 impl<const F: u32> Q<F> {
     /// Nothing.
     pub const ZERO: Self = Self(0);
-    /// The greatest number; in a torque it means *saturated*.
+    /// The largest number; in a torque it means *saturated*.
     pub const MAX: Self = Self(i16::MAX);
-    /// The least number; in a torque it means *saturated*.
+    /// The smallest number; in a torque it means *saturated*.
     pub const MIN: Self = Self(i16::MIN);
     /// Steps in one.
     const SCALE: f64 = (1_u32 << F) as f64;
@@ -66,14 +66,14 @@ impl<const F: u32> Q<F> {
         f64::from(self.0) / Self::SCALE
     }
 
-    /// The nearest number of this format, halves away from zero; out of range it saturates, and what
+    /// The nearest number of this format, ties away from zero; out of range it saturates, and what
     /// is not a number becomes zero.
     #[must_use]
     pub fn nearest(value: f64) -> Self {
         Self(saturate(round_half_away(value * Self::SCALE)))
     }
 
-    /// The nearest number of this format, halves away from zero.
+    /// The nearest number of this format, ties away from zero.
     ///
     /// # Errors
     /// When the nearest step lies outside the range, or `value` is not a number.
@@ -84,8 +84,8 @@ impl<const F: u32> Q<F> {
         i16::try_from(round_half_away(value * Self::SCALE)).map(Self).map_err(|_| Self::out_of_range(value))
     }
 
-    /// The least number of this format that is not below `value`: how thresholds are rounded, so that
-    /// nothing below the threshold that was asked for gets through.
+    /// The smallest number of this format that is not below `value`: how thresholds are rounded, so that
+    /// nothing below the requested threshold gets through.
     ///
     /// # Errors
     /// When that number lies outside the range, or `value` is not a number.
@@ -107,7 +107,7 @@ impl<const F: u32> Q<F> {
         self.0 == i16::MAX || self.0 == i16::MIN
     }
 
-    /// The negative; the least number becomes the greatest.
+    /// The negative; the smallest number becomes the largest.
     #[must_use]
     pub const fn saturating_neg(self) -> Self {
         Self(self.0.saturating_neg())
@@ -140,7 +140,7 @@ impl<const F: u32> Q<F> {
 
 impl Q1_14 {
     /// An angle in radians as quarter turns, `z = angle / (pi/2)` wrapped into [-2, 2), to the nearest
-    /// step (halves away from zero). `None` when the angle is not finite.
+    /// step (ties away from zero). `None` when the angle is not finite.
     ///
     /// The range of Q1.14 is one whole turn, so wrapping is what 16-bit words do by themselves
     /// (paper, Eq. 11; the period of its Eq. 12 is 4, not 2).
@@ -195,7 +195,7 @@ impl<const F: u32> Acc<F> {
         Acc(self.0.saturating_mul(1_i64 << (G - F)))
     }
 
-    /// Rounds to `G` fractional bits, halves up, and holds the result within 16 bits: one of the few
+    /// Rounds to `G` fractional bits, ties up, and holds the result within 16 bits: one of the few
     /// places where bits may be lost.
     ///
     /// The error is at most half a step of 2^-G unless the result saturates.
@@ -214,7 +214,7 @@ impl<const F: u32> Acc<F> {
     }
 }
 
-/// Rounds to the nearest integer, halves away from zero; saturates at 64 bits, and NaN becomes 0.
+/// Rounds to the nearest integer, ties away from zero; saturates at 64 bits, and NaN becomes 0.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_precision_loss,
@@ -283,7 +283,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_threshold_is_the_least_step_not_below_it(value in -31.9_f64..31.9) {
+        fn a_threshold_is_the_smallest_step_not_below_it(value in -31.9_f64..31.9) {
             let word = Q5_10::try_at_least(value).unwrap();
             prop_assert!(word.to_f64() >= value && word.to_f64() - value < 1.0 / 1_024.0);
         }
@@ -297,7 +297,7 @@ mod tests {
         }
 
         #[test]
-        fn halves_round_up(whole in -32_768_i64..32_767) {
+        fn ties_round_up(whole in -32_768_i64..32_767) {
             let half = Acc::<13>::from_steps(2 * whole + 1);
             prop_assert_eq!(i64::from(half.round::<12>().to_bits()), whole + 1);
         }

@@ -1,4 +1,4 @@
-//! Who speaks, and of what: the eleven bits of an identifier.
+//! Identifiers: kind of packet and node in eleven bits.
 //!
 //! ```text
 //!   bit   10 9 8 | 7 6 5 4 3 2 1 0
@@ -15,16 +15,16 @@ use thiserror::Error;
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct CellId(u8);
 
-/// A number that is no cell's.
+/// A number that is no node id of a cell.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[error("{got} is no cell number: 1 to {max} are (0 is the gateway, 255 everyone)", max = CellId::MAX.0)]
+#[error("{got} is no node id: 1 to {max} are (0 is the gateway, 255 everyone)", max = CellId::MAX.0)]
 pub struct CellIdOutOfRange {
-    /// The number that was asked for.
+    /// The number that was requested.
     pub got: i64,
 }
 
 impl CellId {
-    /// The greatest cell number.
+    /// The largest node id of a cell.
     pub const MAX: Self = Self(254);
     /// How many cells a bus can have.
     pub const COUNT: usize = 254;
@@ -52,7 +52,7 @@ impl CellId {
         self.0 as usize - 1
     }
 
-    /// All cell numbers, in order.
+    /// All node ids of cells, in order.
     pub fn all() -> impl Iterator<Item = Self> {
         (1..=Self::MAX.0).map(Self)
     }
@@ -117,7 +117,7 @@ impl core::fmt::Display for Node {
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[repr(u8)]
 pub enum Kind {
-    /// From the gateway's side to everyone; the node field says what is commanded.
+    /// From the gateway's side to everyone; the node field is the command.
     Command = 0,
     /// A partial sum of torques.
     Sum = 1,
@@ -194,7 +194,7 @@ pub enum Command {
     Halt = 0,
     /// The joint positions of a new epoch.
     Joints = 1,
-    /// Answer with a heartbeat when all that the last joints asked for is done.
+    /// Answer with a heartbeat when all answers to the last joints are sent.
     Sync = 2,
     /// Leave the halted state.
     Resume = 3,
@@ -317,10 +317,10 @@ mod tests {
     }
 
     #[test]
-    fn cell_numbers_are_1_to_254() {
+    fn node_ids_of_cells_are_1_to_254() {
         assert_eq!(CellId::all().count(), CellId::COUNT);
         assert!(CellId::all().all(|cell| Node::from_byte(cell.get()) == Node::Cell(cell)));
         let error = CellId::new(255).unwrap_err().to_string();
-        assert_eq!(error, "255 is no cell number: 1 to 254 are (0 is the gateway, 255 everyone)");
+        assert_eq!(error, "255 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)");
     }
 }

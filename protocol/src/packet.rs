@@ -91,7 +91,7 @@ pub struct Packet {
     pub words: [i16; WORDS],
     /// The joint broadcast it belongs to.
     pub epoch: Epoch,
-    /// Cells whose torque is in the words, or what the kind says.
+    /// Cells whose torque is in the words, or as the kind defines it.
     pub count: u8,
 }
 
@@ -114,7 +114,7 @@ pub enum PacketError {
     Crc {
         /// What the bytes give.
         expected: u16,
-        /// What the packet says.
+        /// The CRC in the packet.
         got: u16,
     },
     /// A classic frame that gives no packet with the one before it or the one after it.
@@ -146,7 +146,7 @@ impl Packet {
         bytes
     }
 
-    /// The sixteen bytes with zeros for the CRC: for whoever reads its fields and sends nothing.
+    /// The sixteen bytes with zeros for the CRC: for reading its fields only.
     #[must_use]
     pub fn without_crc(&self) -> [u8; BYTES] {
         let mut bytes = [0; BYTES];
@@ -231,19 +231,19 @@ fn checksum(id: Id, words: &[[u8; 2]], end: [u8; 2]) -> u16 {
 /// What became of a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reassembly {
-    /// A first half; its second one is awaited.
+    /// A first segment; the second one is awaited.
     Waiting,
-    /// Both halves were there and the CRC is right.
+    /// Both segments arrived and the CRC is right.
     Complete(Packet),
-    /// A packet is lost: two halves that do not belong together, or that came too far apart. The older half is
-    /// dropped, and the newer one is now the first. Said once for a packet both of whose halves came.
+    /// A packet is lost: two segments that do not belong together, or that came too far apart. The older one is
+    /// dropped, and the newer one is now the first. Returned once for a packet both of whose segments came.
     Incomplete,
 }
 
-/// The waiting first half of a packet in two classic frames, one of these per identifier.
+/// The waiting first segment of a packet in two classic frames, one of these per identifier.
 ///
-/// Halves come in order and within [`Segment::within`] of each other. When the CRC of a pair fails, only
-/// the older half is dropped, so that a lost frame costs one packet and not every later one.
+/// Segments come in order and within [`Segment::within`] of each other. When the CRC of two segments fails, only
+/// the older one is dropped, so that a lost frame costs one packet and not every later one.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Segment {
     waiting: Option<Waiting>,
@@ -253,21 +253,21 @@ pub struct Segment {
 struct Waiting {
     data: [u8; 8],
     since: Micros,
-    /// It may be the second half of a packet that has been counted as incomplete: it is not counted again.
+    /// It may be the second segment of a packet that has been counted as incomplete: it is not counted again.
     counted: bool,
 }
 
 impl Segment {
-    /// The longest time between the arrivals of two halves of joints and of what answers them: less than the 16 ms
-    /// after which the next ones usually come, for of 65 536 pairs of halves of two packets one has a right CRC.
+    /// The longest time between the segments of joints and of the answers to them: less than the 16 ms after which
+    /// the next ones usually come, because one in 65 536 pairs of segments of different packets has a right CRC.
     const WITHIN_A_PERIOD: Span = Span::from_millis(15);
-    /// The longest time between those of everything else, most of which is said once.
+    /// The longest time between those of everything else, most of which is sent once.
     const WITHIN: Span = Span::from_millis(100);
 
     /// Nothing waiting.
     pub const NONE: Self = Self { waiting: None };
 
-    /// The longest time between the arrivals of the two halves of a packet.
+    /// The longest time between the arrivals of the two segments of a packet.
     #[must_use]
     pub fn within(id: Id) -> Span {
         let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
@@ -338,7 +338,7 @@ mod tests {
         let mut segment = Segment::NONE;
         let mut push = |at, frame: &Frame| segment.push(Micros(at), id, frame.data()).unwrap();
         assert_eq!(push(0, &segments(1)[0]), Reassembly::Waiting);
-        // The second half of epoch 1 is lost.
+        // The second segment of epoch 1 is lost.
         assert_eq!(push(1_000, &segments(2)[0]), Reassembly::Incomplete);
         assert_eq!(push(1_100, &segments(2)[1]), Reassembly::Complete(make(2)));
         assert_eq!(push(9_000, &segments(3)[0]), Reassembly::Waiting);
@@ -379,7 +379,7 @@ mod tests {
             assert_eq!(push(apart, &segments(2)[1]), Reassembly::Incomplete);
             assert_eq!(push(50_000, &segments(3)[0]), Reassembly::Waiting, "that packet is counted");
             assert_eq!(push(50_100, &segments(3)[1]), Reassembly::Complete(make(3)));
-            // Halves of two packets, each of which lost its other one, are counted each.
+            // Segments of two packets, each of which lost its other one, are counted each.
             assert_eq!(push(90_000, &segments(4)[0]), Reassembly::Waiting);
             assert_eq!(push(110_000, &segments(5)[0]), Reassembly::Incomplete);
             assert_eq!(push(130_000, &segments(6)[0]), Reassembly::Incomplete);

@@ -1,4 +1,4 @@
-//! Being asked to end, also while nobody reads what is written.
+//! Requests to end, also while the reader of the output does not read.
 
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -10,14 +10,14 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, fstat};
 use rustix::io::Errno;
 
-/// How often somebody who waits looks whether to end.
+/// How often a waiting program checks whether to end.
 const LOOK: Duration = Duration::from_millis(100);
 /// How many looks long a reader is waited for after that.
 const LOOKS: u32 = 10;
 /// What a pipe that takes anything takes at once, without waiting.
 const PIECE: usize = 4_096;
 
-/// Set when the program was asked to end, by whoever catches its signals.
+/// Set by the signal handler when the program shall end.
 #[must_use]
 pub fn flag() -> &'static Arc<AtomicBool> {
     static FLAG: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
@@ -43,7 +43,7 @@ impl<F: AsFd> Stoppable<F> {
         Self { file, waits, looks: LOOKS }
     }
 
-    /// Waits until something can be written, or an error said.
+    /// Waits until something can be written, or an error reported.
     fn wait(&mut self) -> io::Result<()> {
         let timeout = Timespec::try_from(LOOK).ok();
         loop {

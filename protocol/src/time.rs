@@ -1,4 +1,4 @@
-//! Points in time and lengths of time in whole microseconds, passed in by whoever has a clock.
+//! Points in time and lengths of time in whole microseconds, passed in by the caller.
 //!
 //! The cores never read a clock: a test, a simulation and a microcontroller each bring their own.
 

@@ -28,13 +28,13 @@ impl Failure {
         Self::with_code(1, text)
     }
 
-    /// Exit code 1 after all has been said.
+    /// Exit code 1 after the output is complete.
     #[must_use]
     pub const fn said() -> Self {
         Self { text: String::new(), code: 1 }
     }
 
-    /// An error that knows its exit code.
+    /// An error with its exit code.
     #[must_use]
     pub fn with_code(code: u8, text: impl Display) -> Self {
         Self { text: text.to_string(), code }
@@ -60,7 +60,7 @@ impl Display for Failure {
 pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
     if !text.is_empty() {
-        // When it is closed, nobody wants to know.
+        // When it is closed, there is no reader.
         let _ = Stoppable::new(io::stderr()).write_all(format!("{program}: {text}\n").as_bytes());
     }
     ExitCode::from(code)
@@ -87,7 +87,7 @@ pub fn written(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// What clap says in several lines, in one: what is wrong and its tip, without the usage.
+/// clap's message in one line: what is wrong and its tip, without the usage.
 #[must_use]
 pub fn one_line(text: &str) -> String {
     let text = text.strip_prefix("error: ").unwrap_or(text);

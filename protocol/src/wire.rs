@@ -1,4 +1,4 @@
-//! What two cells say to each other over the wire between their ports, and how a bench simulates such a wire.
+//! The messages between two cells over the wire between their ports, and how a bench simulates such a wire.
 //!
 //! A wire leads from one port to another and belongs to no bus. The bench simulates it on the cells' bus by
 //! classic frames with 29-bit identifiers that only its other end takes; they never go onto a real bus.
@@ -9,20 +9,20 @@
 //!                                                                          (4 bytes) and bytes 0 to 5
 //! ```
 //!
-//! | kind | name | bytes 1 to 5 | says |
+//! | kind | name | bytes 1 to 5 | meaning |
 //! |---|---|---|---|
-//! | 1 | hello | version, number, port + flags, round, depth | I am here, and so far from the gateway |
-//! | 2 | join | | may I send my sums to you? |
-//! | 3 | grant | round, depth | yes; this is how far I am |
-//! | 4 | refuse | | no; or: you are no child of mine |
-//! | 5 | leave | | I am no child of yours any more |
-//! | 6 | left | | I have heard it: from now on I take no sum of yours |
-//! | 7 | state | epoch | I am your child: my sums from this epoch on are for you |
-//! | 8 | missed | epoch | I did not take your sum of this epoch |
-//! | 9 | seek | round | I have no way up: a new round, later than this one, please |
-//! | 10 | number | walk, first, last | number yourself and those below you from these |
-//! | 11 | return | walk, first, last | done; these are left (none when first > last) |
-//! | 12 | ask | | are you there? say hello |
+//! | 1 | hello | version, node id, port + flags, round, depth | periodic: the sender's state and rank |
+//! | 2 | join | | requests to send sums to the receiver |
+//! | 3 | grant | round, depth | accepts a join; the sender's rank |
+//! | 4 | refuse | | rejects a join, or a hello from a cell that is no child |
+//! | 5 | leave | | the sender is no child of the receiver any more |
+//! | 6 | leave_ack | | acknowledges leave: no sum of the receiver is taken from now on |
+//! | 7 | state | epoch | the sender's sums from this epoch on are for the receiver |
+//! | 8 | nack | epoch | the receiver's sum of this epoch was not taken |
+//! | 9 | repair | round | the sender is unreachable: requests a round later than this one |
+//! | 10 | node_id | walk, first, last | node ids for the receiver and the cells below it |
+//! | 11 | return | walk, first, last | the walk is done; the node ids that remain (none when first > last) |
+//! | 12 | probe | | requests a hello |
 
 use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
@@ -38,7 +38,7 @@ pub const UPLINK: usize = PORTS;
 /// Bytes of a message, its CRC among them.
 pub const BYTES: usize = 8;
 
-/// One direction of one simulated wire: whoever sends on it.
+/// One direction of one simulated wire, named by its sender.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct LinkId {
     /// The wire's number on its bus.
@@ -47,13 +47,13 @@ pub struct LinkId {
     pub back: bool,
 }
 
-/// How far somebody is from the gateway.
+/// The distance to the gateway, and the version of the tree in which it holds.
 ///
-/// A label only ever improves: a later round, or the same with a lesser depth. A cell takes a parent only
-/// whose label is better than its own, so that parents never form a circle.
+/// A rank only ever improves: a later round, or the same with a smaller depth. A cell takes a parent only
+/// whose rank is better than its own, so that parents never form a loop.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Rank {
-    /// The exploration from which the depth is, modulo 2^8.
+    /// The round (version of the tree) from which the depth is, modulo 2^8.
     pub round: u8,
     /// Wires to the gateway's side: 0 is the gateway, 1 a root.
     pub depth: u8,
@@ -69,67 +69,67 @@ impl Rank {
         }
     }
 
-    /// The label of a child.
+    /// The rank of a child.
     #[must_use]
     pub const fn below(self) -> Self {
         Self { round: self.round, depth: self.depth.saturating_add(1) }
     }
 }
 
-/// What is said again and again over every port.
+/// What is sent periodically over every port.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Hello {
     /// The protocol's version.
     pub version: u8,
-    /// The cell's number; 0 of a cell without one, and of the gateway.
+    /// The node id; 0 of a cell without one, and of the gateway.
     pub number: u8,
-    /// The port that it says this on.
+    /// The port that it is sent on.
     pub port: u8,
-    /// It hears the other end.
+    /// The sender receives the other end.
     pub hears: bool,
-    /// Its sums go out here: whoever hears it is its parent.
+    /// Its sums go out here: the receiver is its parent.
     pub up: bool,
-    /// It, or a cell below it, has no number yet.
+    /// It, or a cell below it, has no node id yet.
     pub unnumbered: bool,
-    /// How far it is; none without a way to the gateway.
+    /// Its rank; none where it is unreachable.
     pub rank: Option<Rank>,
 }
 
 /// A message over a wire.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum PortMessage {
-    /// I am here.
+    /// The sender's state and rank.
     Hello(Hello),
-    /// May I send my sums to you?
+    /// Requests to send sums to the receiver.
     Join,
-    /// Yes; this is how far I am.
+    /// Accepts a join, with the sender's rank.
     Grant(Rank),
-    /// No; or: you are no child of mine.
+    /// Rejects a join, or a hello from a cell that is no child.
     Refuse,
-    /// I am no child of yours any more.
+    /// The sender is no child of the receiver any more.
     Leave,
-    /// I have heard it.
+    /// Acknowledges a leave.
     LeaveAck,
-    /// I am your child: my sums from this epoch on are for you.
+    /// The sender's sums from this epoch on are for the receiver.
     State(Epoch),
-    /// I did not take your sum of this epoch.
+    /// The receiver's sum of this epoch was not taken.
     Nack(Epoch),
-    /// I have no way up, and a round later than this one would help.
+    /// The sender is unreachable and requests a round later than this one.
     Repair(u8),
-    /// Number yourself and those below you.
+    /// Node ids for the receiver and the cells below it.
     NodeId(Walk),
-    /// Everybody here has a number.
+    /// All cells below the sender have a node id, as far as there were enough.
     Return(Walk),
-    /// Are you there?
+    /// Requests a hello.
     Probe,
 }
 
-/// Numbers to give away, in a walk over the tree.
+/// Node ids to assign, in a walk over the tree.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Walk {
     /// Which walk.
     pub walk: u8,
-    /// The first number that is free.
+    /// The first node id that is free.
     pub first: u8,
     /// The last of them.
     pub last: u8,
@@ -138,10 +138,10 @@ pub struct Walk {
 const HEARS: u8 = 1 << 3;
 const UP: u8 = 1 << 4;
 const UNNUMBERED: u8 = 1 << 5;
-const LABELLED: u8 = 1 << 6;
+const HAS_RANK: u8 = 1 << 6;
 
 impl PortMessage {
-    /// The bytes that say it, up to the CRC.
+    /// Its bytes, up to the CRC.
     #[must_use]
     pub fn encode(self) -> [u8; 6] {
         match self {
@@ -150,7 +150,7 @@ impl PortMessage {
                 let flags = flag(hello.hears, HEARS)
                     | flag(hello.up, UP)
                     | flag(hello.unnumbered, UNNUMBERED)
-                    | flag(hello.rank.is_some(), LABELLED);
+                    | flag(hello.rank.is_some(), HAS_RANK);
                 let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
                 [1, hello.version, hello.number, (hello.port & 7) | flags, round, depth]
             }
@@ -179,7 +179,7 @@ impl PortMessage {
                 hears: c & HEARS != 0,
                 up: c & UP != 0,
                 unnumbered: c & UNNUMBERED != 0,
-                rank: if c & LABELLED == 0 { None } else { Some(Rank { round: d, depth: e }) },
+                rank: if c & HAS_RANK == 0 { None } else { Some(Rank { round: d, depth: e }) },
             }),
             2 => Self::Join,
             3 => Self::Grant(Rank { round: a, depth: b }),
@@ -204,7 +204,7 @@ impl LinkId {
         EXTENDED | FLAG | ((self.wire as u32) << 1) | self.back as u32
     }
 
-    /// The lane whose frames bear this identifier, with its flags.
+    /// The link id whose frames have this identifier, with its flags.
     #[must_use]
     pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
         let bits = raw_id & EXTENDED_MASK & !FLAG;
@@ -221,7 +221,7 @@ impl LinkId {
         Self { wire: self.wire, back: !self.back }
     }
 
-    /// The frame that says this.
+    /// The frame of a message.
     #[must_use]
     pub fn frame(self, message: PortMessage) -> Frame {
         let body = message.encode();
@@ -230,7 +230,7 @@ impl LinkId {
         Frame::classic(self.raw_id(), &[a, b, c, d, e, f, low, high]).unwrap_or(Frame::EMPTY)
     }
 
-    /// What a frame of this lane says; `None` when it is not one, or damaged, or of a kind that does not exist.
+    /// The message of a frame; `None` when it has another link id, is damaged, or of a kind that does not exist.
     #[must_use]
     pub fn read(self, frame: &Frame) -> Option<PortMessage> {
         let &[a, b, c, d, e, f, low, high] = frame.data() else { return None };
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rank_of_a_later_round_or_a_lesser_depth_is_better() {
+    fn a_rank_of_a_later_round_or_a_smaller_depth_is_better() {
         let rank = |round, depth| Rank { round, depth };
         assert!(rank(1, 9).is_better_than(rank(0, 1)));
         assert!(rank(0, 9).is_better_than(rank(255, 1)));
@@ -273,7 +273,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_said_is_heard_on_this_link_id_only(wire: u16, back: bool, body: [u8; 6]) {
+        fn a_message_is_read_on_its_own_link_id_only(wire: u16, back: bool, body: [u8; 6]) {
             let link_id = LinkId { wire, back };
             if let Some(message) = PortMessage::decode(body) {
                 let frame = link_id.frame(message);

@@ -13,7 +13,7 @@
 //! that holds from SOF to the last bit of the CRC; in CAN FD to the last bit of the data, where a run of five makes the first
 //! of the *fixed* stuff bits (fsb: 6 of them, or 7 with the longer CRC) and not one more. BRS is counted as nominal and the
 //! CRC delimiter as data: each is in part the other, and together they are one bit of each for every sample point.
-//! The intermission (int3) is counted: nobody can send earlier.
+//! The intermission (int3) is counted: no node can send earlier.
 
 mod extremes;
 mod rates;

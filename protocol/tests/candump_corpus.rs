@@ -1,6 +1,6 @@
 //! Odd lines of candump text, each with what it is: `golden/candump_corpus.log`, written by hand.
 //!
-//! The crate `socketcan` reads the same lines as a second opinion; where it reads less, the corpus says so.
+//! The crate `socketcan` reads the same lines as a second opinion; where it reads less, the corpus notes it.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 

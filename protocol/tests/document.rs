@@ -180,7 +180,7 @@ fn the_documents_tables_list_the_fields_of_the_schema() {
         if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
             document.replace_range(from..to, &table);
         } else {
-            assert_eq!(document[from..to], table, "SKINBUS_TAKE_OVER=yes writes the tables anew");
+            assert_eq!(document[from..to], table, "SKINBUS_TAKE_OVER=yes writes the tables again");
         }
     }
     if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {

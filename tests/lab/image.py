@@ -180,15 +180,15 @@ def initramfs(root):
     for line in (modules / "modules.dep").read_text().splitlines():
         path, others = line.split(":")
         depends[path.split("/")[-1].split(".")[0].replace("-", "_")] = (path, others.split(), line)
-    wanted = set()
+    selected = set()
     for name in MODULES:
         if name.replace("-", "_") not in depends:
             raise LabError(f"the kernel {modules.name} has no module {name}; a generic Debian kernel (-amd64) has, a -cloud one has not")
         path, others, _ = depends[name.replace("-", "_")]
-        wanted |= {path, *others}
-    for path in wanted:
+        selected |= {path, *others}
+    for path in selected:
         tree[f"lib/modules/{modules.name}/{path}"] = unsigned((modules / path).read_bytes())
-    kept = [line for path, _, line in depends.values() if path in wanted]
+    kept = [line for path, _, line in depends.values() if path in selected]
     tree[f"lib/modules/{modules.name}/modules.dep"] = ("\n".join(kept) + "\n").encode()
     return cpio(tree)
 
@@ -201,7 +201,7 @@ def has_interpreter(elf):
 
 
 def unsigned(module):
-    """A module without its signature, which costs the guest time and is not enforced."""
+    """A module without its signature, which costs time in the virtual machine and is not enforced."""
     if not module.endswith(SIGNATURE_END):
         return module
     end = len(module) - len(SIGNATURE_END)

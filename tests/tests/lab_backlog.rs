@@ -1,4 +1,4 @@
-//! Frames that the kernel drops between sender and sockets while it tells the sender that all is well: its queue
+//! Frames that the kernel drops between sender and sockets while the sender gets no error: its queue
 //! of arrived packets is made so short that the torques of one cell never get through.
 //!
 //! The queue is the whole machine's, so this is for the lab machine only.

@@ -38,7 +38,7 @@ fn what_253_processes_do_not_answer_at_20_hz_they_were_too_late_for_and_nothing_
 /// With `candump` and the kernel's own part, that is all of it.
 const SATURATED: f64 = 0.7;
 
-/// Frames bear the wall's time, and somebody may set it: by hand, or NTP.
+/// Frames have the wall clock's time, which may be set: by hand, or by NTP.
 #[test]
 #[ignore = "needs the lab machine"]
 fn cells_and_gateway_live_through_steps_of_the_walls_clock() {

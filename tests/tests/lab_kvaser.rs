@@ -108,7 +108,7 @@ impl Drop for Hanging {
     }
 }
 
-/// What `ip` or `tc` knows.
+/// The output of `ip` or `tc`.
 fn json(words: &str) -> Value {
     serde_json::from_slice(&tool(words).stdout).unwrap()
 }
@@ -132,7 +132,7 @@ fn open(name: &str, options: &Options) -> Result<Bus, BusError> {
     Bus::open(name, Choice::Only(BusKind::SocketCan), options)
 }
 
-/// A frame that says its number.
+/// A frame that contains its number.
 fn numbered(number: u32) -> Frame {
     Frame::classic(0x123, &number.to_le_bytes()).unwrap()
 }
@@ -179,7 +179,7 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
     place.start("gateway", &words)
 }
 
-/// How many packets a log has, and how many halves that found no other in time.
+/// How many packets a log has, and how many segments that found no other in time.
 fn pairs(log: &str) -> (u64, u64) {
     let (mut segments, mut whole, mut incomplete) = (vec![Segment::NONE; 1 << 11], 0, 0);
     for line in log.lines() {
@@ -196,7 +196,7 @@ fn pairs(log: &str) -> (u64, u64) {
     (whole, incomplete)
 }
 
-/// Sees that all packets of a run are accounted for, by what its log says itself; its log and its figures.
+/// Checks that all packets of a run are accounted for, by its log; its log and its figures.
 fn packets_add_up(place: &Place) -> (Log, Summary) {
     let (summary, text) = (place.summary(), place.read("run.log"));
     let (whole, incomplete) = pairs(&text);
@@ -222,7 +222,7 @@ fn adds_up(place: &Place) -> Log {
     log
 }
 
-/// Waits until this many torques of cell 1 have come, in halves.
+/// Waits until torques of cell 1 have come, in two segments each.
 fn torques_come(bus: &str) {
     let torque = Filter { id: 0x201, mask: Filter::EXACT_MASK };
     let bus = open(bus, &options(&[torque])).unwrap();
@@ -243,7 +243,7 @@ fn across_controllers() -> Log {
     drop(cells);
     let [near, far] = candumps.map(|candump| {
         let mut frames = candump.frames();
-        // What one candump is told to end by, the other sees as well.
+        // The frame at which one candump ends is seen by the other as well.
         frames.retain(|frame| !frame.is_extended());
         by_identifier(&frames)
     });
@@ -253,7 +253,7 @@ fn across_controllers() -> Log {
     let ours = frames_of(&place.path("run.log"));
     assert!(ours.iter().all(|frame| frame.format() == Format::Classic && frame.len() == 8));
     for (id, ours) in by_identifier(&ours) {
-        // Cells speak before the gateway listens and after.
+        // Cells send before the gateway listens and after.
         assert!(near[&id].windows(ours.len()).any(|part| part == ours), "{id:03X} comes in another order");
     }
     adds_up(&place)
@@ -327,7 +327,7 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let tries = refused("can0") - before;
     assert!((2..=102).contains(&tries), "{tries} tries in 50 ms");
 
-    // Who has no time asks once.
+    // A caller with no time tries once.
     let before = refused("can0");
     let error = hasty.send(&frames[sent..]).unwrap_err();
     assert!(error.sent == 0 && matches!(error.cause, BusError::Full { .. }), "{error}");
@@ -400,13 +400,13 @@ fn error_frames_of_the_driver_are_counted() {
     bench.hears_the_loop();
     for _ in 0..2 {
         torques_come("can1");
-        // The gateway's controller has room for 64 bytes, and nobody takes them out. What the cells' controller has
-        // sent it does not hear of either: it is started anew for each frame.
+        // The gateway's controller has room for 64 bytes, which are not taken out. What the cells' controller has
+        // sent is not reported either: it is restarted for each frame.
         let hanging = controllers.hang();
         for _ in 0..10 {
             tool("ip link set can0 down");
             tool("ip link set can0 up");
-            // Its queue may be full of what the cells have to say, and its controller busy with that.
+            // Its queue may be full of the cells' frames, and its controller busy with them.
             command("cansend can0 1ABCDEF0#0102030405060708").stderr(Stdio::null()).status().unwrap();
         }
         drop(hanging);

@@ -284,7 +284,7 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --nodes 9-3",
-            "invalid value '9-3' for '--nodes <A-B>': two numbers of 1 to 254, the lesser one first, such as 1-64; \
+            "invalid value '9-3' for '--nodes <A-B>': two node ids of 1 to 254, the smaller one first, such as 1-64; \
              try '--help'"
                 .to_owned(),
         ),

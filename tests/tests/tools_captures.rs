@@ -123,7 +123,7 @@ fn lines(text: &str) -> Vec<String> {
     text.lines().map(str::to_owned).collect()
 }
 
-/// A frame as the script prints python-can's; what that cannot tell is left out.
+/// A frame as the script prints python-can's; what that does not have is left out.
 fn of_can(record: &Record<'_>) -> String {
     let Record { time, interface, frame, .. } = record;
     let fd = frame.format() == Format::Fd;
@@ -288,7 +288,7 @@ fn what_each_tool_reads_beyond_that_is_as_docs_captures_says() {
     }
 }
 
-/// Everything in a recording as the script prints it, with the digits its channels say.
+/// Everything in a recording as the script prints it, with the digits of its channels.
 fn of_ros(path: &Path) -> Vec<String> {
     let stamp = |nanos: u64| format!("{nanos} {}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000);
     let mut all = Vec::new();

@@ -52,7 +52,7 @@ fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
     let python = tests.join("../target/tools/bin/python");
     assert!(python.exists(), "{} is missing: tests/tools/install makes it ready", python.display());
     let script = tests.join("tools/recording.py");
-    // The second file has what is in force, too.
+    // The second file starts with the present state, too.
     let name = "run-1.mcap";
     let recorded = Recorded::read(&place.path(name));
     let topics: BTreeSet<_> = recorded.messages.iter().map(|message| message.topic.as_str()).collect();

@@ -50,7 +50,7 @@ fn all_answer(place: &Place) {
     (0..BUSES.len()).for_each(|bus| answers(place, bus));
 }
 
-/// Waits until a bench has said something so many times.
+/// Waits until a bench has printed something so many times.
 fn says(bench: &Running, words: &str, times: usize) {
     until(words, || (bench.stderr().matches(words).count() == times).then_some(()));
 }
@@ -118,7 +118,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     let _vcan1 = Vcan::with_mtu("vcan1", 16);
     bench.hears("vcan1 works again");
     answers(&place, 1);
-    // As nobody wants it, which is said, and then as it has to be.
+    // First with the wrong setting, which is reported, and then with the right one.
     let narrow = Vcan::with_mtu("vcan2", 16);
     bench.hears("vcan2 cannot be opened again yet: vcan2 has MTU 16 and CAN FD needs 72");
     narrow.remove();

@@ -1,5 +1,5 @@
 //! Frames that are damaged on their way, on a real kernel: the cells are on `vcan0`, the gateway is on `vcan1`,
-//! and the kernel's own CAN gateway stands between them and turns bits where its rules say so.
+//! and the kernel's own CAN gateway stands between them and turns bits as its rules define.
 
 #![allow(
     clippy::unwrap_used,
@@ -63,7 +63,7 @@ fn turned(bits: &str) -> String {
 
 /// How many frames the rule with this filter has passed on, by the kernel's own count.
 fn passed(filter: &str) -> usize {
-    // Its exit code says how much it was told.
+    // Its exit code is no status: it depends on the length of the kernel's answer.
     let rules = command("cangw -L").output().unwrap().stdout;
     let rules = String::from_utf8(rules).unwrap();
     let rule =
@@ -177,7 +177,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     let complete = summary.of_bus("/epochs_complete");
     assert!(complete > 0 && complete <= sent as u64 - wrong, "{complete} of {sent}");
 
-    // Each cell says so itself, in the report that ends the run.
+    // Each cell reports it itself, at the end of the run.
     let log = Log::of(gateways, Format::Fd);
     for cell in 1..=CELLS {
         let refused = log.messages.iter().rev().find_map(|(message, _)| match message {

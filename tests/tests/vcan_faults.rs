@@ -41,7 +41,7 @@ fn all_answer(place: &Place) {
     }
 }
 
-/// Sees that everything is accounted for, but for what cells tried to say on a bus that took nothing: they count that
+/// Checks that everything is accounted for, but for what cells tried to send on a bus that took nothing: they count that
 /// as sent.
 fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
     let of = |pointer: &str| summary.of_bus(pointer);
@@ -62,7 +62,7 @@ fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
 
 /// Waits until a cell reports that the robot is halted, acknowledges, and checks that the same cells answer again.
 fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
-    place.test_client().waits_for("the cells to be told", |message| {
+    place.test_client().waits_for("the cells to be halted", |message| {
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
             if heartbeat.state.has(State::HALTED))
     });
@@ -85,7 +85,7 @@ fn ends_well_after_a_pause(place: &Place, bench: Running) {
     assert_eq!(summary.total("/loop/bad_cycles"), summary.count("/loop/bad_cycles", INVALID));
     assert_eq!((summary.of_bus("/uplink/restarts"), summary.silent().len()), (0, 0), "{:#}", summary.0);
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
-    // Who was told to halt answers nothing before it is told to go on.
+    // A halted cell answers nothing before a resume.
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let after = |index: usize, expected: &Message| {
         let mut rest = log.messages.iter().enumerate().skip(index);
@@ -197,7 +197,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     assert!(!log.torques().is_empty());
     assert!(stderr.contains(&format!("{} frames until then are in run.log", log.frames.len())), "{stderr}");
 
-    // And cells that nobody has started say it themselves.
+    // And cells that are started by hand report it themselves.
     let vcan5 = Vcan::make("vcan5");
     let cells = place.start("cell-node", "--bus vcan5 --nodes 1-6 --skin skin.toml");
     let lists =
@@ -249,7 +249,7 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     bench.tells(5, "fallen silent");
     let by_hand = place.start("cell-node", "--bus vcan0 --node 3 --skin skin.toml");
     bench.hears("cell 3 on vcan0 restarted");
-    // It feels what it did: the touch is as long as the run, and nobody else would tell it.
+    // Its contact state is restored: the touch is as long as the run, and the bench resends it.
     place.test_client().waits_for("a torque of the new cell", torque_of(3));
     process::signal(stopped, Signal::CONT);
     bench.tells(5, "come back");
@@ -261,7 +261,11 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent().len(), 0);
     assert_eq!((summary.of_bus("/uplink/restarts"), summary.odd(0)), (1, 0), "{:#}", summary.0);
-    assert!(summary.of_bus("/replies/in_doubt") > 0, "nobody knows what cell 3 did last: {:#}", summary.0);
+    assert!(
+        summary.of_bus("/replies/in_doubt") > 0,
+        "the last replies of cell 3 are in doubt: {:#}",
+        summary.0
+    );
     assert!(summary.of_bus("/replies/skipped") > 0, "cell 5 answers no old joints: {:#}", summary.0);
 }
 

@@ -33,7 +33,7 @@ struct Pair {
     sender: Bus,
     sleeper: Bus,
     inbox: Inbox,
-    /// Frames that the sleeper wanted, so far.
+    /// Frames that passed the sleeper's filter, so far.
     sent: u32,
     /// Frames that it got.
     heard: u32,
@@ -96,7 +96,7 @@ impl Pair {
                 self.heard += 1;
                 last = Some(number);
             }
-            // The embedded bus may have told of drops after the last one as well.
+            // The embedded bus may have reported drops after the last one as well.
             let known = self.heard + dropped;
             match (last, self.kind) {
                 (Some(last), BusKind::SocketCan) => assert_eq!(last + 1, known),
@@ -120,7 +120,7 @@ impl Pair {
     }
 }
 
-/// What was sent and not received is what the bus says it dropped, to the last frame.
+/// What was sent and not received is what the bus reports as dropped, to the last frame.
 fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
     let exact = Filter { id: EXPECTED, mask: Filter::EXACT_MASK };
     // What several filters match comes once and is dropped once; what none matches is no loss.
@@ -190,16 +190,16 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     place.test_client().waits_for_epoch(10);
     bench.signal(Signal::STOP);
     until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
-    // For more than a second; cells say what they have to say meanwhile.
+    // For more than a second; cells keep sending meanwhile.
     tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
     bench.signal(Signal::CONT);
     let ended = bench.end().well();
-    // The log says itself what is missing in it.
+    // The log itself records what is missing in it.
     let log = place.read("run.log");
     let (missing, lines): (Vec<_>, Vec<_>) = log.lines().partition(|line| line.starts_with("DROPCOUNT: "));
     place.write("frames.log", &(lines.join("\n") + "\n"));
     let (ours, mut theirs) = (frames_of(&place.path("frames.log")), candump.frames());
-    // What cells said when the gateway listened no more is nobody's loss.
+    // What cells sent after the gateway stopped listening is not a loss.
     let last = ours.last().unwrap();
     theirs.truncate(1 + theirs.iter().rposition(|frame| frame == last).unwrap());
 

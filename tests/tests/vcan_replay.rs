@@ -98,7 +98,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     let vcan0 = Vcan0;
     vcan0.fill();
     let replay = place.replay("some.log", "--send-timeout 50");
-    // Until the second frame has been given up, which is told by the third.
+    // Until the second frame has timed out, which the third one reports.
     replay.hears("vcan0 is socketcan");
     std::thread::sleep(Duration::from_millis(1_000));
     vcan0.empty();
@@ -110,7 +110,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
 }
 
-/// How much later than the first one frames came than they should have, in µs: median, 90 %, greatest.
+/// How much later than the first one frames came than they should have, in µs: median, 90 %, maximum.
 fn lateness(log: &str, period_us: i64) -> [i64; 3] {
     let mut late = Vec::new();
     for line in fs::read_to_string(log).unwrap().lines() {
@@ -155,6 +155,6 @@ fn lateness_at_two_milliseconds_is_printed_beside_canplayers() {
         assert_eq!(replayed.number("/late_us/count"), 1_000);
         eprintln!("by its own count {}, idle {}", replayed.0["late_us"], replayed.0["idle_late_us"]);
     });
-    eprintln!("lateness at 2 ms, by candump's times, after the quickest, us (50 %, 90 %, greatest):");
+    eprintln!("lateness at 2 ms, by candump's times, after the quickest, us (50 %, 90 %, max):");
     eprintln!("  gateway replay {ours:?}, canplayer {theirs:?}");
 }

@@ -105,7 +105,7 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     let torques = log.torques();
     let (ended, pressed): (Vec<_>, Vec<_>) =
         torques.iter().partition(|(_, _, packet)| packet.words == [0; WORDS]);
-    assert!(torques.iter().all(|(_, (cell, ..), _)| *cell == 2), "nobody else is pressed");
+    assert!(torques.iter().all(|(_, (cell, ..), _)| *cell == 2), "no other cell is pressed");
     assert_eq!(
         (ended.len(), torques.last().unwrap().2.words),
         (1, [0; WORDS]),
@@ -170,13 +170,13 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     // The gateway has sent one too, before its loop began.
     let resumes = log.messages.iter().enumerate().skip(halt);
     let resume = resumes.clone().find(|(_, (message, _))| *message == Message::Resume).unwrap().0;
-    let numbers = joints_before(&log, halt)..joints_before(&log, resume);
-    assert!(numbers.len() >= 10, "{numbers:?}");
+    let rounds = joints_before(&log, halt)..joints_before(&log, resume);
+    assert!(rounds.len() >= 10, "{rounds:?}");
     let torques = log.torques();
-    let answers = torques.iter().filter(|(number, ..)| numbers.contains(number)).count();
+    let answers = torques.iter().filter(|(round, ..)| rounds.contains(round)).count();
     assert_eq!(answers, 0, "halted cells answer nothing");
     for cell in 1..=4 {
-        let after = torques.iter().filter(|(number, (of, ..), _)| *of == cell && *number >= numbers.end);
+        let after = torques.iter().filter(|(round, (of, ..), _)| *of == cell && *round >= rounds.end);
         assert!(after.count() > 0, "cell {cell} answers again");
     }
 }
@@ -191,14 +191,14 @@ fn replies(log: &Log) -> Vec<Reply> {
     replies
 }
 
-/// Tries a few times: on a machine that is away for more than a period of the joints, cells skip some, and say so.
+/// Tries a few times: on a machine that is away for more than a period of the joints, cells skip some, and count them.
 fn undisturbed<T>(what: &str, mut attempt: impl FnMut() -> Option<T>) -> T {
     (0..6)
         .find_map(|_| attempt())
         .unwrap_or_else(|| panic!("{what}: cells skipped joints in each of six tries"))
 }
 
-/// The times and frames of a log that cells hear: joints and stimuli.
+/// The times and frames of a log that cells receive: joints and stimuli.
 fn joints_and_stimuli(log: &Path) -> String {
     let heard = |line: &&str| {
         let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
@@ -232,7 +232,7 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     let text = joints_and_stimuli(&place.path("candump.log"));
     place.write("replay.log", &text);
     let replayed = undisturbed("replay", || {
-        // Fresh ones: what was felt last, and the last epoch, are of the recording.
+        // Fresh ones: the last contact state, and the last epoch, are those of the recording.
         let cells = place.start("cell-node", &format!("--bus vcan0 --nodes 1-{CELLS} --skin skin.toml"));
         place.test_client().waits_for_settled_cells(CELLS);
         let candump = Candump::start("vcan0", &place.path("again.log"));
@@ -240,7 +240,7 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
         let test_client = place.test_client();
         cansend(&place, "report");
         let skipped = RefCell::new(BTreeMap::new());
-        test_client.waits_for("what the cells have heard", |message| {
+        test_client.waits_for("what the cells have received", |message| {
             if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heard(heard), .. } = message
             {
                 skipped.borrow_mut().insert(cell.get(), heard.joints_late);
@@ -269,9 +269,9 @@ fn frame_text(frame: &Frame) -> String {
 /// Cells of the bench that `cangen` babbles at.
 const CELLS: u8 = 6;
 
-/// What `cangen` is told: babbling identifiers, and everything at random.
+/// Arguments of `cangen`: babbling identifiers, and everything at random.
 const NOISE: &[&str] = &[
-    // A node that nobody has, as fast as it goes.
+    // A node that does not exist, as fast as it goes.
     "-g 0 -I 6A0 -L 8 -n 3000",
     "-g 0 -I 6A0 -L 8 -n 3000",
     // The same in packets of our size.
@@ -284,7 +284,7 @@ const NOISE: &[&str] = &[
     "-g 0 -f -I 502 -L 16 -n 50",
     "-g 0 -f -I 5FF -L 16 -n 50",
     "-g 0 -I 704 -n 300",
-    // What a cell is said to have sent.
+    // Frames with a cell's identifier.
     "-g 0 -f -b -I 205 -L 16 -n 50",
     "-g 0 -f -b -I 206 -L 20 -n 50",
     // At random, in every kind of frame.
@@ -300,7 +300,7 @@ const NOISE: &[&str] = &[
     "-g 5 -I r -m -n 100",
 ];
 
-/// Whether somebody of this bench uses an identifier: cells 1 to [`CELLS`], or the gateway.
+/// Whether a node of this bench uses an identifier: cells 1 to [`CELLS`], or the gateway.
 fn is_used(id: Id) -> bool {
     let bits = id.to_bits();
     bits <= 0x004 || [0x400, 0x5FF, 0x7FF].contains(&bits) || (bits > 0x0FF && (1..=CELLS).contains(&id.node))
@@ -363,7 +363,7 @@ fn all_are_counted(frames: &[Frame], summary: &Summary) {
         let counted =
             summary.count("/buses/0/received", kind.name()) + summary.count("/buses/0/sent", kind.name());
         let seen = kinds.get(kind.name()).copied().unwrap_or(0);
-        // Cells that are being ended may still say a heartbeat when the gateway no longer listens.
+        // Cells that are being ended may still send a heartbeat when the gateway no longer listens.
         assert!(
             counted == seen || (kind == Kind::Network && counted < seen),
             "{kind:?}: {counted} of {seen}"
@@ -382,23 +382,23 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     place.test_client().waits_for("a torque", torque_of(1, true));
     for noise in NOISE {
         tool(&format!("cangen vcan0 -i {noise}"));
-        // On one processor, everybody has to have room for the next ones.
+        // On one processor, every socket needs room for the next ones.
         candump.catch_up();
     }
-    // An error frame, which says that a controller is bus-off.
+    // An error frame, which reports a controller as bus-off.
     tool("cansend vcan0 20000040#0000000000000000");
     let test_client = place.test_client();
     for cell in 1..=CELLS {
         test_client.waits_for("torques after that", torque_of(cell, true));
     }
     cansend(&place, "report");
-    let told = RefCell::new(BTreeMap::new());
+    let reported = RefCell::new(BTreeMap::new());
     test_client.waits_for("what the cells have refused", |message| {
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Refused(refused), .. } = message
         {
-            told.borrow_mut().insert(cell.get(), *refused);
+            reported.borrow_mut().insert(cell.get(), *refused);
         }
-        told.borrow().len() == usize::from(CELLS)
+        reported.borrow().len() == usize::from(CELLS)
     });
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -417,8 +417,8 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     // That error frame, and a frame of candump's each time.
     let expected = expected + 1 + NOISE.len() as u64;
     assert_eq!(summary.odd(0), expected, "each of cangen's frames is odd, and nothing else: {:#}", summary.0);
-    for (cell, told) in &*told.borrow() {
-        assert_eq!(*told, refused_by(*cell, &frames), "cell {cell}");
+    for (cell, refused) in &*reported.borrow() {
+        assert_eq!(*refused, refused_by(*cell, &frames), "cell {cell}");
     }
     // What bears a cell's name and is not its own is in its account.
     let of_cells = |frame: &&Frame| {
@@ -460,7 +460,7 @@ fn the_stock_tools_read_our_log() {
     let ours = frames_of(&path);
     assert_eq!(ours.len() as u64, place.summary().number("/recording/frames"));
     assert!(ours.len() > 300, "{}", ours.len());
-    // It says what candump says, letter by letter.
+    // Its output is candump's, letter by letter.
     candump.frames();
     let texts = |file: &str| {
         let text = place.read(file);
@@ -475,7 +475,7 @@ fn the_stock_tools_read_our_log() {
         let left = theirs.get_mut(&frame).filter(|left| **left > 0);
         *left.unwrap_or_else(|| panic!("candump has not seen {frame}")) -= 1;
     }
-    // Cells that are being ended may still say a heartbeat when the gateway no longer listens.
+    // Cells that are being ended may still send a heartbeat when the gateway no longer listens.
     theirs.retain(|frame, left| *left > 0 && !frame.starts_with('4'));
     assert_eq!(theirs, BTreeMap::new(), "candump has seen what we have not");
 
@@ -487,7 +487,7 @@ fn the_stock_tools_read_our_log() {
     let asc = place.path("run.asc");
     let read = tool(&format!("log2asc -I {} -O {} vcan0", path.display(), asc.display()));
     assert_eq!((read.stdout, read.stderr), (vec![], vec![]));
-    // And back again by its counterpart, which knows no classic remote frame's length.
+    // And back again by its counterpart, which drops the length of classic remote frames.
     let back = place.path("back.log");
     tool(&format!("asc2log -I {} -O {}", asc.display(), back.display()));
     let back = frames_of(&back);

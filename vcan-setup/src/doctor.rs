@@ -1,9 +1,9 @@
-//! What a bench would meet on this machine, judged.
+//! Whether a bench would run on this machine.
 //!
 //! ```text
 //!   skin or names --+
-//!                   +--> look --> Facts --> judge --> findings: ok, note, fault, each with what mends it
-//!   this machine ---+   (asks)            (decides)
+//!                   +--> look --> Facts --> assess --> findings: ok, note, fault, each with hints
+//!   this machine ---+  (queries)           (decides)
 //! ```
 
 use std::collections::BTreeSet;
@@ -32,7 +32,7 @@ const TIMES: usize = 4;
 pub enum Level {
     /// As it should be.
     Ok,
-    /// A bench runs, and somebody should know this.
+    /// A bench runs, and this is worth knowing.
     Note,
     /// No bench runs, or none whose figures mean anything.
     Fault,
@@ -57,7 +57,7 @@ pub struct Finding {
     pub level: Level,
     /// What it is.
     pub text: String,
-    /// What mends it: one command each, any of them does.
+    /// How to fix it: one command each, any of them is enough.
     pub hints: Vec<String>,
 }
 
@@ -74,7 +74,7 @@ impl Finding {
         Self { level: Level::Fault, text: text.into(), hints: Vec::new() }
     }
 
-    /// And what mends it.
+    /// With one more hint.
     fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hints.push(hint.into());
         self
@@ -92,9 +92,9 @@ pub fn would_run(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.level != Level::Fault)
 }
 
-/// Judges the facts, the most basic ones first.
+/// Assesses the facts, the most basic ones first.
 #[must_use]
-pub fn comparator(facts: &Facts) -> Vec<Finding> {
+pub fn assess(facts: &Facts) -> Vec<Finding> {
     let mut findings = vec![facts.kind()];
     match facts.bus_kind() {
         BusKind::SocketCan if facts.kernel.has_can => {
@@ -104,7 +104,7 @@ pub fn comparator(facts: &Facts) -> Vec<Finding> {
             findings.extend(facts.receive_buffer());
             findings.extend(facts.backlog());
         }
-        // Without CAN in the kernel nothing more can be said of interfaces.
+        // Without CAN in the kernel there are no interfaces to check.
         BusKind::SocketCan => {}
         BusKind::Embedded => {
             findings.push(facts.embedded());
@@ -135,7 +135,7 @@ impl Facts {
         if self.user.admin || self.user.root { command.to_owned() } else { format!("sudo {command}") }
     }
 
-    /// What `vcan-setup up` is told to mean a bus: its skin, or its name.
+    /// The argument of `vcan-setup up` for a bus: its skin, or its name.
     fn up(&self, target: &Target) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
         self.own(&format!("up {what}"))
@@ -164,7 +164,7 @@ impl Facts {
         }
     }
 
-    /// Who is on a bus already.
+    /// The nodes on a bus already.
     fn traffic(&self, bus: &Bus, on: &str) -> Vec<Finding> {
         let name = &bus.target.name;
         let heard = match &bus.heard {

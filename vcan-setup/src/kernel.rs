@@ -14,16 +14,16 @@ pub enum Module {
     Loadable,
     /// Not among the modules of this kernel.
     Missing,
-    /// Nobody can tell: the modules of this kernel are not on this disk.
+    /// Unknown: the modules of this kernel are not on this disk.
     Unknown,
 }
 
 /// What a kernel is, as far as CAN is concerned.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Kernel {
-    /// Its release, as `uname -r` says it.
+    /// Its release, as in `uname -r`.
     pub release: String,
-    /// The machine, as `uname -m` says it.
+    /// The machine, as in `uname -m`.
     pub machine: String,
     /// The distribution's names, from os-release: `ID` and `ID_LIKE`.
     pub distribution: String,
@@ -65,7 +65,7 @@ impl Kernel {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
-    /// What mends that there is no CAN, or no `vcan`: one command each, with a comment as in a shell, the
+    /// How to fix that there is no CAN, or no `vcan`: one command each, with a comment as in a shell, the
     /// nearest first.
     #[must_use]
     pub fn hints(&self, module: Module) -> Vec<String> {

@@ -104,10 +104,10 @@ impl Hardware {
 }
 
 impl Rates {
-    /// Whether these are what was wanted, but for half a percent; what was not wanted may be anything.
+    /// Whether these are the target's, within half a percent; a rate that the target leaves open may be anything.
     #[must_use]
     pub fn meet(self, target: Self) -> bool {
-        // A controller's clock is divided by whole numbers: it may miss what was asked for, by less than the
+        // A controller's clock is divided by whole numbers: it may miss what was requested, by less than the
         // nodes of a bus may differ.
         let near = |target: Option<u32>, has: Option<u32>| {
             let near = |target: u32, has: u32| u64::from(target.abs_diff(has)) * 200 <= target.into();

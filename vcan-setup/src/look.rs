@@ -20,7 +20,7 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::Target;
 
-/// How long a bus is listened to: a gateway sends joints much more often, a cell says that it is there at
+/// How long a bus is listened to: a gateway sends joints much more often, a cell sends a heartbeat at
 /// least every half second.
 const LISTEN: Duration = Duration::from_millis(600);
 
@@ -59,7 +59,7 @@ fn usable(target: &Target, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
-/// Listens for other gateways and for cells; nothing when nobody serves the bus.
+/// Listens for other gateways and for cells; nothing when the bus is not served.
 fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
     let options = Options { fd: target.format == Format::Fd, ..Options::default() };
     let until = Instant::now() + LISTEN;
@@ -89,7 +89,7 @@ impl Heard {
     pub fn take(&mut self, id: Id) {
         let node = Node::from_byte(id.node);
         match id.kind {
-            // The rest of the gateway's side may come from somebody at a shell.
+            // The rest of the gateway's side may come from a user at a shell.
             Kind::Command => self.gateway |= Command::from_byte(id.node) == Some(Command::Joints),
             Kind::Network if node == Node::Gateway => self.gateway = true,
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => {
@@ -100,7 +100,7 @@ impl Heard {
     }
 }
 
-/// What the kernel grants to whom asks as the gateway does; it is the same for every sort of socket.
+/// What the kernel grants to a request like the gateway's; it is the same for every sort of socket.
 fn receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
@@ -159,7 +159,7 @@ pub struct Embedded {
     pub name: String,
     /// Its socket.
     pub path: String,
-    /// Whether somebody serves it: a killed server leaves its socket behind.
+    /// Whether it is served: a killed server leaves its socket behind.
     pub served: bool,
 }
 
@@ -185,7 +185,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
     buses
 }
 
-/// Only a socket that nobody listens on refuses.
+/// Only a socket without a listener refuses.
 fn is_served(directory: &Path, name: &str) -> bool {
     let socket = seqpacket(SocketFlags::NONBLOCK);
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };

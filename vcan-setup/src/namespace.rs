@@ -41,12 +41,12 @@ pub enum NamespaceError {
         /// Its number.
         pid: u32,
     },
-    /// Anything else that the system says.
+    /// Any other error of the system.
     #[error("cannot open the network namespace {}: {source}", path.display())]
     Io {
         /// Its file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }

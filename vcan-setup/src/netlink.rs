@@ -1,4 +1,4 @@
-//! What the kernel says of its interfaces, and what it is told to do with them: rtnetlink.
+//! The kernel's interfaces, listed and changed by rtnetlink.
 //!
 //! Decides nothing: [`plan`](crate::plan) does. A link that is made is given its number here, so that what
 //! follows is done to that one and to no other of the same name.
@@ -79,7 +79,7 @@ impl Netlink {
                 Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
                     *namespace = known.get(id).cloned();
-                    // Only who may look into that namespace is told.
+                    // Only a user with access to that namespace gets an answer.
                     *name = self.name_in(*id, *index).ok().flatten();
                 }
                 Kind::Hardware(hardware) => hardware.driver = driver(&interface.name),
@@ -89,7 +89,7 @@ impl Netlink {
         Ok(interfaces)
     }
 
-    /// What the kernel says of each interface.
+    /// Each interface as the kernel reports it.
     fn all(&mut self) -> io::Result<Vec<Vec<u8>>> {
         self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
@@ -137,7 +137,7 @@ impl Netlink {
     /// Makes a vcan of this name, marks it and brings it up; its number.
     ///
     /// # Errors
-    /// What the kernel says; then nothing was made, or it was removed again.
+    /// The kernel's error; then nothing was made, or it was removed again.
     pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
         let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
         let marked = self.mark(index);
@@ -147,7 +147,7 @@ impl Netlink {
     /// Makes a pair, marks both ends and brings them up; the number of the end that is here.
     ///
     /// # Errors
-    /// What the kernel says; then nothing was made, or it was removed again.
+    /// The kernel's error; then nothing was made, or it was removed again.
     pub fn make_pair(
         &mut self,
         name: &str,
@@ -181,8 +181,8 @@ impl Netlink {
         Ok(indices.max().unwrap_or(0) + 1)
     }
 
-    /// Makes a link, which is down and has MTU 72; its number. It is chosen here: the kernel does not say
-    /// which one it would have taken, and a name can have changed hands before it is asked about.
+    /// Makes a link, which is down and has MTU 72; its number. It is chosen here: the kernel does not report
+    /// which one it would have taken, and a name can have changed hands before it is looked up.
     fn add(
         &mut self,
         name: &str,
@@ -200,7 +200,7 @@ impl Netlink {
                 Ok(_) => return Ok(index),
                 // Somebody else took the number of the other end meanwhile,
                 Err(error) if is(&error, Errno::BUSY) && number < TRIES => number += 2,
-                // or this one: the kernel says the same of a name that is taken.
+                // or this one: the kernel returns the same error for a name that is taken.
                 Err(error) if is(&error, Errno::EXIST) && number < TRIES && self.free_index()? > index => {
                     number += 2;
                 }
@@ -210,7 +210,7 @@ impl Netlink {
     }
 
     fn mark(&mut self, index: u32) -> io::Result<()> {
-        // First the mark: a link that bears it can be removed by whoever comes next.
+        // First the mark: a link that has it can be removed by the next command.
         self.change(link(index, [LinkAttribute::IfAlias(MARK.to_owned())]))?;
         self.set_up(index, true)
     }
@@ -222,7 +222,7 @@ impl Netlink {
     /// Brings an interface up or down.
     ///
     /// # Errors
-    /// What the kernel says.
+    /// The kernel's error.
     pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
         let mut message = link(index, []);
         message.header.change_mask = LinkFlags::Up;
@@ -233,7 +233,7 @@ impl Netlink {
     /// Sets the MTU of an interface, which has to be down.
     ///
     /// # Errors
-    /// What the kernel says.
+    /// The kernel's error.
     pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
         self.change(link(index, [LinkAttribute::Mtu(mtu)]))
     }
@@ -241,7 +241,7 @@ impl Netlink {
     /// Sets the bit rates of CAN hardware, which has to be down. Without a rate for data it is classic.
     ///
     /// # Errors
-    /// What the driver says.
+    /// The driver's error.
     pub fn set_rates(&mut self, index: u32, rates: Rates) -> io::Result<()> {
         let fd = if rates.data_bitrate.is_some() { CanCtrlModeFlags::Fd } else { CanCtrlModeFlags::empty() };
         let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
@@ -251,7 +251,7 @@ impl Netlink {
         self.change(link(index, [LinkAttribute::LinkInfo(info)]))
     }
 
-    /// Sees that a clock comes near enough to what was asked for: a driver takes what is five percent away.
+    /// Sees that a clock comes near enough to what was requested: a driver takes what is five percent away.
     fn see_rates(&mut self, index: u32, target: Rates) -> io::Result<()> {
         let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
         match nearest.filter(|nearest| !nearest.meet(target)) {
@@ -263,7 +263,7 @@ impl Netlink {
     /// Removes an interface, and the other end of its pair with it.
     ///
     /// # Errors
-    /// What the kernel says.
+    /// The kernel's error.
     pub fn remove(&mut self, index: u32) -> io::Result<()> {
         self.exchange.request(RouteNetlinkMessage::DelLink(link(index, [])), 0).map(|_| ())
     }
@@ -271,7 +271,7 @@ impl Netlink {
     /// Does one step; what undoes it, if there is anything to be undone.
     ///
     /// # Errors
-    /// What the kernel says; then what the step has done so far was undone.
+    /// The kernel's error; then what the step has done so far was undone.
     pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
@@ -301,7 +301,7 @@ impl Netlink {
 
     fn or_undo(&mut self, done: io::Result<()>, undo: Undo) -> io::Result<Undo> {
         if done.is_err() {
-            // The first error is the one to tell.
+            // The first error is the one to report.
             let _ = self.undo(&undo);
         }
         done.map(|()| undo)
@@ -310,7 +310,7 @@ impl Netlink {
     /// Takes back what a step has done.
     ///
     /// # Errors
-    /// What the kernel says.
+    /// The kernel's error.
     pub fn undo(&mut self, undo: &Undo) -> io::Result<()> {
         match *undo {
             Undo::Remove { index } => self.remove(index),

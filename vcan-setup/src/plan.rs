@@ -1,14 +1,14 @@
-//! What is to be done, before anything is done: wanted interfaces and those that are there come to
-//! steps, or to a refusal.
+//! What is to be done, before anything is done: target interfaces and present ones are turned into
+//! steps, or into a refusal.
 //!
 //! ```text
-//!   wanted  --+
-//!             +--> up, down --> steps, each of which can be said in words and as an `ip` command
+//!   target  --+
+//!             +--> up, down --> steps, each of which can be printed in words and as an `ip` command
 //!   present --+            \--> or why nothing is done at all
 //! ```
 //!
 //! A step makes an interface, or changes or removes one that this program has made. The one exception is
-//! [`Action::SetRates`], which is planned only when it was asked for, and only for CAN hardware.
+//! [`Action::SetRates`], which is planned only when it was requested, and only for CAN hardware.
 
 use protocol::can::Format;
 use protocol::skin::Skin;
@@ -24,7 +24,7 @@ pub use refusal::Refusal;
 pub(crate) use step::widen;
 pub use step::{Action, Step};
 
-/// An interface that somebody wants.
+/// A requested interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Target {
     /// Its name.
@@ -35,7 +35,7 @@ pub struct Target {
     pub skin: Option<SkinBus>,
 }
 
-/// What a skin says of a bus that may be hardware.
+/// A skin's values for a bus that may be hardware.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct SkinBus {
     /// The skin's file, as a shell takes it.
@@ -65,7 +65,7 @@ impl Target {
         skin.buses.iter().map(target).collect()
     }
 
-    /// Of hardware that was named nobody knows which frames are wanted: those that it carries.
+    /// For hardware that was named without a skin, the format is the one that it carries.
     pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
         let there = find(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
@@ -88,14 +88,14 @@ impl Target {
         Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
-    /// Whether an interface's MTU carries the frames that are wanted.
+    /// Whether an interface's MTU carries the required frames.
     #[must_use]
     pub const fn carried_by(&self, mtu: u32) -> bool {
         matches!(self.format, Format::Classic) || mtu >= FD_MTU
     }
 }
 
-/// A pair that somebody wants, seen from its first end.
+/// A requested pair, seen from its first end.
 #[derive(Clone, Copy, Debug)]
 pub struct TargetPair<'a> {
     /// The end in this network namespace.
@@ -129,7 +129,7 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
     present.iter().find(|interface| interface.name == name)
 }
 
-/// What has to be done so that every wanted interface is there, is up and carries what it has to.
+/// The steps after which every target interface is there, is up and carries the required frames.
 ///
 /// # Errors
 /// When that cannot be had without touching something that is not ours. Then nothing is to be done.
@@ -238,7 +238,7 @@ impl Plan {
         }
     }
 
-    /// Brings a virtual interface that is there into the wanted state, if it is ours.
+    /// Brings a virtual interface that is there into the target state, if it is ours.
     fn fit(&mut self, target: &Target, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
@@ -258,7 +258,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Compares hardware with the skin, and sets it when that was asked for.
+    /// Compares hardware with the skin, and sets it when that was requested.
     fn hardware(
         &mut self,
         target: &Target,
@@ -297,7 +297,7 @@ impl Plan {
             return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
         match missing {
-            // Somebody has set its rates, of which the skin says nothing.
+            // Its rates are set, and the skin has none.
             Some(_) if before.bitrate.is_some() => Err(Refusal::Down(name)),
             Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
             None => Err(Refusal::HardwareDown { name, what, file }),
@@ -305,7 +305,7 @@ impl Plan {
     }
 }
 
-/// What has to be done so that none of the wanted interfaces is left that this program has made.
+/// The steps that remove those of the target interfaces that this program has made.
 ///
 /// # Errors
 /// When an interface was named that is not ours. Buses of a skin are left alone instead.

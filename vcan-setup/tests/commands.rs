@@ -50,7 +50,7 @@ impl Folder {
         std::fs::write(self.0.path().join(name), text).unwrap();
     }
 
-    /// Serves a bus, and says so before it returns.
+    /// Serves a bus, and returns when it is served.
     fn serve(&self, name: &str) -> Served {
         let mut child = self.command(&format!("serve {name}")).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
@@ -226,7 +226,7 @@ fn the_doctor_rates_the_kernel_by_the_choice() {
     assert_eq!((said.code, said.err.as_str()), (1, ""));
 }
 
-/// Runs the doctor while somebody says something on the bus all the time.
+/// Runs the doctor while a process sends on the bus all the time.
 fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
     let options = Options { filters: vec![], directory: Some(folder.buses()), ..Options::default() };
     let bus = Bus::open("nosuchcan1", Choice::Only(BusKind::Embedded), &options).unwrap();

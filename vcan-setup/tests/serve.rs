@@ -15,7 +15,7 @@ use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
-/// A server that has said that it is ready.
+/// A server that is ready.
 fn serve(directory: &Path, arguments: &[&str]) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
     command.args(["serve", "vcan0"]).args(arguments).env("SKINBUS_DIR", directory);

@@ -119,7 +119,7 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
     assert!(matches!(error, BusError::NotCan { .. }), "{error}");
 }
 
-/// Uses an interface of its own, so that nobody else's goes down.
+/// Uses an interface of its own, so that no other test's goes down.
 #[test]
 #[ignore = "needs vcan"]
 fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
@@ -147,11 +147,11 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     let error = a.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Down { .. }) && error.may_pass(), "{error}");
     assert_eq!(a.receive(&mut inbox).unwrap(), 0, "and is told once");
-    // A loop that only offers frames takes the word; who receives on the same bus hears it all the same.
+    // A loop that only offers frames consumes the error; a receiver on the same bus gets it all the same.
     assert!(!c.offer(&[frame]) && c.wait(Some(Duration::ZERO)).unwrap());
     assert!(matches!(c.receive(&mut inbox).unwrap_err(), BusError::Down { .. }));
     assert!(!c.wait(Some(Duration::ZERO)).unwrap(), "once for each time that it was said");
-    // What the socket was told has precedence over what it is asked to do.
+    // A pending error of the socket comes before the requested operation.
     let errors = [(); 2].map(|()| b.send(&[frame]).unwrap_err());
     assert!(errors.iter().all(|error| matches!(error.cause, BusError::Down { .. })), "{errors:?}");
     ip("link set vcan9 up");

@@ -28,14 +28,14 @@ fn run_as(user: u32, arguments: &str) -> Said {
     Said::by(&mut command)
 }
 
-/// A command that does what it is told.
+/// A command that succeeds.
 fn done(arguments: &str) -> String {
     let said = run_as(0, arguments);
     assert_eq!((said.code, said.err.as_str()), (0, ""), "{arguments}: {said:?}");
     said.out
 }
 
-/// A command that does not: what it says.
+/// A command that fails: its message.
 fn fails(arguments: &str, code: i32) -> String {
     let said = run_as(0, arguments);
     assert_eq!((said.code, said.out.as_str()), (code, ""), "{arguments}: {said:?}");
@@ -162,7 +162,7 @@ fn what_is_ours_and_was_spoilt_is_repaired() {
     assert_eq!(done("up vcan20"), "vcan20 has MTU 72, and is up\n");
     let repaired = link("vcan20").unwrap();
     assert_ours(&repaired, "vcan");
-    assert_eq!(repaired["ifindex"], index, "not made anew");
+    assert_eq!(repaired["ifindex"], index, "the same interface");
 }
 
 #[test]
@@ -177,7 +177,7 @@ fn what_is_not_ours_is_never_touched() {
     assert_eq!(
         fails("up vcan21 vcan20", 1),
         format!(
-            "vcan20 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `{repairs}` mends it"
+            "vcan20 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `{repairs}` fixes it"
         )
     );
     assert_eq!(
@@ -203,7 +203,7 @@ fn what_is_not_ours_is_never_touched() {
     };
     assert_eq!(same(links("")), same(before));
 
-    // The remedy is one.
+    // The hint works.
     assert!(Command::new("sh").args(["-c", &repairs["sudo ".len()..]]).status().unwrap().success());
     assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan, made by somebody else)\n");
 }
@@ -322,7 +322,7 @@ fn a_pair_leads_into_another_namespace() {
     ip("-n blue link set vcan0 down");
     let said = fails(up, 1);
     assert!(
-        said.contains("is down") && said.ends_with("`sudo ip -n blue link set vcan0 up` mends it"),
+        said.contains("is down") && said.ends_with("`sudo ip -n blue link set vcan0 up` fixes it"),
         "{said}"
     );
 
@@ -360,7 +360,7 @@ fn a_pair_within_one_namespace_and_into_that_of_a_process() {
 #[ignore = "needs vcan"]
 fn what_was_made_is_taken_back_when_a_later_step_fails() {
     let _made = Made(&["vcan20", "vcan21", "vcan22"]);
-    // An altname is taken, and only the kernel says so.
+    // An altname is taken, and only the kernel reports it.
     ip("link add vcan20 type vcan");
     ip("link set vcan20 mtu 16");
     ip("link set vcan20 alias skinbus");
@@ -443,7 +443,7 @@ fn doctor(arguments: &str) -> (i32, Vec<String>) {
     );
     let faults = json["findings"].as_array().unwrap().iter().filter(|it| it["level"] == "fault");
     let said_of = |it: &Value| {
-        let hints = it["remedies"].as_array().unwrap().iter().map(|it| it.as_str().unwrap());
+        let hints = it["hints"].as_array().unwrap().iter().map(|it| it.as_str().unwrap());
         std::iter::once(it["text"].as_str().unwrap()).chain(hints).collect::<Vec<_>>().join(" | ")
     };
     (said.code, faults.map(said_of).collect())

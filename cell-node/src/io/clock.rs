@@ -11,7 +11,7 @@ const MEASURE: Span = Span::from_millis(250);
 #[derive(Debug)]
 pub(super) struct Clock {
     start: Instant,
-    /// The wall's time at the start, in µs since 1970; measured again now and then, because somebody may set
+    /// The wall's time at the start, in µs since 1970; measured again now and then, because it may be set
     /// the wall's clock.
     wall: u64,
     /// When it was measured.

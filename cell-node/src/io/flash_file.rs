@@ -61,7 +61,7 @@ impl FlashFile {
         let Some(path) = &self.path else { return Ok(()) };
         let part = path.with_extension("flash.part");
         let store = || {
-            // What is left of an earlier attempt, or of somebody else.
+            // A leftover of an earlier attempt, or of another program.
             match fs::remove_file(&part) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => {}
@@ -80,7 +80,7 @@ impl FlashFile {
     }
 }
 
-/// The bytes of a regular file, as many as tell that there are too many. A pipe is not waited for.
+/// The bytes of a regular file, up to one more than are allowed. Does not wait for a pipe.
 fn read(path: &Path) -> io::Result<Vec<u8>> {
     let no_wait = i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or_default();
     let file = OpenOptions::new().read(true).custom_flags(no_wait).open(path)?;

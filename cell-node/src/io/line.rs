@@ -21,7 +21,7 @@ impl Line {
     /// Opens it.
     ///
     /// # Errors
-    /// When it cannot be used as it is asked for.
+    /// When it cannot be used as requested.
     pub fn open(&self, options: &Options) -> Result<Bus, Stopped> {
         let bus = Bus::open(&self.name, self.choice, options)?;
         if self.wires && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {

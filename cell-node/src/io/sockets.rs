@@ -1,4 +1,4 @@
-//! The sockets of a process: what wakes it comes by one, what can wait until it is awake by another.
+//! The sockets of a process: one wakes it, the other is only read while it is awake (deferred receive).
 
 use std::time::Duration;
 
@@ -8,36 +8,36 @@ use protocol::can::Frame;
 use super::Line;
 use super::Stopped;
 
-/// What a process hears.
+/// The receive filters of a process.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Hearing {
-    /// What wakes it.
+    /// Of the socket that wakes it.
     pub(super) at_once: Vec<Filter>,
-    /// What it hears before that.
+    /// Of the socket that is read before frames that woke it.
     pub(super) deferred: Vec<Filter>,
 }
 
-/// The open bus, twice when something is heard aside.
+/// The open bus; a second socket where some frames are deferred.
 ///
-/// Waking a process costs more than all that it does with a frame, so it is not woken for what only has to be known
-/// by the time that something else comes.
+/// Waking a process costs more than processing a frame, so a frame that is only needed together with a later one
+/// does not wake it.
 #[derive(Debug)]
 pub struct Sockets {
     bus: Bus,
     deferred: Option<Bus>,
-    /// What came aside.
+    /// Received deferred.
     waited: Inbox,
-    /// What woke the process.
+    /// Received by the socket that wakes the process.
     woke: Inbox,
     /// Both, in the order of the kernel's time stamps.
     came: Vec<Received>,
 }
 
 impl Sockets {
-    /// Opens the bus; `deferred` asks for the second socket.
+    /// Opens the bus; `deferred` are the filters of the second socket.
     ///
     /// # Errors
-    /// When it cannot be used as it is asked for.
+    /// When it cannot be used as requested.
     pub(super) fn open(line: &Line, options: &Options, deferred: Option<&[Filter]>) -> Result<Self, Stopped> {
         let bus = line.open(options)?;
         let open = |filters: &[Filter]| {
@@ -56,9 +56,9 @@ impl Sockets {
         self.bus.name()
     }
 
-    /// Puts other filters in force than those that are.
+    /// Replaces the filters `before` by `hearing`.
     pub(super) fn set_filters(&self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
-        // What moves from one socket to the other comes by both for a moment rather than by none.
+        // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) =
             (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
         if let (Some(deferred), true) = (&self.deferred, !update.is_empty()) {
@@ -77,7 +77,7 @@ impl Sockets {
         self.bus.send(frames).map_err(|error| error.cause)
     }
 
-    /// Forgets what came last, and takes what has come by now; whether there is anything.
+    /// Drops the last frames and receives those that are there; whether there are any.
     pub(super) fn look(&mut self) -> Result<bool, BusError> {
         self.wait(Duration::ZERO)?;
         if self.came.is_empty() {
@@ -86,7 +86,7 @@ impl Sockets {
         Ok(!self.came.is_empty())
     }
 
-    /// Forgets what came last, and waits for what wakes; with it comes what waited.
+    /// Drops the last frames and waits for one that wakes; the deferred ones are received with it.
     pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
         self.waited.clear();
         self.woke.clear();
@@ -117,7 +117,7 @@ impl Sockets {
         Ok(())
     }
 
-    /// What came last.
+    /// The frames received last.
     pub(super) fn frames(&self) -> &[Received] {
         &self.came
     }

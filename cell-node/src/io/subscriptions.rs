@@ -1,4 +1,4 @@
-//! Which cell of a process hears what.
+//! Which cell of a process receives which frames.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -12,29 +12,29 @@ use super::sockets::Hearing;
 /// The frames of all simulated wires of a bus.
 const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
 
-/// By identifier and by lane, who hears it: cells by their place in the process.
+/// The receiving cells, as indices within the process, by identifier and by link id.
 #[derive(Debug, Default)]
 pub(super) struct Subscriptions {
     by_id: HashMap<Id, Heard>,
     by_link_id: HashMap<LinkId, (usize, usize)>,
 }
 
-/// Who hears an identifier.
+/// The receivers of an identifier.
 #[derive(Debug, Default)]
 struct Heard {
     by: Vec<usize>,
-    /// Somebody has to be woken for it.
+    /// At least one receiver has to be woken for it.
     wakes: bool,
 }
 
 impl Subscriptions {
-    /// The port of a cell hears this lane, for good.
+    /// Subscribes a cell's port to a link id, permanently.
     pub(super) fn wire(&mut self, link_id: LinkId, cell: usize, port: usize) {
         self.by_link_id.insert(link_id, (cell, port));
     }
 
-    /// Forgets who hears which identifiers, and takes these in place of it: cell, identifier, and whether it is
-    /// enough to hear it aside.
+    /// Replaces all subscriptions to identifiers by these: cell, identifier, and whether it may be received
+    /// deferred.
     pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
         for (cell, id, deferred) in hears {
@@ -44,18 +44,18 @@ impl Subscriptions {
         }
     }
 
-    /// The cells that hear an identifier.
+    /// The cells that receive an identifier.
     pub(super) fn of_id(&self, id: Id) -> &[usize] {
         self.by_id.get(&id).map_or(&[], |heard| &heard.by)
     }
 
-    /// The cell, and its port, that hears a lane.
+    /// The cell, and its port, that receives a link id.
     pub(super) fn of_link_id(&self, link_id: LinkId) -> Option<(usize, usize)> {
         self.by_link_id.get(&link_id).copied()
     }
 
-    /// One exact filter for each identifier and each lane; for more than a socket takes, one for each kind that is
-    /// heard, and one for all wires.
+    /// One exact filter for each identifier and each link id. If these are more than a socket takes: one for each
+    /// kind that is received, and one for all wires.
     pub(super) fn hearing(&self) -> Hearing {
         let link_ids: BTreeSet<_> = self.by_link_id.keys().copied().collect();
         let ids = |wakes| -> BTreeSet<_> {
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn who_hears_an_identifier_changes_and_who_hears_a_link_id_does_not() {
+    fn subscriptions_to_identifiers_are_replaced_and_those_to_link_ids_stay() {
         let mut subscriptions = subscriptions(3);
         let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
         assert_eq!(subscriptions.of_id(id(Kind::Sum, 2)), [1]);
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_is_woken_for_what_all_who_hear_it_receive_deferred() {
+    fn an_identifier_is_deferred_only_if_all_its_receivers_defer_it() {
         let mut subscriptions = Subscriptions::default();
         let id = |number| Id::new(Kind::Sum, Node::Cell(CellId::new(number).unwrap()));
         subscriptions

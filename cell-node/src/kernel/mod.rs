@@ -14,9 +14,9 @@
 //! - [`Wrench`] carries the contact's force and moment from the cell's link down to the base. It is the
 //!   one to use: fewer than half of the operations, and the smaller error.
 //! - [`Projection`] carries the frames from the base up to the cell, as the paper does (Eq. 20 to 25).
-//!   It is the witness in tests and the other side of the comparison.
+//!   It is the oracle in tests, and what the wrench kernel is compared with.
 //!
-//! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | greatest |
+//! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | max |
 //! |---|---|---|---|---|---|---|
 //! | [`Wrench`] | 40 | 24 | 5 | 5 | 1.2e-4 Nm | 1.5e-3 Nm |
 //! | [`Projection`] | 103 | 56 | 6 | 6 | 1.4e-4 Nm | 1.5e-3 Nm |
@@ -32,7 +32,7 @@
 //! twists four for each vector; lengths that are zero cost nothing. Parameters that
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
-#[cfg(any(feature = "witness", test))]
+#[cfg(any(feature = "oracle", test))]
 pub mod oracle;
 mod projection;
 mod scalar;

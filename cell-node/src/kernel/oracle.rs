@@ -1,4 +1,4 @@
-//! Numbers to test and to count with: real ones, and ones that count what is done to them.
+//! Numbers for tests: real ones as an oracle, and words that count the operations on them.
 
 use std::cell::Cell;
 
@@ -6,7 +6,7 @@ use protocol::fixed::Q1_14;
 
 use super::{Operations, Scalar, Word};
 
-/// The witness: real numbers, the library's sine and cosine, no rounding.
+/// The oracle: real numbers, the library's sine and cosine, no rounding.
 impl Scalar for f64 {
     type Wide = Self;
     type Fine = Self;
@@ -65,7 +65,7 @@ std::thread_local! {
 }
 
 impl Operations {
-    /// Runs a computation on [`Counted`] numbers and says what it did.
+    /// Runs a computation on [`Counted`] numbers and returns its operation count.
     pub fn count<T>(computation: impl FnOnce() -> T) -> (T, Self) {
         DONE.set(Self::default());
         let result = computation();
@@ -73,7 +73,7 @@ impl Operations {
     }
 }
 
-/// A Q1.14 word that [`Operations::count`] watches.
+/// A Q1.14 word whose operations [`Operations::count`] counts.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Counted(pub Q1_14);
 

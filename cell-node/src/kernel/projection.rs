@@ -30,7 +30,7 @@ use super::{Kernel, Scalar, Twist, angle, length};
 pub struct Projection<S = Q1_14> {
     /// The joint that moves the cell; 0 when there is none.
     joint: usize,
-    /// Whether all axes are upright: then nobody reads how high the cell is and how hard it is pushed up.
+    /// Whether all axes are upright: then the cell's height and the vertical force are unused.
     upright: bool,
     /// The cell in the frame of joint k.
     position: [S; 3],
@@ -49,9 +49,9 @@ struct Link<S> {
     a: Option<S>,
     /// Absent for joint 1 too: it shifts along the axis of joint 1, which has no moment about it.
     d: Option<S>,
-    /// Whether somebody reads x_l.
+    /// Whether x_l is used.
     x: bool,
-    /// Whether this ends a group of parallel axes; then somebody reads v_l.
+    /// Whether this ends a group of parallel axes; then v_l is used.
     ends: bool,
 }
 

@@ -40,7 +40,7 @@ pub trait Scalar: Copy {
     fn plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
     /// The difference.
     fn minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
-    /// Rounds a sum to a word, halves up, and holds it in range.
+    /// Rounds a sum to the nearest word, ties up, and saturates.
     fn round(sum: Self::Wide) -> Self;
     /// The negative.
     fn negative(self) -> Self;

@@ -44,7 +44,7 @@ struct Wrenched<T> {
     moment: [T; 3],
 }
 
-/// Which components of a wrench somebody reads.
+/// Which components of a wrench are used.
 type Live = Wrenched<bool>;
 
 impl Live {

@@ -3,15 +3,16 @@
 //! ```text
 //!   message of a port ─> handle ─────┐             ┌─> poll_transmit ─> message for a port
 //!                now ──> handle_time ┼─ [Network] ─┼─> up, children ──> whose sums are whose
-//!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a number for this cell
+//!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a node id for this cell
 //! ```
 //!
-//! Whoever has a way to the gateway says so in its hellos, with a [`Rank`]: how far it is, and in which round of
-//! exploration. A cell without a parent asks the nearest port whose label is better than every label that it had
-//! itself (join, grant). Labels only improve, and a parent's is better than its child's: so there is never a
-//! circle, whatever is lost or late. While no sums go up, a cell moves to a port that is nearer than its parent, so
-//! that the tree does not stay deeper than it must. Where no label is good enough, the cell asks for a new round
-//! (seek), which goes up to the gateway and comes down as better labels for all.
+//! A cell with a route to the root announces it in its hellos, with a [`Rank`]: its depth, and the round (version) of
+//! the tree. A cell without a parent sends a join to the nearest port whose rank is better than every rank that it had
+//! itself, and the neighbour answers with a grant. A cell's rank only improves, and a parent's is better than its
+//! child's: so the tree has no loops, whatever is lost or late. While no sums are sent, a cell moves to a port that is
+//! nearer than its parent, so that the tree does not stay deeper than necessary. Where no rank is good enough, the cell
+//! starts a local repair: it requests a new round, which is forwarded to the root and spreads from there as better
+//! ranks for all.
 
 mod node_ids;
 mod port;
@@ -30,28 +31,28 @@ use port::Port;
 
 /// From one hello to the next.
 const HELLO: Span = Span::from_millis(250);
-/// How long a cell waits for a grant before it asks another one.
+/// How long a cell waits for a grant before it tries another port.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);
-/// From one search for a way to the next, at first and at most.
+/// From one local repair to the next: the first interval, and the maximum.
 const REPAIR: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
-/// From one time that the gateway's side is told that it was left to the next; it takes sums until it knows.
+/// From one leave to the gateway's side to the next, until it acknowledges; it takes sums until then.
 const AGAIN: Span = Span::from_millis(20);
 /// Ports, and a root's wire to the gateway's side.
 const ALL: usize = PORTS + 1;
-/// Messages that wait for ports; a shell takes them after every call.
+/// Outgoing messages, which a shell takes after every call.
 const OUTBOX: usize = 32;
 
 /// How a parent was lost, and so whether it may still take a sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(crate) enum Lost {
-    /// It did not take the last sums, or will not have this child: it takes no more.
+    /// It did not take the last sums, or refuses this child: it takes no more.
     Done,
-    /// It is not heard, does not hear, or has no way itself: it may take sums until it says that it let this child
-    /// go.
+    /// The link is down in one direction, or the parent is unreachable itself: it may take sums until it acknowledges
+    /// the leave.
     Unsure,
 }
 
-/// Who hears this cell's sums.
+/// The neighbour that takes this cell's sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Parent {
     port: usize,
@@ -62,10 +63,10 @@ struct Parent {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct FormerParent {
     port: usize,
-    /// It takes no sum any more.
+    /// It acknowledged: it takes no sum any more.
     heard: bool,
     since: Micros,
-    /// When it is told again.
+    /// When the leave is resent.
     again: Micros,
 }
 
@@ -83,30 +84,30 @@ impl FormerParent {
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     wired: u8,
-    /// Ports that hear nothing.
+    /// Ports whose input is ignored (bit mask).
     pub(crate) deaf: u8,
     node_ids: NodeIds,
     ports: [Port; ALL],
     parent: Option<Parent>,
-    /// The best label that this cell ever had: only better ones are followed.
+    /// The best rank that this cell ever had: only better ones are followed.
     best: Option<Rank>,
-    /// The label that its ports were told last, or that there is none.
+    /// The rank that was announced last, if any.
     offered: Option<Rank>,
     joining: Option<(usize, Micros)>,
-    /// Sums go up: a parent is not left without need.
+    /// Sums are being sent: a parent is not left without need.
     pub(crate) busy: bool,
-    /// The parent has no way itself.
+    /// The parent itself is unreachable.
     deserted: bool,
-    /// When a new round is asked for again, and how long after the last time that is.
+    /// When the next local repair is due, and the interval after that.
     repair: Option<(Micros, Span)>,
-    /// The last round that somebody asked for, whether all were asked for it or the parent only, and when.
+    /// The last repair that was forwarded: its round, whether to all ports or to the parent only, and when.
     passed_on: Option<(u8, bool, Micros)>,
     /// The parent that was left last.
     former_parent: Option<FormerParent>,
     reported: Option<[PortState; PORTS]>,
     /// How often the parent changed.
     pub(crate) changes: u16,
-    /// The place in the tree is another than when this was looked at last.
+    /// The place in the tree has changed since this was read last.
     pub(crate) tree_changed: bool,
     next_hello: Micros,
     outbox: Deque<(usize, PortMessage), OUTBOX>,
@@ -130,12 +131,12 @@ impl Network {
         self.wired != 0
     }
 
-    /// Whether something can come in through a port: it is wired, and not deaf.
+    /// Whether a port receives: it is wired, and its link is not down.
     pub(crate) const fn hears(&self, port: usize) -> bool {
         self.wired & !self.deaf & 1 << port != 0
     }
 
-    /// The port whose other end hears this cell's sums.
+    /// The port that leads to the parent.
     pub(crate) fn up(&self) -> Option<usize> {
         self.parent.map(|parent| parent.port)
     }
@@ -145,17 +146,17 @@ impl Network {
         self.parent.map(|parent| parent.rank.depth)
     }
 
-    /// What those below it are told.
+    /// The rank that it announces to those below it.
     fn rank(&self) -> Option<Rank> {
         self.parent.map(|parent| parent.rank.below())
     }
 
-    /// The round of the label.
+    /// The round of its rank.
     pub(crate) fn round(&self) -> u8 {
         self.best.map_or(0, |rank| rank.round)
     }
 
-    /// The parent's number: 0 for the gateway's side.
+    /// The parent's node id: 0 for the gateway's side.
     pub(crate) fn parent_node(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
@@ -163,7 +164,7 @@ impl Network {
         }
     }
 
-    /// The number of the cell at a port.
+    /// The node id of the cell at a port.
     pub(crate) fn number_at(&self, port: usize) -> Option<CellId> {
         self.ports.get(port)?.number()
     }
@@ -173,18 +174,18 @@ impl Network {
         self.ports.get(port).is_some_and(Port::is_child)
     }
 
-    /// The port where the child with this number is.
+    /// The port of the child with this node id.
     pub(crate) fn child_with(&self, number: CellId) -> Option<usize> {
         (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
     }
 
-    /// Whether the parent that was left last has heard so, or there was none: then it takes no sum any more.
+    /// Whether the former parent has acknowledged the leave, or there is none: then it takes no sum any more.
     pub(crate) fn is_released(&self) -> bool {
         self.former_parent.is_none_or(|former_parent| former_parent.heard)
     }
 
-    /// The cell was silent for an epoch: a parent that was left takes no sum any more. The gateway's side needs longer:
-    /// it goes by what it hears over the wire.
+    /// The cell was silent for an epoch: a former parent takes no sum any more. The gateway's side needs longer,
+    /// because it goes by the messages of the wire.
     pub(crate) fn forget_former_parent(&mut self, now: Micros) {
         self.former_parent
             .take_if(|former_parent| former_parent.port != UPLINK || now.since(former_parent.since) >= HELLO);
@@ -205,18 +206,18 @@ impl Network {
         self.ports.iter().take(PORTS).enumerate().map(bit).sum()
     }
 
-    /// What the ports lead to.
+    /// What each port leads to.
     pub(crate) fn port_states(&self, now: Micros) -> [PortState; PORTS] {
         core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
-    /// Whether the ports lead to something else than when this was asked last.
+    /// Whether what the ports lead to has changed since the last call.
     pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
     }
 
-    /// A number that a walk gave this cell, once.
+    /// A node id that a walk assigned to this cell, once.
     pub(crate) const fn given(&mut self) -> Option<CellId> {
         self.node_ids.given.take()
     }
@@ -238,10 +239,10 @@ impl Network {
         [join, repair, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
-    /// Says something to the cell at a port.
+    /// Sends a message to the cell at a port.
     pub(crate) fn say(&mut self, port: usize, message: PortMessage) {
         if self.wired >> port & 1 != 0 {
-            // A shell takes messages after every call; what does not fit is said again by the next hello.
+            // A shell takes messages after every call; for what does not fit, the next hello stands in.
             let _ = self.outbox.push_back((port, message));
         }
     }
@@ -270,7 +271,7 @@ impl Network {
         }
     }
 
-    /// Takes what came in through a port that hears, except what is about sums: `State` and `Nack`.
+    /// Takes a message of a port that receives, except those about sums: `State` and `Nack`.
     pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
@@ -320,9 +321,9 @@ impl Network {
                 _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
                 // It is as near as it was, or nearer, or of a later round.
                 Some(rank) if !parent.rank.is_better_than(rank) => self.follow(now, port, rank),
-                // It has no way itself, and looks for one; so do those below, and what they say meanwhile is missed soon.
+                // The parent is unreachable and repairs its route: this cell helps, and its sums are NACKed meanwhile.
                 None => self.pass_on(now, port, parent.rank.round),
-                // It started anew.
+                // It restarted.
                 Some(_) => self.lose_parent(now, Lost::Unsure),
             },
             Some(parent) => self.improve(now, port, parent),
@@ -330,7 +331,7 @@ impl Network {
         }
     }
 
-    /// Says the hellos that are due until then: while the cell is awake anyway, it need not wake for them.
+    /// Sends the hellos that are due by then: while the cell is awake anyway, it need not wake for them.
     pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
             self.next_hello = phase::next(self.next_hello, HELLO, now);
@@ -341,7 +342,7 @@ impl Network {
         }
     }
 
-    /// A parent that was left and may not know it.
+    /// A former parent that has not acknowledged the leave.
     fn to_be_reported(&self) -> Option<FormerParent> {
         self.former_parent
             .filter(|former_parent| !former_parent.heard && self.up() != Some(former_parent.port))
@@ -375,7 +376,7 @@ impl Network {
         self.tell_unnumbered(now);
     }
 
-    /// Says that the sums from this epoch on are for the parent.
+    /// Announces to the parent that the sums from this epoch on are for it.
     pub(crate) fn state(&mut self, epoch: Epoch) {
         if let Some(up) = self.up().filter(|up| *up != UPLINK) {
             self.say(up, PortMessage::State(epoch));

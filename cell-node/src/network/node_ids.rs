@@ -1,4 +1,4 @@
-//! Numbers for cells that have none: a walk over the tree gives them away, depth first.
+//! Node ids for cells that have none: a walk over the tree assigns them, depth first.
 
 use protocol::id::CellId;
 use protocol::time::Micros;
@@ -7,14 +7,14 @@ use protocol::wire::{PORTS, PortMessage, Walk};
 use super::Network;
 use super::port::Port;
 
-/// The cell's number, and what it knows of the numbers of those below it.
+/// The cell's node id, and the state of the walk that assigns node ids to those below it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct NodeIds {
     /// Its own, if it has one.
     pub(super) own: Option<CellId>,
-    /// A number that a walk gave it, until that is asked.
+    /// The node id that a walk assigned, until it is read.
     pub(super) given: Option<CellId>,
-    /// The walk that is with this cell and those below it, and the port that has it now.
+    /// The walk that is in this subtree, and the port that it is at.
     walking: Option<(Walk, usize)>,
     last_walk: Option<u8>,
     was_unnumbered: bool,
@@ -25,7 +25,7 @@ impl Network {
         self.node_ids.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
     }
 
-    /// Numbers are given away: this cell takes the first if it has none, and then each child's turn comes.
+    /// Node ids are assigned: this cell takes the first if it has none, then the walk goes to each child in turn.
     pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
         if self.node_ids.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;

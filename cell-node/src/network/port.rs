@@ -1,13 +1,13 @@
-//! What is known of one port.
+//! The state of one port.
 
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::time::{Micros, Span};
 use protocol::wire::{Hello, Rank};
 
-/// A port from which nothing came for so long leads nowhere: two hellos and some jitter.
+/// After so long without a hello a port leads nowhere: two hellos and some jitter.
 pub(super) const SILENT: Span = Span::from_millis(600);
-/// A child that was let in so long ago knows it, and says so in its hellos.
+/// So long after its grant a child names this cell as its parent in its hellos.
 const KNOWS: Span = Span::from_millis(300);
 
 /// One port.
@@ -17,18 +17,18 @@ pub(super) struct Port {
     heard: Option<(Hello, Micros)>,
     /// Since when the cell there is a child of this one.
     pub(super) child: Option<Micros>,
-    /// Its hellos count again when they are later than this: it was a parent and was lost.
+    /// It was a parent and was lost: only later hellos count again.
     pub(super) distrusted: Option<Micros>,
-    /// Somebody there asked for a later round, and has not been told a label since.
+    /// The cell there requested a later round, and no rank was announced to it since.
     pub(super) sought: bool,
 }
 
 impl Port {
-    /// Takes a hello; whether this is the first one for long.
+    /// Takes a hello; whether it is the first one after a silence.
     pub(super) fn take(&mut self, now: Micros, hello: Hello) -> bool {
         let restarted = self.hello(now).is_none();
         self.heard = Some((hello, now));
-        // It has been told, and does not think so: it is a child no longer.
+        // It had time to learn of the grant and names another parent: it is a child no longer.
         let forgot = !hello.up && self.child.is_some_and(|since| now.since(since) > KNOWS);
         if forgot {
             self.child = None;
@@ -41,7 +41,7 @@ impl Port {
         self.heard.as_ref().filter(|(_, at)| now.since(*at) <= SILENT).map(|(hello, _)| hello)
     }
 
-    /// Whether it works in both directions, and the other end speaks this version.
+    /// Whether it works in both directions, and the other end uses this version.
     pub(super) fn works(&self, now: Micros) -> bool {
         self.hello(now).is_some_and(|hello| hello.hears && hello.version == VERSION)
     }
@@ -53,17 +53,17 @@ impl Port {
         self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
     }
 
-    /// The number of the cell at the other end, if it has one.
+    /// The node id of the cell at the other end, if it has one.
     pub(super) fn number(&self) -> Option<CellId> {
         CellId::new(self.heard?.0.number.into()).ok()
     }
 
-    /// Whether a cell without a number is there or below.
+    /// Whether a cell without a node id is there or below.
     pub(super) fn is_unnumbered(&self) -> bool {
         self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
-    /// Whether a later round makes a difference there at once: to a child, and to who looks for a way.
+    /// Whether a later round has to be announced there at once: to a child, and to a cell that is unreachable.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
         self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }
@@ -72,7 +72,7 @@ impl Port {
         self.child.is_some()
     }
 
-    /// Lets time pass: a child from which nothing comes is none.
+    /// Time has passed: a silent child is no child any more.
     pub(super) fn pass(&mut self, now: Micros) {
         if self.hello(now).is_none() {
             self.child = None;

@@ -1,4 +1,4 @@
-//! The way up: whom a cell joins, follows, leaves, and lets in.
+//! The route to the root: which parent a cell joins, follows and leaves, and which children it grants.
 
 use protocol::time::{Micros, Span};
 use protocol::wire::{PortMessage, Rank, UPLINK};
@@ -7,12 +7,12 @@ use super::port::Port;
 use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};
 
 impl Network {
-    /// Whether nothing is lost by moving: no sums go up, or the parent has no way itself.
+    /// Whether nothing is lost by moving: no sums are sent, or the parent is unreachable itself.
     const fn may_move(&self) -> bool {
         !self.busy || self.deserted
     }
 
-    /// A port that is nearer than the parent is asked, when nothing is lost by moving.
+    /// Sends a join to a port that is nearer than the parent, when nothing is lost by moving.
     pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
         let rank = self.ports.get(port).and_then(|port| port.rank(now));
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
@@ -22,8 +22,8 @@ impl Network {
         }
     }
 
-    /// The parent's label is this. All ports hear another depth; another round only those that need it: children,
-    /// and who looks for a way. So a round costs one message a cell, and not one a port.
+    /// The parent's rank is this. A new depth is announced on all ports; a new round only where it is needed: to
+    /// children and to unreachable cells. So a round costs one message per cell, not one per port.
     pub(super) fn follow(&mut self, now: Micros, port: usize, rank: Rank) {
         let before = self.parent.replace(Parent { port, rank });
         if before == self.parent {
@@ -45,7 +45,7 @@ impl Network {
         }
     }
 
-    /// A cell asks to send its sums here.
+    /// A cell requests to send its sums here.
     pub(super) fn let_in(&mut self, now: Micros, port: usize) {
         let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
             return self.say(port, PortMessage::Refuse);
@@ -67,7 +67,7 @@ impl Network {
         self.best.is_none_or(|best| rank.is_better_than(best))
     }
 
-    /// A cell lets this one in.
+    /// A neighbour granted the join.
     pub(super) fn join(&mut self, now: Micros, port: usize, rank: Rank) {
         if self.up() == Some(port) {
             return;
@@ -90,7 +90,7 @@ impl Network {
         }
     }
 
-    /// The parent does not take this cell's sums any more: another way has to be found.
+    /// The parent does not take this cell's sums any more: another route has to be found.
     pub(crate) fn lose_parent(&mut self, now: Micros, how: Lost) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
@@ -105,7 +105,7 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
-    /// Asks the nearest port that is good enough, or for a new round where none is.
+    /// Sends a join to the nearest port that is good enough, or starts a local repair where none is.
     pub(super) fn search(&mut self, now: Micros) {
         if self.parent.is_some() {
             return;
@@ -117,28 +117,28 @@ impl Network {
             self.joining = None;
             self.distrust(now, requested);
         }
-        let labelled = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
-        let good = labelled().filter(|(_, rank)| self.is_good(*rank));
+        let ranked = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
+        let good = ranked().filter(|(_, rank)| self.is_good(*rank));
         let nearest =
             good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
         if let Some((port, _)) = nearest {
             self.joining = Some((port, now));
             return self.say(port, PortMessage::Join);
         }
-        // Who never had a way has nothing to compare: the first hello with a label is good enough.
+        // A cell that never had a rank has nothing to compare: the first hello with a rank is good enough.
         let Some(best) = self.best else { return };
         let (at, wait) = self.repair.unwrap_or((now, REPAIR.0));
         if now >= at {
             self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR.1)));
-            // Where no other port leads to the gateway, or none did so far, the way may be through those below, or
-            // through who was a parent.
+            // Where no other port leads to the gateway, or the first repair found none, the route may be through a
+            // child or through a former parent.
             let is_first = wait == REPAIR.0;
             let leads = self.ports.iter().any(|port| port.rank(now).is_some());
             self.repair_at(now, best.round, None, !(leads && is_first));
         }
     }
 
-    /// Asks for a round later than this one, on all ports that lead to the gateway but one, or on all that work.
+    /// Requests a round later than this one, on all ports that lead to the gateway but one, or on all that work.
     fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
         for port in (0..ALL).filter(|port| Some(*port) != but) {
             let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
@@ -148,8 +148,8 @@ impl Network {
         }
     }
 
-    /// Somebody needs a round later than this one: above they pass it on to the gateway, below to whoever has another
-    /// way there.
+    /// A neighbour needs a round later than this one. A child's repair is forwarded to the parent; a parent's to all
+    /// other ports, one of which may have another route.
     pub(super) fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
         if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {
@@ -158,7 +158,8 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(|port| port.sought = true);
         let is_deserted = parent.port == port;
         self.deserted |= is_deserted;
-        // Upwards is not everywhere: a parent may have two wires to this cell, and seek on both.
+        // A repair forwarded to the parent only does not count for a deserted cell: a parent may have two wires to this
+        // cell, and repair on both.
         let again =
             |(of, everywhere, at)| of == round && now.since(at) < REPAIR.0 && (everywhere || !is_deserted);
         if self.passed_on.is_some_and(again) {

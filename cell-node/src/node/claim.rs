@@ -1,4 +1,4 @@
-//! A cell's number: claimed, defended, and told with each heartbeat.
+//! A cell's address claim: claimed, defended, and stated with each heartbeat.
 
 use protocol::message::{Heartbeat, NetworkPage, Refused, State};
 use protocol::time::{Micros, Span};
@@ -9,58 +9,58 @@ use crate::phase;
 
 /// From one heartbeat to the next.
 pub const HEARTBEAT: Span = Span::from_millis(250);
-/// How long a new cell listens at least for another one under its number.
+/// How long a new cell listens at least for another one with its node id.
 pub const CLAIM: Span = Span::from_millis(250);
-/// First words are spread over this time by serial number: two cells under one number that are switched
-/// on together would else send different data under one identifier in the same bit time.
+/// First heartbeats are spread over this time by serial number: two cells with one node id that are switched
+/// on together would otherwise send different data with one identifier in the same bit time.
 const FIRST_WORD: Span = Span::from_millis(64);
-/// The shortest time between two answers to another cell under our number.
+/// The shortest time between two answers to another cell with our node id.
 const DEFEND: Span = Span::from_millis(10);
 
-/// How far a cell is with claiming its number.
+/// The stage of an address claim.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Claim {
-    /// It has not said anything yet.
-    Unsaid,
-    /// It has claimed the number and listens whether somebody else has it.
-    Said,
-    /// The number is its own.
+    /// Nothing has been sent yet.
+    Unsent,
+    /// The claim has been sent; the cell listens whether another one owns the node id.
+    Sent,
+    /// The cell owns the node id.
     Settled,
 }
 
-/// The claim of a number, and the heartbeats that tell it.
+/// The address claim, and the heartbeats that carry it.
 #[derive(Debug)]
 pub(super) struct AddressClaim {
     pub(super) stage: Claim,
     pub(super) next_heartbeat: Micros,
-    /// A sync asks for a heartbeat, which waits for the present epoch's end.
+    /// A sync requested a heartbeat, which waits for the present epoch's end.
     pub(super) sync_waits: bool,
-    /// When another cell was told last that the number is taken.
+    /// When the node id was defended last.
     defended: Option<Micros>,
-    /// The serial number of the cell that has the number already.
+    /// The serial number of the cell that owns the node id already.
     pub(super) taken: Option<u32>,
 }
 
 impl AddressClaim {
-    /// The number will be claimed; never while there is none.
+    /// A claim that starts now; without a node id it never starts.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
         let wait = phase::by_serial(FIRST_WORD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
-        Self { stage: Claim::Unsaid, next_heartbeat, sync_waits: false, defended: None, taken: None }
+        Self { stage: Claim::Unsent, next_heartbeat, sync_waits: false, defended: None, taken: None }
     }
 
-    /// Whether the number is this cell's own.
+    /// Whether this cell owns the node id.
     pub(super) fn is_settled(&self) -> bool {
         self.stage == Claim::Settled
     }
 }
 
 impl Node {
-    /// Says the heartbeat that is due: the first one claims the number, and the next one has it.
+    /// Sends the heartbeat that is due: the first is the address claim, with the next the cell owns the node id.
     pub(super) fn claim_in_time(&mut self, now: Micros) {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
-        if self.claim.stage == Claim::Unsaid {
-            self.claim.stage = Claim::Said;
+        if self.claim.stage == Claim::Unsent {
+            self.claim.stage = Claim::Sent;
             self.claim.next_heartbeat = now + CLAIM + phase::by_number(HEARTBEAT, cell);
             return self.push_heartbeat();
         }
@@ -73,7 +73,7 @@ impl Node {
         self.push_heartbeat();
         let Summing { network, report, .. } = &mut self.summing;
         if network.exists() {
-            // Another round alone is no news for anybody else.
+            // Another round alone waits for the heartbeat.
             report.due |= report.round != network.round();
             self.tell_tree(now);
             if self.summing.network.ports_changed(now) {
@@ -85,9 +85,9 @@ impl Node {
         self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT, now);
     }
 
-    /// Somebody else spoke under our number. While we claim it we give way, unless the other claims it
-    /// too and has the greater serial number; once it is ours we tell those who claim it, and only those:
-    /// two settled cells would go on telling each other for ever.
+    /// Another cell sent with our node id. While we claim it we give way, unless the other claims it
+    /// too and has the larger serial number. Once we own it we defend it, but only against claims:
+    /// two settled cells would answer each other for ever.
     pub(super) fn hear_own_number(&mut self, now: Micros, page: &NetworkPage) {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = if let NetworkPage::Heartbeat(other) = page { Some(other) } else { None };
@@ -101,7 +101,7 @@ impl Node {
         }
     }
 
-    /// How the cell is: its flags, and what can be derived.
+    /// The cell's state: its flags, and what can be derived.
     pub(super) fn state(&self) -> State {
         let in_use = self.configuration.in_use.as_ref();
         self.flags

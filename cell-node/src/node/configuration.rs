@@ -1,4 +1,4 @@
-//! What a cell computes with, and what somebody is about to make it compute with.
+//! The parameters that a cell computes with, and the staged ones.
 //!
 //! Writes go to a staged copy. A commit that names the staged copy's hash takes it into flash, and then
 //! into use, as a whole: a cell that is interrupted between two writes keeps computing with what it had.

@@ -4,7 +4,7 @@
 //!   frame, now, age ─> handle_frame ───┐          ┌─> poll_transmit ─> packet
 //!              now ─> handle_timeout ──┼─ [Node] ─┼─> poll_timeout ──> when to call again
 //!       ok or not ─> handle_stored ────┘          ├─> poll_store ────> parameters for flash
-//!                                                 └─> taken ─────────> who has this number already
+//!                                                 └─> taken ─────────> who owns this node id already
 //! ```
 //!
 //! It never blocks, allocates or panics, and reads no clock. A frame that it cannot use is counted by
@@ -43,7 +43,7 @@ use summing::Summing;
 pub use claim::{CLAIM, HEARTBEAT};
 pub use stimuli::PENDING;
 
-/// Identifiers that a cell can hear: its own, and the sums of the cells at its ports.
+/// Identifiers that a cell can receive: its own, and the sums of the cells at its ports.
 pub const HEARD: usize = OWN + PORTS;
 /// Packets that wait to be sent; a shell takes them after every call.
 const OUTBOX: usize = 16;
@@ -71,8 +71,8 @@ pub struct Node {
 }
 
 impl Node {
-    /// A cell that starts now: it will claim its number with a first heartbeat, and obeys stimuli if
-    /// `test_mode` says so.
+    /// A cell that starts now: its first heartbeat is its address claim, and it obeys stimuli in
+    /// `test_mode`.
     #[must_use]
     pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
         Self {
@@ -96,7 +96,7 @@ impl Node {
         }
     }
 
-    /// The same cell in a network: bit p says that port p leads somewhere, bit 4 that it is wired to the
+    /// The same cell in a network: bit p means that port p leads somewhere, bit 4 that it is wired to the
     /// gateway's side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
@@ -110,18 +110,18 @@ impl Node {
         self.summing.network.poll_transmit()
     }
 
-    /// Whether the identifiers that it hears have changed since the last call.
+    /// Whether the identifiers that it receives have changed since the last call.
     pub fn poll_hears(&mut self) -> bool {
         self.summing.poll_hears()
     }
 
-    /// Who it is.
+    /// Its identity.
     #[must_use]
     pub const fn identity(&self) -> Identity {
         self.identity
     }
 
-    /// The serial number of the cell that has this number already; then this one must fall silent.
+    /// The serial number of the cell that owns this node id already; then this one must fall silent.
     #[must_use]
     pub const fn taken(&self) -> Option<u32> {
         self.claim.taken
@@ -130,7 +130,7 @@ impl Node {
     /// The next packet to send.
     pub fn poll_transmit(&mut self) -> Option<Packet> {
         let mut message = self.outbox.pop_front()?;
-        // The counter says what went out before, so it is filled in when the heartbeat itself goes out.
+        // The counter covers the packets before this one, so it is filled in when the heartbeat itself goes out.
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &mut message {
             heartbeat.sent = self.sent;
         }
@@ -155,14 +155,14 @@ impl Node {
         Some(Kept { number: self.identity.cell, parameters })
     }
 
-    /// The identifiers that this cell hears now; a shell asks again after [`Node::poll_hears`].
+    /// The identifiers that this cell receives now; a shell reads them again after [`Node::poll_hears`].
     pub fn hears(&self) -> impl Iterator<Item = Id> + use<'_> {
         self.slots().into_iter().flatten()
     }
 
-    /// Whether it need not be woken for one of them, as long as it hears it before whatever comes next: the
-    /// parent's sum, which only tells that the parent is there; and joints while it would only wait for its children's
-    /// sums, which come after them.
+    /// Whether it need not be woken for one of them (deferred receive), as long as it gets it before whatever comes
+    /// next: the parent's sum, which only shows that the parent is there; and joints while it would only wait for its
+    /// children's sums, which come after them.
     #[must_use]
     pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
@@ -171,7 +171,7 @@ impl Node {
         self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
-    /// By slot of a pair's waiting half.
+    /// By slot of the reassembly.
     fn slots(&self) -> [Option<Id>; HEARD] {
         let sums = self.summing.heard.map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
         let mut ids = self.identity.hears().into_iter().chain(sums);
@@ -187,7 +187,7 @@ impl Node {
         self.claim_in_time(now);
     }
 
-    /// Takes a frame that came `age` ago. What this cell does not hear is ignored.
+    /// Takes a frame that came `age` ago. Identifiers that this cell does not receive are ignored.
     pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Ok(id) = packet::data_id(frame) else {
             count(&mut self.receiver.refused.foreign);
@@ -206,7 +206,7 @@ impl Node {
             Message::Joints { epoch, joints } => {
                 let taken = self.heard.joints;
                 self.take_joints(now, age, epoch, &joints);
-                // What was latched at joints that were too old is told with the next.
+                // What was latched at joints that were too old is sent with the next.
                 if self.heard.joints != taken {
                     self.sense(now);
                 }
@@ -220,7 +220,7 @@ impl Node {
             Message::Resume => self.flags = self.flags.with(State::HALTED, false),
             Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
             Message::Network { page, .. } => self.hear_own_number(now, &page),
-            // Whose number is in doubt answers nothing.
+            // A cell answers nothing until it owns its node id.
             Message::Sync | Message::Report | Message::Configure { .. } if !self.claim.is_settled() => {}
             Message::Sync if self.summing.sum.is_settled(now) => self.push_heartbeat(),
             Message::Sync => {
@@ -238,7 +238,7 @@ impl Node {
             }
             Message::Configure { tag, request, .. } => {
                 self.configure(now, tag, request);
-                // Another mode is another beginning, and who leaves test mode feels nothing any more.
+                // Another mode starts again, and a cell that leaves test mode measures no contact any more.
                 self.sense(now);
             }
             Message::Sum { from, epoch, torque, count } => {
@@ -246,7 +246,7 @@ impl Node {
                     self.handle_sums(now);
                 }
             }
-            // None of these is heard, see `Identity::hears`.
+            // None of these is received, see `Identity::hears`.
             Message::Torque { .. } | Message::Sensors { .. } | Message::Configured { .. } => {}
         }
     }
@@ -257,15 +257,15 @@ impl Node {
             count(&mut self.heard.joints_repeated);
             return;
         }
-        // All that came before these joints has been heard.
-        self.comparator(now);
+        // All frames before these joints have been received.
+        self.check_missing(now);
         let in_use = self.configuration.in_use.as_ref();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.receiver.refused.meaning);
             return;
         }
-        // Old joints are not answered, but what holds from them on holds: a cell that hung would else keep
-        // feeling what was there before.
+        // Old joints are not answered, but their stimuli are latched: a cell that hung would otherwise keep
+        // the contact state from before.
         self.epoch = Some(epoch);
         self.stimuli.latch(epoch);
         if in_use.is_some_and(|in_use| age > in_use.period()) {
@@ -287,7 +287,7 @@ impl Node {
         self.answer_joints(epoch, torque);
     }
 
-    /// Answers with its own torque; one that is zero says once that a contact has ended.
+    /// Answers with its own torque; one answer of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque>) {
         let Some(from) = self.identity.cell else { return };
         let torque = match torque {
@@ -303,7 +303,7 @@ impl Node {
         self.push(Message::Torque { from, epoch, torque });
     }
 
-    /// What is due before the next joints is said now, while the cell is awake: hellos and a heartbeat.
+    /// What is due before the next joints is sent now, while the cell is awake: hellos and a heartbeat.
     fn speak_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use.as_ref() else { return };
         let next_joints = now + in_use.period();
@@ -327,7 +327,7 @@ impl Node {
         }
     }
 
-    /// A word that is sent may be saturated, which the next heartbeat says.
+    /// A word that is sent may be saturated, which the next heartbeat flags.
     fn mark_saturated(&mut self, saturated: bool) {
         self.flags = self.flags.with(State::SATURATED, saturated || self.flags.has(State::SATURATED));
     }

@@ -10,22 +10,22 @@ use super::Node;
 /// What is switched at run time and not kept: parameters 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Switches {
-    /// What it answers joints with.
+    /// What joints are answered with.
     reply: Reply,
     /// When it sends what it measures.
     pub(super) sensing: Sensing,
     /// Which changes are events.
     pub(super) events: Events,
-    /// Which ports hear nothing.
+    /// Which ports receive nothing.
     links_down: LinksDown,
 }
 
 /// What is being written into flash.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Storing {
-    /// Parameters that somebody committed, with the request's tag.
+    /// Committed parameters, with the request's tag.
     Parameters(Parameters, u8),
-    /// The number that the network gave.
+    /// The node id that the network assigned.
     NodeId,
 }
 
@@ -55,7 +55,7 @@ impl Node {
 
     /// Flash was written, or could not be.
     pub fn handle_stored(&mut self, written: bool) {
-        // A number that could not be kept is given anew after the next start.
+        // A node id that could not be stored is assigned again after the next start.
         let Some(Storing::Parameters(parameters, tag)) = self.storing.take() else { return };
         if written {
             self.configuration.activate(parameters);

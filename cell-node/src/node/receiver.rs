@@ -1,4 +1,4 @@
-//! From frames to packets: which identifiers are whose slot, halves, and what cannot be used.
+//! From frames to packets: reassembly of segments by slot, and counts of what cannot be used.
 
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
@@ -8,11 +8,11 @@ use protocol::time::Micros;
 
 use super::{HEARD, count};
 
-/// What waits for its other half, and what was refused.
+/// First segments that wait for the second, and counts of what was refused.
 #[derive(Debug)]
 pub(super) struct Receiver {
     format: Format,
-    /// By slot of the identifier among those that are heard.
+    /// By slot of the identifier among those that are received.
     segments: [Segment; HEARD],
     /// What cannot be used, by its reason.
     pub(super) refused: Refused,

@@ -1,14 +1,14 @@
-//! When a cell says what it feels without being asked: continuously, on events, or not at all.
+//! When a cell sends its contact state without a request: continuously, on events, or not at all.
 //!
 //! ```text
-//!   Off         silence; a report asks
+//!   Off         silence, except for a report
 //!   Continuous  |s       s       s       s       s       s     a page 0 each period, phases spread by node
 //!   Event       |s   s ss    s             s             s     on change, on release, with each heartbeat
 //! ```
 //!
-//! A change is measured from what was *sent* last and not from what was felt last, so that a slow drift is
-//! seen. Touch and release have two thresholds, so that noise at one of them is no stream of events. What is
-//! said follows from what is felt and from the times alone: the same inputs, the same frames.
+//! A change is measured against what was *sent* last and not against the last measurement, so that a slow drift
+//! is reported. Touch and release have two thresholds, so that noise at one of them is no stream of events. What is
+//! sent depends on the contact state and the times alone: the same inputs, the same frames.
 
 use protocol::fixed::Q;
 use protocol::id::CellId;
@@ -21,10 +21,10 @@ use super::stimuli::Sensed;
 use super::{Node, Switches};
 use crate::phase;
 
-/// Every so many heartbeats bring the acceleration too: it tells no touch, and is seldom wanted.
+/// Every so many heartbeats carry the acceleration too: it shows no touch and is rarely needed.
 const BEATS_PER_ACCELERATION: u8 = 4;
 
-/// Which pages are to be said.
+/// Which pages are to be sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Pages {
     skin: bool,
@@ -36,15 +36,15 @@ impl Pages {
     pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
-/// What was said, and when the next is due.
+/// What was sent, and when the next is due.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sensing {
     mode: Mode,
     /// When the next one is due; in continuous mode only.
     due: Option<Micros>,
-    /// What was sent last, whoever asked for it.
+    /// What was sent last, requested or not.
     sent: Sensed,
-    /// When page 0 was said last without being asked for.
+    /// When page 0 was sent last without a request.
     said: Option<Micros>,
     contact: Touch,
     proximity: Touch,
@@ -71,7 +71,7 @@ impl Sensing {
         self.says(now, pages)
     }
 
-    /// Another mode, which begins with what is felt now.
+    /// Another mode, which starts with the present contact state.
     fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
@@ -88,7 +88,7 @@ impl Sensing {
         self.says(now, Pages::BOTH)
     }
 
-    /// Follows contact and proximity; whether that is to be said: a touch, a release, and the zero after one.
+    /// Tracks contact and proximity; whether there is an event: a touch or a release.
     fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
         let contact = self.contact.next(contact(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
@@ -98,7 +98,7 @@ impl Sensing {
         before != (contact, proximity)
     }
 
-    /// A regular heartbeat goes out. What was said at this very moment is not said again.
+    /// A regular heartbeat goes out. What was sent at this very moment is not resent.
     pub(super) fn beat(&mut self, now: Micros) -> Pages {
         if self.mode == Mode::Off {
             return Pages::NONE;
@@ -108,7 +108,7 @@ impl Sensing {
         self.says(now, Pages { skin, acceleration: self.beats == 0 })
     }
 
-    /// Time has passed: what is due before `until` is said, and what was missed is skipped; the phase is kept.
+    /// Time has passed: what is due before `until` is sent, overdue periods are skipped; the phase is kept.
     fn pass(&mut self, now: Micros, until: Micros) -> Pages {
         let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
         if due >= until {
@@ -141,21 +141,21 @@ fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
 }
 
 impl Node {
-    /// Says what has to be said after something was latched, measured or switched.
+    /// Sends what is due after something was latched, measured or switched.
     pub(super) fn sense(&mut self, now: Micros) {
-        // Whose number is in doubt says nothing; what is felt is compared with what was sent, so that
-        // nothing is forgotten.
+        // Nothing is sent until the cell owns its node id; the contact state is compared with what was sent, so that
+        // nothing is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
         let pages = self.sensing.look(now, &self.switches, cell, &self.stimuli.sensed);
         self.push_sensors(pages);
     }
 
-    /// When it has something to say by itself; not while its number is in doubt.
+    /// When it has something to send by itself; not until it owns its node id.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
         self.sensing.due.filter(|_| self.claim.is_settled())
     }
 
-    /// Says what is due.
+    /// Sends what is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
         if self.sensing_due().is_some() {
             let pages = self.sensing.pass(now, now + Span(1));
@@ -163,8 +163,8 @@ impl Node {
         }
     }
 
-    /// What is due before the next joints is said now, while the cell is awake. Not where it would be said
-    /// once for each joints or more often: all cells would say it at once, each time.
+    /// What is due before the next joints is sent now, while the cell is awake. Not where the period is that of
+    /// the joints or shorter: all cells would send at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use.as_ref() else { return };
         let joints = in_use.period();
@@ -176,7 +176,7 @@ impl Node {
         }
     }
 
-    /// Says what is felt.
+    /// Sends the present contact state.
     pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
         let Some(from) = self.identity.cell else { return };
         let skin = skin.then_some(SensorPage::Skin(self.stimuli.sensed.skin));

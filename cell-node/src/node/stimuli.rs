@@ -1,7 +1,7 @@
-//! What a cell feels, and what it shall feel from a later epoch on.
+//! A cell's contact state, and stimuli that set it from a later epoch on.
 //!
-//! A stimulus is not felt when it arrives but when the joints of its epoch do, so that a torque is a
-//! function of one joints frame and not of who was quicker on the bus.
+//! A stimulus is not latched when it arrives but when the joints of its epoch do, so that a torque is a
+//! function of one joints frame and not of the order of frames on the bus.
 
 use heapless::Vec;
 use protocol::fixed::Q3_12;
@@ -22,7 +22,7 @@ pub(super) enum Arrival {
     Refused,
 }
 
-/// All that a cell feels.
+/// All sensor values of a cell: its contact state.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Sensed {
     pub(super) skin: SkinSensors,
@@ -44,7 +44,7 @@ impl Sensed {
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
     pending: Vec<(From, SensorPage), PENDING>,
-    /// What is felt now.
+    /// The present contact state.
     pub(super) sensed: Sensed,
 }
 
@@ -58,7 +58,7 @@ impl Stimuli {
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
 
-    /// Feels, in the order of their arrival, all stimuli that hold from `epoch` on or earlier.
+    /// Latches, in the order of their arrival, all stimuli that hold from `epoch` on or earlier.
     pub(super) fn latch(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
             let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);

@@ -1,4 +1,4 @@
-//! The cell in a network: whose sums are whose, and when they are said.
+//! The cell in a network: which sums are for which parent, and when they are sent.
 
 use protocol::id::CellId;
 use protocol::message::{Message, NetworkPage, Ports, Tree};
@@ -11,18 +11,18 @@ use crate::contact::Torque;
 use crate::network::{Lost, Network};
 use crate::sum::{Begin, Sum, Words};
 
-/// So many more epochs in a row without an answer are borne each time that a parent that was lost that way says that it
-/// was there and heard.
+/// So many more epochs (in sixteenths) without an answer are tolerated each time that a parent which was lost for that
+/// reason acknowledges the leave: it was there all the time.
 const TOLERANCE_STEP: u16 = 2 * FORGETS;
 /// So many at most.
 const TOLERANCE: u16 = 12 * FORGETS;
 /// One less after so many epochs with a sum of the parent.
 const FORGETS: u16 = 16;
-/// After so many epochs in a row in which nothing was amiss, a cell is woken by its children and not by joints.
+/// After so many complete epochs in a row, a cell is woken by its children and not by joints.
 const STEADY: u8 = 8;
-/// Who looks later than this who is missing was away, and what it misses may wait to be heard.
+/// A check for missing sums that runs later than this finds nothing: the sums may still wait in the socket.
 const PUNCTUAL: Span = Span::from_millis(1);
-/// The shortest time between two words about its place in the tree.
+/// The shortest time between two reports of its place in the tree.
 const TREE: Span = Span::from_millis(50);
 
 /// The parent that an epoch's sum is for.
@@ -33,45 +33,44 @@ enum Parent {
     None,
     /// The gateway's side, which sends no sums.
     Gateway,
-    /// The cell at a port, if its number is known, and whether a sum of it was heard in this epoch.
+    /// The cell at a port, its node id if known, and whether one of its sums was received in this epoch.
     Cell { port: usize, number: Option<CellId>, heard: bool },
 }
 
-/// When a cell says where it is in the tree.
+/// When a cell reports its place in the tree.
 #[derive(Debug, Default)]
 pub(super) struct TreeReport {
-    /// There is news.
+    /// The place has changed.
     pub(super) due: bool,
     /// Not before this.
     next: Micros,
-    /// The round that was told last.
+    /// The round that was reported last.
     pub(super) round: u8,
 }
 
-/// A cell's network, its sums, and what one is to the other.
+/// A cell's network, its sums, and the state that connects them.
 #[derive(Debug, Default)]
 pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
-    /// By port, whose sums are heard.
+    /// By port, the cell whose sums are received.
     pub(super) heard: [Option<CellId>; PORTS],
     hears_changed: bool,
     parent: Parent,
-    /// Whether a sum was said in the epoch before the present one.
+    /// Whether a sum was sent in the epoch before the present one.
     said_before: bool,
-    /// The parent may not have taken a sum: it is asked whether it hears this cell, until it answers. Epochs in a row in
-    /// which it did not.
+    /// The parent may not have taken a sum: it is probed until it answers. Epochs in a row in which it did not.
     unanswered: Option<u16>,
-    /// How many of them are borne, in sixteenths: who lost parents that were there all the time is on a machine that is
-    /// late, and would only lose the next one too.
+    /// How many of them are tolerated, in sixteenths: a cell that lost parents that were there all the time runs on a
+    /// machine that is late, and would only lose the next one too.
     tolerance: u16,
-    /// The port of a parent that was lost and may have been there all the time.
+    /// The port of a parent that was lost for lack of answers, and may have been there all the time.
     suspected: Option<usize>,
-    /// Epochs in a row in which a child was waited for and nothing was amiss.
+    /// Complete epochs in a row in which a child was waited for.
     steady: u8,
-    /// Joints are heard aside: what wakes this cell is its children.
+    /// Joints are received deferred: this cell is woken by its children.
     pub(super) waits_for_children: bool,
-    /// How often the parent had changed when that was looked at last.
+    /// The count of changes of the parent when it was read last.
     changes: u16,
     pub(super) report: TreeReport,
 }
@@ -83,12 +82,12 @@ impl Summing {
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
-    /// The parent whose sums are heard.
+    /// The parent whose sums are received.
     pub(super) fn heard_parent(&self) -> Option<CellId> {
         self.heard.get(self.network.up()?).copied().flatten()
     }
 
-    /// Whether what is heard, or what wakes the cell, has changed since the last call.
+    /// Whether the received identifiers, or those that wake the cell, have changed since the last call.
     pub(super) fn poll_hears(&mut self) -> bool {
         let waits = self.steady == STEADY && self.unanswered.is_none() && self.sum.awaits_children();
         self.hears_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
@@ -102,13 +101,13 @@ impl Summing {
 
     pub(super) fn handle_time(&mut self, now: Micros) {
         if self.waits_for_children && now >= self.sum.late_at_next() {
-            // No joints came: from now on they wake it again.
+            // No joints arrived: from now on they wake it again.
             self.steady = 0;
         }
         self.network.handle_time(now);
     }
 
-    /// Takes what came in through a port that hears.
+    /// Takes a message of a port that receives.
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.up() == Some(port);
         self.sum.heard_after(age);
@@ -137,7 +136,7 @@ impl Summing {
         self.network.handle(now, port, message);
     }
 
-    /// Takes in what the network has come to.
+    /// Follows changes of the network.
     fn follow_network(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
             self.sum.disown(port);
@@ -145,7 +144,7 @@ impl Summing {
         if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
             self.unanswered = None;
             self.sum.restate = true;
-            // What was said in this epoch may have been taken by the parent before.
+            // What was sent in this epoch may have been taken by the parent before.
             self.sum.fall_silent();
         }
         if self.network.up().is_none() {
@@ -160,7 +159,7 @@ impl Summing {
         self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
     }
 
-    /// New joints, which stood on the bus `age` ago; the tree is for their sums as it is now.
+    /// New joints, which were on the bus `age` ago; their sums use the tree as it is now.
     pub(super) fn begin(
         &mut self,
         now: Micros,
@@ -170,7 +169,7 @@ impl Summing {
     ) {
         let (at, up) = (now - age, self.network.up());
         self.said_before = self.sum.said_in(epoch.before());
-        // A parent that was left and may not know it takes no sum from who was silent for an epoch.
+        // A former parent takes no sum from a cell that was silent for an epoch.
         if !self.said_before {
             self.network.forget_former_parent(at);
         }
@@ -188,12 +187,12 @@ impl Summing {
             children: self.network.children(),
         };
         self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
-        // What waited aside is no sign of a late machine.
+        // The age of deferred frames is no sign of a late machine.
         if !self.waits_for_children {
             self.sum.heard_after(age);
         }
         if let Some(unanswered) = self.unanswered {
-            // Without an answer the parent is lost in this epoch, and what was not said is free for another.
+            // Without an answer the parent is lost in this epoch, and a sum that was not sent may go to another.
             if unanswered >= self.tolerated() {
                 self.sum.held = true;
             }
@@ -213,15 +212,15 @@ impl Summing {
         let Some(port) = self.network.child_with(from).filter(|&port| self.network.hears(port)) else {
             return false;
         };
-        // Unlike a parent's, a child's is heard as it comes.
+        // Unlike a parent's, a child's is not deferred.
         self.sum.heard_after(age);
         self.sum.take(now, port, epoch, words);
         true
     }
 
-    /// Looks whose sums did not come in this epoch, once; whether the parent is lost.
-    fn comparator(&mut self, now: Micros) -> bool {
-        let Some((epoch, nack)) = self.sum.comparator() else { return false };
+    /// Sends a NACK to each child whose sum is missing in this epoch, once; whether the parent is lost.
+    fn check_missing(&mut self, now: Micros) -> bool {
+        let Some((epoch, nack)) = self.sum.missing() else { return false };
         for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
             self.network.say(port, PortMessage::Nack(epoch));
         }
@@ -231,7 +230,7 @@ impl Summing {
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
                 *unanswered += 1;
-                // Of who was silent all this epoch it takes no more.
+                // A cell that was silent all this epoch has no lease any more.
                 lost = (*unanswered > tolerated).then_some(if said { Lost::Unsure } else { Lost::Done });
             }
             (None, Parent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
@@ -251,8 +250,8 @@ impl Summing {
         lost.is_some()
     }
 
-    /// The parent says that it did not take a sum: it has to be told anew whom they are for, and asked whether it hears
-    /// this cell at all.
+    /// The parent did not take a sum: the state is resent, and the parent is probed whether it receives this cell at
+    /// all.
     fn was_nack(&mut self, epoch: Epoch) {
         self.sum.restate = true;
         let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
@@ -263,12 +262,12 @@ impl Summing {
         }
     }
 
-    /// Epochs in a row without an answer that are borne.
+    /// Epochs in a row without an answer that are tolerated.
     const fn tolerated(&self) -> u16 {
         self.tolerance.div_ceil(FORGETS)
     }
 
-    /// Asks the parent whether it is there; it is looked for the answer before the next joints.
+    /// Probes the parent; the answer is checked before the next joints.
     fn probe_parent(&mut self) {
         if let Some(up) = self.network.up() {
             self.network.say(up, PortMessage::Probe);
@@ -278,7 +277,7 @@ impl Summing {
 }
 
 impl Node {
-    /// Takes what came in through a port `age` ago.
+    /// Takes a message that came in through a port `age` ago.
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         if self.summing.network.hears(port) {
             self.summing.handle_port(now, age, port, message);
@@ -286,7 +285,7 @@ impl Node {
         }
     }
 
-    /// Takes in what the network has come to.
+    /// Follows changes of the network.
     pub(super) fn after_network(&mut self, now: Micros) {
         if !self.summing.network.exists() {
             return;
@@ -301,7 +300,7 @@ impl Node {
         self.tell_tree(now);
     }
 
-    /// Says what is due, and looks who is missing.
+    /// Sends the sum that is due, and checks for missing ones.
     pub(super) fn handle_sums(&mut self, now: Micros) {
         let Some(from) = self.identity.cell else { return };
         let summing = &mut self.summing;
@@ -313,9 +312,9 @@ impl Node {
             self.push(Message::Sum { from, epoch, torque, count });
         }
         let Some(late) = self.summing.sum.check(now) else { return };
-        // Who looks late looks at the next joints, when all that came before them has been heard.
+        // A late check is left to the next joints, when all frames before them have been received.
         if late <= PUNCTUAL {
-            self.comparator(now);
+            self.check_missing(now);
             if self.summing.unanswered.is_some() {
                 self.summing.probe_parent();
             }
@@ -325,14 +324,14 @@ impl Node {
         }
     }
 
-    /// Looks whose sums did not come in this epoch, once.
-    pub(super) fn comparator(&mut self, now: Micros) {
-        if self.summing.comparator(now) {
+    /// Checks for missing sums of this epoch, once.
+    pub(super) fn check_missing(&mut self, now: Micros) {
+        if self.summing.check_missing(now) {
             self.after_network(now);
         }
     }
 
-    /// Says where it is in the tree, if that is news; while everything changes, not every change.
+    /// Reports its place in the tree if that has changed, at a limited rate.
     pub(super) fn tell_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
         let may = self.summing.network.exists() && self.claim.is_settled();

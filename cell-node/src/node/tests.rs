@@ -33,7 +33,7 @@ fn identity() -> Identity {
     Identity { cell: Some(cell()), serial: 100_012 }
 }
 
-/// A cell that has claimed its number and said so.
+/// A cell that owns its node id.
 fn settled(flash: Flash) -> Node {
     settle(Node::new(identity(), Format::Fd, &flash, true, Micros(0)))
 }
@@ -46,7 +46,7 @@ fn settle(mut node: Node) -> Node {
     node
 }
 
-/// A cell that has just claimed its number, and its claim.
+/// A cell that has just sent its address claim, and the claim.
 fn claiming(identity: Identity) -> (Node, Message) {
     let mut node = Node::new(identity, Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
     node.handle_timeout(node.poll_timeout());
@@ -104,7 +104,7 @@ fn heard(node: &mut Node) -> (Heard, Refused) {
 
 // JOINTS-3, JOINTS-5, JOINTS-6
 #[test]
-fn a_pressed_cell_answers_each_joints_frame_and_says_once_that_the_contact_has_ended() {
+fn a_pressed_cell_answers_each_joints_frame_and_the_end_of_contact_with_one_zero() {
     let mut node = settled(Flash::Sound(wheel()));
     assert_eq!(tell(&mut node, &joints(0)), [], "quiet: nothing touches it");
     assert_eq!(tell(&mut node, &press(4.0, From::Epoch(Epoch(2)))), []);
@@ -139,11 +139,11 @@ fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
 
 // JOINTS-4, STIM-8
 #[test]
-fn a_cell_that_hung_feels_what_came_meanwhile() {
+fn a_cell_that_hung_latches_the_stimuli_that_came_meanwhile() {
     let mut node = settled(Flash::Sound(wheel()));
     tell(&mut node, &press(4.0, From::Next));
     assert_eq!(tell(&mut node, &joints(0)), [torque(0, -2.0)]);
-    // Twenty stimuli and joints waited while it hung, more than can be pending; the last one lets go.
+    // Twenty stimuli and joints waited while it hung, more than can be pending; the last one releases.
     for epoch in 1..=20 {
         tell(&mut node, &press(if epoch < 20 { 3.0 } else { 0.0 }, From::Epoch(Epoch(epoch))));
         for frame in joints(epoch).encode().frames(Format::Fd) {
@@ -172,7 +172,7 @@ fn a_halted_cell_is_silent_until_a_resume() {
 
 // BEAT-2
 #[test]
-fn a_heartbeat_that_is_due_before_the_next_joints_comes_with_the_answer_and_shifts_no_other() {
+fn a_heartbeat_that_is_due_before_the_next_joints_is_sent_with_the_answer_and_keeps_its_phase() {
     let mut node = settled(Flash::Sound(wheel()));
     let due = node.poll_timeout();
     let mut epoch = Epoch(0);
@@ -190,7 +190,7 @@ fn a_heartbeat_that_is_due_before_the_next_joints_comes_with_the_answer_and_shif
     assert_eq!(node.poll_timeout(), due + HEARTBEAT, "neither drifts nor comes twice");
     node.handle_timeout(due);
     assert_eq!(drain(&mut node), []);
-    // With nobody to answer it comes when it is due.
+    // Without joints it comes when it is due.
     node.handle_timeout(due + HEARTBEAT);
     assert_eq!(drain(&mut node).len(), 1);
 }
@@ -218,9 +218,9 @@ fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
 
 // CLAIM-3, CLAIM-6, CLAIM-7
 #[test]
-fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
+fn a_claiming_cell_gives_way_to_the_owner_of_the_node_id() {
     let mut other = settled(Flash::Sound(wheel()));
-    // The newcomer's claim reaches the one that is there, which says that the number is its own.
+    // The newcomer's claim reaches the owner, which defends its node id.
     let (mut newcomer, claim) = claiming(Identity { serial: 7, ..identity() });
     let defence = tell(&mut other, &claim);
     assert!(heartbeat(&defence).state.has(State::DUPLICATE));
@@ -228,14 +228,14 @@ fn a_cell_that_hears_its_own_number_while_it_claims_it_gives_way() {
     tell(&mut newcomer, &defence[0]);
     assert_eq!(newcomer.taken(), Some(100_012));
     assert_eq!(other.taken(), None);
-    // Two that are settled notice each other and do not talk about it for ever.
+    // Two settled cells notice each other and do not answer each other for ever.
     assert_eq!(tell(&mut other, &defence[0]), []);
     assert!(heartbeat(&tell(&mut other, &Message::Sync)).state.has(State::DUPLICATE));
 }
 
 // CLAIM-3
 #[test]
-fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
+fn of_two_simultaneous_claims_the_lower_serial_number_wins() {
     let (mut low, from_low) = claiming(Identity { serial: 1, ..identity() });
     let (mut high, from_high) = claiming(Identity { serial: 2, ..identity() });
     tell(&mut low, &from_high);
@@ -245,7 +245,7 @@ fn of_two_that_claim_a_number_at_once_the_lower_serial_number_stays() {
 
 // CLAIM-2, JOINTS-5, STIM-8
 #[test]
-fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
+fn a_claiming_cell_listens_and_answers_nothing() {
     let (mut node, _) = claiming(identity());
     let to = Address::Everyone;
     let request = Message::Configure { to, tag: 0, request: Request::Read { number: 0 } };
@@ -254,12 +254,12 @@ fn a_cell_that_claims_its_number_listens_and_answers_nothing() {
     }
     node.handle_timeout(node.poll_timeout());
     assert_eq!(drain(&mut node).len(), 1);
-    assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)], "it has felt all the while");
+    assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)], "the stimulus was latched");
 }
 
 // CONF-8, STATE-3
 #[test]
-fn a_cell_without_sound_flash_says_so_and_sends_no_torque() {
+fn a_cell_without_sound_flash_flags_it_and_sends_no_torque() {
     let mut node = settled(Flash::Damaged);
     tell(&mut node, &press(4.0, From::Next));
     assert_eq!(tell(&mut node, &joints(0)), []);
@@ -309,7 +309,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     tell(&mut node, &press(4.0, From::Next));
     assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)]);
     let state = heartbeat(&tell(&mut node, &Message::Sync)).state;
-    assert!(state.has(State::CONFIGURED) && !state.has(State::FLASH_DAMAGED), "mended");
+    assert!(state.has(State::CONFIGURED) && !state.has(State::FLASH_DAMAGED), "repaired");
 
     // What cannot be is refused, and what was in use stays in use.
     let mut words = wheel().words(Parameter::Mount);
@@ -400,11 +400,11 @@ fn the_classic_format_works_in_segments() {
     };
     assert_eq!(hear(&mut node, &press(4.0, From::Next)), []);
     assert_eq!(hear(&mut node, &joints(0)), [torque(0, -2.0)]);
-    // Half a packet is lost: that packet is lost, the next one is not.
+    // One segment is lost: its packet is lost, the next one is not.
     let first = joints(1).encode().frames(Format::Classic).next().unwrap();
     node.handle_frame(NOW, Span(0), &first);
     assert_eq!(hear(&mut node, &joints(2)), [torque(2, -2.0)]);
-    // How far apart they are is a matter of when they arrived, not of when the cell came to hear them.
+    // How far apart they are is a matter of when they arrived, not of when the cell processed them.
     let within = Segment::within(Id::command(Command::Joints));
     let mut apart = |epoch, second: Micros, age| {
         let mut segments = joints(epoch).encode().frames(Format::Classic);
@@ -445,7 +445,7 @@ fn skipped_joints_leave_active_as_it_is() {
 }
 
 #[test]
-fn no_frame_whatever_brings_a_cell_down() {
+fn no_frame_makes_a_cell_panic() {
     use proptest::prelude::*;
     let frames =
         proptest::collection::vec((0_u32..0x800, proptest::collection::vec(any::<u8>(), 0..=64)), 0..40);

@@ -26,7 +26,7 @@ fn at(epoch: u8, micros: u64) -> Micros {
     Micros(u64::from(epoch) * PERIOD.0 + micros)
 }
 
-/// What it says from now to the end of the epoch, and when.
+/// What it sends from now to the end of the epoch, and when.
 fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     let mut said = Vec::new();
     for micros in (0..PERIOD.0).step_by(100) {
@@ -40,7 +40,7 @@ fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
 
 // SUM-4, SUM-6
 #[test]
-fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
+fn a_cell_sends_in_the_slot_of_its_depth_and_sends_one_end() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 1), Some(&own(2_400)));
     assert_eq!(says(&mut sum, 1), [(2_000, 2, 1, true)]);
@@ -51,12 +51,12 @@ fn a_cell_speaks_in_the_slot_of_its_depth_and_says_once_that_it_has_ended() {
     sum.begin(&begin(4, 1), None);
     assert_eq!(says(&mut sum, 4), []);
     sum.begin(&begin(5, 1), Some(&own(1_000)));
-    assert_eq!(says(&mut sum, 5), [(2_000, 1, 1, true)], "stated anew");
+    assert_eq!(says(&mut sum, 5), [(2_000, 1, 1, true)], "stated again");
 }
 
 // SUM-2
 #[test]
-fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
+fn the_rounding_remainder_is_carried_until_the_contact_ends() {
     for (carry, target) in [(true, [0, 1, 0, 1, 0]), (false, [0; 5])] {
         let mut sum = sum(carry);
         let mut got = Vec::new();
@@ -70,7 +70,7 @@ fn what_rounding_takes_away_is_carried_until_the_contact_ends() {
     sum.begin(&begin(0, 0), Some(&own(400)));
     sum.begin(&begin(1, 0), None);
     sum.begin(&begin(2, 0), Some(&own(400)));
-    assert_eq!(says(&mut sum, 2).first().map(|said| said.1), Some(0), "nothing was left");
+    assert_eq!(says(&mut sum, 2).first().map(|said| said.1), Some(0), "no remainder");
 }
 
 // SUM-4, SUM-5
@@ -94,16 +94,16 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
     sum.take(at(1, 500), 1, Epoch(1), words(10, 1));
-    assert_eq!((sum.taken, sum.dropped), (0, 1), "not said whom it is for");
+    assert_eq!((sum.taken, sum.dropped), (0, 1), "no state yet");
     sum.state(at(1, 600), 1, Epoch(1));
-    assert_eq!((sum.taken, sum.dropped), (1, 0), "said late");
+    assert_eq!((sum.taken, sum.dropped), (1, 0), "the state came late");
     sum.begin(&begin(2, 2), None);
     sum.take(at(2, 500), 1, Epoch(2), words(10, 1));
     assert_eq!(sum.taken, 2);
     sum.begin(&begin(3, 2), None);
-    assert_eq!(sum.comparator(), Some((Epoch(3), 0b10)), "it did not come");
+    assert_eq!(sum.missing(), Some((Epoch(3), 0b10)), "it did not come");
     sum.begin(&begin(4, 2), None);
-    assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "it is looked in time");
+    assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "checked in time");
     assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (None, Some(Span(0))));
     sum.take(at(4, 500), 1, Epoch(4), words(10, 1));
     assert_eq!(sum.taken, 2, "after a gap");
@@ -127,18 +127,18 @@ fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
     assert_eq!((sum.taken, sum.dropped), (1, 1));
     sum.take(at(3, 200), 1, Epoch(3), words(10, 1));
     assert_eq!((sum.taken, sum.dropped), (2, 1));
-    assert_eq!(sum.comparator(), Some((Epoch(3), 0)));
+    assert_eq!(sum.missing(), Some((Epoch(3), 0)));
 }
 
 // LEASE-3
 #[test]
-fn an_end_closes_the_lease_without_a_word() {
+fn an_end_closes_the_lease_without_a_nack() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
     sum.state(at(1, 0), 1, Epoch(1));
     sum.take(at(1, 100), 1, Epoch(1), Words::END);
     sum.begin(&begin(2, 2), None);
-    assert_eq!((sum.poll_timeout(), sum.comparator()), (None, Some((Epoch(2), 0))), "nobody is missed");
+    assert_eq!((sum.poll_timeout(), sum.missing()), (None, Some((Epoch(2), 0))), "nothing is missing");
 }
 
 // SUM-3
@@ -163,8 +163,8 @@ fn saturation_passes_upwards_word_by_word() {
 
 // NACK-2
 #[test]
-fn a_machine_that_hears_late_blames_nobody() {
-    for (age, rated) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
+fn a_machine_that_receives_late_checks_no_missing_sums() {
+    for (age, missing) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
         let mut sum = sum(false);
         sum.begin(&begin(1, 1), Some(&own(1_000)));
         sum.state(at(1, 10), 0, Epoch(1));
@@ -172,6 +172,6 @@ fn a_machine_that_hears_late_blames_nobody() {
         sum.begin(&begin(2, 1), Some(&own(1_000)));
         sum.watch();
         sum.heard_after(Span(age));
-        assert_eq!(sum.comparator(), rated, "{age} µs");
+        assert_eq!(sum.missing(), missing, "{age} µs");
     }
 }

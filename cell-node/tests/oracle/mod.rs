@@ -69,7 +69,7 @@ impl Case {
 pub(crate) struct Errors {
     /// The mean of the absolute errors.
     pub(crate) mean: f64,
-    /// The greatest absolute error.
+    /// The largest absolute error.
     pub(crate) max: f64,
     /// How many torques were compared: those of loaded joints.
     pub(crate) torques: usize,
@@ -78,7 +78,7 @@ pub(crate) struct Errors {
 }
 
 impl Errors {
-    /// Compares what `torques` says of each case.
+    /// Compares the result of `torques` for each case.
     pub(crate) fn of(torques: impl Fn(&Case) -> [f64; MAX_JOINTS]) -> Self {
         let cases = Case::all();
         let fits = |case: &&Case| case.torques.iter().all(|torque| torque.abs() < Q3_12::MAX.to_f64());

@@ -12,11 +12,11 @@ use crate::can::FD_BYTES;
 
 /// How many datagrams one call moves at most.
 pub const BATCH: usize = 64;
-/// So many are asked for first: most reads find one or two, and room for 64 costs more to lay out than a
+/// So many are requested first: most reads find one or two, and room for 64 costs more to lay out than a
 /// datagram to read.
 const FEW: usize = 4;
 
-/// Room for one datagram and what the kernel says of it.
+/// Room for one datagram and the kernel's data about it.
 pub(super) struct Slot {
     pub(super) bytes: [u8; FD_BYTES],
     /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
@@ -43,7 +43,7 @@ impl Batch {
     /// Takes what is waiting in a socket, and forgets what was here. Never waits.
     ///
     /// # Errors
-    /// What `recvmmsg` says; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
+    /// The error of `recvmmsg`; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
         self.count = 0;
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
@@ -56,7 +56,7 @@ impl Batch {
         Ok(self.count)
     }
 
-    /// Waits for one datagram as long as the socket's `SO_RCVTIMEO` says, and takes only this one: who is
+    /// Waits for one datagram for at most the socket's `SO_RCVTIMEO`, and takes only this one: who is
     /// woken for each would look for a second in vain.
     pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
         self.count = 0;
@@ -88,20 +88,20 @@ impl std::fmt::Debug for Batch {
 pub struct Datagram<'a>(&'a Slot);
 
 impl<'a> Datagram<'a> {
-    /// Its bytes, or `None` when it was longer than 72 and is cut off.
+    /// Its bytes, or `None` when it was longer than 72 and is truncated.
     #[must_use]
     pub fn bytes(self) -> Option<&'a [u8]> {
         if self.0.flags & libc::MSG_TRUNC == 0 { self.0.bytes.get(..self.0.len) } else { None }
     }
 
-    /// Whether the kernel says that this very socket sent it.
+    /// Whether this very socket sent it, as the kernel reports.
     #[must_use]
     pub const fn is_own(self) -> bool {
         self.0.flags & libc::MSG_CONFIRM != 0
     }
 
     /// When it came, in nanoseconds of the wall clock, and how many the kernel had dropped before it,
-    /// each if the kernel said so.
+    /// each if the kernel reported it.
     #[must_use]
     pub fn notes(self) -> Notes {
         let words = self.0.control.map(u64::to_ne_bytes);
@@ -189,7 +189,7 @@ impl Outgoing {
     /// Sends them all, in order, without waiting; how many the socket took.
     ///
     /// # Errors
-    /// What `sendmmsg` says when it could not send even one; [`io::ErrorKind::WouldBlock`] when the socket
+    /// The error of `sendmmsg` when it could not send even one; [`io::ErrorKind::WouldBlock`] when the socket
     /// is full.
     pub fn send(&self, fd: impl AsFd) -> io::Result<usize> {
         let datagrams = self.bytes.iter().zip(&self.lens).take(self.count);
@@ -205,7 +205,7 @@ impl Outgoing {
 /// Sends one datagram, without waiting: one when the socket took it.
 ///
 /// # Errors
-/// What `send` says; [`io::ErrorKind::WouldBlock`] when the socket is full.
+/// The error of `send`; [`io::ErrorKind::WouldBlock`] when the socket is full.
 pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     rustix::net::send(fd, bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
     Ok(1)

@@ -12,7 +12,7 @@ pub use directory::{DirectoryError, address, make_directory, open_directory, soc
 mod client;
 mod directory;
 
-/// The version of what is said beside frames.
+/// The version of the control messages beside frames.
 pub const VERSION: u8 = 2;
 /// Which byte of a frame marks it as the receiver's own.
 pub const OWN_BYTE: usize = 6;
@@ -23,7 +23,7 @@ const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
 const ANSWER_LEN: usize = 17;
 
-/// What a client asks for when it connects.
+/// A client's request when it connects.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Hello {
     /// What it wants to receive.
@@ -69,7 +69,7 @@ impl Hello {
     }
 }
 
-/// Filters that take the place of those in force: all of them when it is the first and the last part.
+/// Filters that replace the present ones: all of them when it is the first and the last part.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct FilterPart {
     /// What came of an unfinished change before is forgotten.
@@ -131,17 +131,17 @@ fn decode_filters(bytes: &[u8]) -> Option<Vec<Filter>> {
     Some(filters.iter().map(filter).collect())
 }
 
-/// What the bus says to a hello.
+/// The bus's answer to a hello.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Answer {
-    /// The filters are in force.
+    /// The filters are set.
     Welcome {
         /// How many bytes may wait for this client, as the kernel counts them.
         granted: u64,
     },
     /// The hello was not understood.
     Refused {
-        /// The version that the bus speaks.
+        /// The version that the bus uses.
         version: u8,
     },
 }

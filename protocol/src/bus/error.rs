@@ -21,10 +21,10 @@ pub enum BusError {
     Filters {
         /// The bus.
         name: String,
-        /// How many were asked for.
+        /// How many were requested.
         got: usize,
     },
-    /// SocketCAN was asked for and the kernel has none.
+    /// SocketCAN was requested and the kernel has none.
     #[error(
         "{0}: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
          (--bus-kind embedded)"
@@ -38,7 +38,7 @@ pub enum BusError {
         "{0} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
     )]
     NotCan(String),
-    /// A classic interface where CAN FD is wanted.
+    /// A classic interface where CAN FD is required.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
          {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` says how)"
@@ -64,7 +64,7 @@ pub enum BusError {
         name: String,
         /// What was tried.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// Nobody serves this embedded bus.
@@ -81,7 +81,7 @@ pub enum BusError {
     /// The directory of embedded buses is not as private as it must be.
     #[error(transparent)]
     Directory(#[from] DirectoryError),
-    /// The embedded bus speaks another version, or did not understand the request.
+    /// The embedded bus uses another version, or did not understand the request.
     #[error(
         "the embedded bus {name} refuses: it speaks version {theirs}, this program version {ours}; use both from one build"
     )]
@@ -118,14 +118,14 @@ pub enum BusError {
     /// An FD frame for a bus that was opened for classic frames only.
     #[error("a CAN FD frame cannot be sent on {0}, which was opened for classic frames only")]
     FdFrame(String),
-    /// Anything else that the system says.
+    /// Any other error of the system.
     #[error("cannot {doing} {name}: {source}")]
     Io {
         /// The bus.
         name: String,
         /// What was tried.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -146,7 +146,7 @@ impl BusError {
         matches!(self, Self::Down(_) | Self::Full { .. })
     }
 
-    /// Whether to open the bus again later may succeed without anybody doing something about this process.
+    /// Whether to open the bus again later may succeed without a change to this process.
     #[must_use]
     pub const fn may_open_later(&self) -> bool {
         matches!(

@@ -39,7 +39,7 @@ impl Inbox {
     }
 
     /// How many frames the kernel, or the embedded bus, has dropped for this socket so far because it was
-    /// not read in time: a running total that wraps (`SO_RXQ_OVFL`). The kernel tells it with the next frame
+    /// not read in time: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports it with the next frame
     /// that arrives, the embedded bus also when the socket has been read empty.
     #[must_use]
     pub const fn dropped(&self) -> u32 {

@@ -15,7 +15,7 @@ use super::{Bus, BusError, Filter, Options};
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: u32 = 72;
 
-/// Bytes that a gateway lets wait unread in its socket of each bus, unless it is told another number: all cells may
+/// Bytes that a gateway lets wait unread in its socket of each bus, unless configured otherwise: all cells may
 /// answer a report at once.
 pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
 
@@ -89,7 +89,7 @@ impl Carrier for SocketCan {
     }
 }
 
-/// Sets a fresh socket as the options say; how many bytes may wait for it.
+/// Sets the options of a new socket; how many bytes may wait for it.
 fn set_up(socket: &CanFdSocket, options: &Options) -> io::Result<usize> {
     set_filters(socket, &options.filters)?;
     socket.set_error_filter(options.error_mask)?;
@@ -108,10 +108,10 @@ fn set_filters(socket: &CanFdSocket, filters: &[Filter]) -> io::Result<()> {
 }
 
 /// Lets so many bytes wait unread in a socket of any sort; how many the kernel granted and counts, which is twice
-/// what was asked for when all was granted.
+/// what was requested when all was granted.
 ///
 /// # Errors
-/// When the system refuses. To get less than was asked for is no error.
+/// When the system refuses. To get less than was requested is no error.
 pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> {
     // Forcing needs CAP_NET_ADMIN; without it the system's limit holds.
     if sockopt::set_socket_recv_buffer_size_force(&socket, bytes).is_err() {

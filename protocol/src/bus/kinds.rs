@@ -1,7 +1,7 @@
 //! Which kinds of buses there are, and which kind each of several is: `--bus-kind embedded --bus-kind
 //! can0=socketcan`.
 //!
-//! A further kind is named here, and does in its own way what [`Carrier`] asks for.
+//! A further kind is named here, and implements [`Carrier`].
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,11 +19,11 @@ use super::{Bus, BusError, Filter, Options, check_name};
 
 /// What each kind of bus does in its own way; the rest of [`Bus`] is the same for all.
 pub(super) trait Carrier {
-    /// Opens a bus with its filters in force and stamps on what arrives: the socket, and how many bytes may wait for
+    /// Opens a bus with its filters set and time stamps on what arrives: the socket, and how many bytes may wait for
     /// it, as the kernel counts them.
     fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError>;
 
-    /// Puts filters in force, in place of those that were.
+    /// Replaces the filters.
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError>;
 
     /// Whether nothing real hangs on the bus of this name.
@@ -32,10 +32,10 @@ pub(super) trait Carrier {
     /// Whether a frame came back to the very socket that sent it.
     fn is_own(&self, frame: Datagram<'_>) -> bool;
 
-    /// How many frames were dropped so far, from a datagram that is no frame and says so.
+    /// How many frames were dropped so far, from a datagram that reports it instead of a frame.
     fn dropped(&self, notice: &[u8]) -> Option<u32>;
 
-    /// What an error of an open socket says of the bus, when it says more than that something failed.
+    /// The state of the bus that an error of an open socket shows, when it shows any.
     fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError>;
 }
 
@@ -85,7 +85,7 @@ impl fmt::Display for BusKind {
     }
 }
 
-/// Which kind of bus is wanted.
+/// Which kind of bus is requested.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum Choice {
     /// SocketCAN where the kernel has it, else the embedded bus.
@@ -99,7 +99,7 @@ impl Choice {
     /// The kind that this choice comes to on this machine.
     ///
     /// A kernel with `CAN_RAW` sockets means SocketCAN, also when the interface is missing: that is an error
-    /// with its remedy, never a silent change of bus.
+    /// with a hint, never a silent change of bus.
     #[must_use]
     pub fn resolve(self) -> BusKind {
         match self {
@@ -178,7 +178,7 @@ pub enum KindsError {
         /// The second.
         second: Choice,
     },
-    /// A bus that nobody else speaks of.
+    /// A bus that no other test uses.
     #[error("--bus-kind {bus}={kind}: there is no bus {bus} here, but {}", known.join(", "))]
     Unknown {
         /// The bus.
@@ -204,7 +204,7 @@ impl Kinds {
         Self { named: named.collect(), others: Choice::Auto }
     }
 
-    /// What the words say; buses that none of them speaks of are as `otherwise` says.
+    /// Decodes the words; buses that none of them speaks of are as `otherwise` says.
     ///
     /// # Errors
     /// When two of them speak of the same.

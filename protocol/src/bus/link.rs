@@ -1,4 +1,4 @@
-//! What the kernel says of an interface: asked of it, because `/sys` may show another network.
+//! An interface as the kernel reports it over netlink, because `/sys` may show another network.
 
 use std::io;
 

@@ -1,4 +1,4 @@
-//! A socket to the kernel that speaks of interfaces (rtnetlink): one request, and all that answers it.
+//! A socket to the kernel's rtnetlink: one request, and all answers to it.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -49,7 +49,7 @@ impl Exchange {
     /// Sends one request and takes all that answers it: the messages, each without its netlink header.
     ///
     /// # Errors
-    /// What the kernel says, or that it does not answer.
+    /// The kernel's error, or that it does not answer.
     pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
         for _ in 0..RETRIES {
             let (answers, interrupted) = self.query(payload.clone(), flags)?;
@@ -101,7 +101,7 @@ impl Exchange {
     }
 }
 
-/// What one answer about an interface says of it. What is not understood is left out: a strange interface must not
+/// Reads one answer about an interface. What is not understood is left out: an unusual interface must not
 /// hide the others.
 pub fn attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
     NlasIterator::new(answer.get(HEADER..).unwrap_or_default())

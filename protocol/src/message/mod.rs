@@ -7,11 +7,11 @@
 //! | 2 torque | sender | own torque in Nm, Q3.12 | 1 |
 //! | 3 sensors | sender | a [`SensorPage`] | page |
 //! | 4 network | sender | a [`NetworkPage`] | page |
-//! | 5 configure | addressee | what to write | parameter, + 0x80 to write; the epoch byte is a tag |
-//! | 6 configured | sender | the value in force, or a refusal | parameter, + 0x80 if written; tag |
-//! | 7 stimulus | addressee | a [`SensorPage`] | page, + 0x80: from the next joints on |
+//! | 5 configure | destination | what to write | parameter, + 0x80 to write; the epoch byte is a tag |
+//! | 6 configured | sender | the present value, or a refusal | parameter, + 0x80 if written; tag |
+//! | 7 stimulus | destination | a [`SensorPage`] | page, + 0x80: from the next joints on |
 //!
-//! In a torque or a sum the greatest and the least word mean *saturated*.
+//! In a torque or a sum the largest and the smallest word mean *saturated*.
 
 mod network;
 mod sensors;
@@ -55,7 +55,7 @@ pub enum From {
     Next,
 }
 
-/// What a `configure` packet asks for.
+/// The request of a `configure` packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Request {
     /// The value of a parameter.
@@ -100,7 +100,7 @@ impl Answer {
     pub const FLASH_FAILED: i16 = 17;
     /// No such parameter.
     pub const UNKNOWN: i16 = 18;
-    /// Words that this parameter cannot have, or a cut outside test mode.
+    /// Words that this parameter cannot have, or `links_down` outside test mode.
     pub const CANNOT_BE: i16 = 19;
 }
 
@@ -130,7 +130,7 @@ pub enum Message {
         epoch: Epoch,
         /// Nm.
         torque: [Q7_8; WORDS],
-        /// Cells in it; 0 ends what was said before.
+        /// Cells in it; 0 ends the sums before.
         count: u8,
     },
     /// One cell's torque.
@@ -151,22 +151,22 @@ pub enum Message {
         /// The measurements.
         page: SensorPage,
     },
-    /// What a cell, or the gateway (node 0), says of itself.
+    /// What a cell, or the gateway (node 0), reports of itself.
     Network {
         /// Who sends it.
         from: Node,
         /// The last joints it took.
         epoch: Epoch,
-        /// What it says.
+        /// What it reports.
         page: NetworkPage,
     },
     /// Read or write a parameter.
     Configure {
-        /// To whom.
+        /// Destination.
         to: Node,
         /// Comes back in the answer.
         tag: u8,
-        /// What is asked.
+        /// The request.
         request: Request,
     },
     /// The answer.
@@ -236,7 +236,7 @@ impl Message {
     /// The packet's meaning. Never panics.
     ///
     /// # Errors
-    /// When the packet says something that this version of the protocol does not know.
+    /// When the packet has a kind, page or value that this version of the protocol does not know.
     pub fn decode(packet: &Packet) -> Result<Self, MessageError> {
         let Packet { id: Id { kind, node }, words, epoch, count } = *packet;
         let sender = || match Node::from_byte(node) {
@@ -301,7 +301,7 @@ impl Message {
         })
     }
 
-    /// The packet that says this.
+    /// Encodes it to a packet.
     #[must_use]
     pub fn encode(&self) -> Packet {
         let packet = |words, epoch, count| Packet { id: self.id(), words, epoch, count };
@@ -377,7 +377,7 @@ impl Message {
         self.id().sender()
     }
 
-    /// The epoch that it speaks of, if it does.
+    /// Its epoch, if it has one.
     #[must_use]
     pub const fn epoch(&self) -> Option<Epoch> {
         match *self {
@@ -416,7 +416,7 @@ impl Message {
         self.torque_words().map(|words| words.iter().any(is_end))
     }
 
-    /// Whether it tells of a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
+    /// Whether it reports a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
     /// or a proximity, a heartbeat of an active cell.
     #[must_use]
     pub fn is_contact(&self) -> bool {
@@ -454,7 +454,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// Whatever a packet is taken to mean is said again by a packet with the same meaning; words
+        /// What is decoded from a packet is encoded to a packet with the same meaning; words
         /// that a page does not use may differ.
         #[test]
         fn a_meaning_comes_back(id in 0_u16..0x800, words: [i16; WORDS], epoch: u8, count: u8) {

@@ -1,4 +1,4 @@
-//! What a cell says of itself and its part of the network.
+//! What a cell reports of itself and its part of the network.
 
 use super::{MessageError, State};
 use crate::id::Kind;
@@ -6,12 +6,12 @@ use crate::packet::{self, WORDS};
 
 /// In a tree page: no parent.
 const NOBODY: u8 = 255;
-/// What a cell says of itself and its part of the network.
+/// What a cell reports of itself and its part of the network.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum NetworkPage {
     /// Page 0.
     Heartbeat(Heartbeat),
-    /// Page 1: what became of the packets it heard.
+    /// Page 1: what became of the packets that it received.
     Heard(Heard),
     /// Page 2: what it refused, by reason.
     Refused(Refused),
@@ -31,13 +31,13 @@ pub struct Heartbeat {
     pub configuration: u16,
     /// Packets sent before this one, modulo 2^16.
     pub sent: u16,
-    /// Frames refused, modulo 2^16; page 2 says why.
+    /// Frames refused, modulo 2^16; page 2 has the reasons.
     pub rejected: u16,
     /// How it is.
     pub state: State,
 }
 
-/// Page 1: what became of what was heard, each modulo 2^16.
+/// Page 1: what became of received packets, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct Heard {
@@ -67,7 +67,7 @@ pub struct Refused {
     pub foreign: u16,
     /// A kind, page or command that does not exist, or words that cannot be.
     pub meaning: u16,
-    /// First halves whose second half did not come.
+    /// First segments whose second segment did not come.
     pub incomplete: u16,
     /// Stimuli for which there was no room, or that a measuring cell was sent.
     pub stimuli: u16,
@@ -76,7 +76,7 @@ pub struct Refused {
 /// Page 3: a cell's place in the tree. The epoch byte is that of the last joints taken.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Tree {
-    /// Where its sums go: the number of a cell, 0 for the gateway's side; `None` without a way up.
+    /// Where its sums go: the node id of a cell, 0 for the gateway's side; `None` where it is unreachable.
     pub parent: Option<u8>,
     /// The port that leads there, 0 to 4; not looked at without a parent.
     pub up: u8,
@@ -92,7 +92,7 @@ pub struct Tree {
     pub sent: u16,
     /// Sums taken from children, modulo 2^16.
     pub taken: u16,
-    /// Sums of children that were not taken: too late, or not said to be for this cell; modulo 2^16.
+    /// Sums of children that were not taken: too late, or without a state message; modulo 2^16.
     pub dropped: u16,
 }
 
@@ -108,15 +108,15 @@ pub struct Ports {
 /// What one port leads to.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct PortState {
-    /// The number of the cell at the other end; 0 when nothing is heard from there, or it has no number.
+    /// The node id of the cell at the other end; 0 when nothing is received from there, or it has no node id.
     pub number: u8,
     /// The other end's port.
     pub port: u8,
-    /// Something is heard from there.
+    /// Hellos are received from there.
     pub hears: bool,
-    /// It hears this cell too.
+    /// The other end receives this cell too.
     pub works: bool,
-    /// It speaks another version of the protocol.
+    /// It uses another version of the protocol.
     pub other_version: bool,
 }
 

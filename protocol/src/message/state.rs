@@ -15,7 +15,7 @@ impl State {
     pub const HALTED: Self = Self(1 << 2);
     /// Its flash was damaged; what was in it is not used.
     pub const FLASH_DAMAGED: Self = Self(1 << 3);
-    /// It has heard another cell speak under its number.
+    /// It has received frames of another cell with its node id.
     pub const DUPLICATE: Self = Self(1 << 4);
     /// It obeys stimuli instead of measuring.
     pub const TEST_MODE: Self = Self(1 << 5);
@@ -65,7 +65,7 @@ impl State {
         (self.0 >> 8) & 0xF
     }
 
-    /// The version of the protocol that the cell speaks.
+    /// The version of the protocol that the cell uses.
     #[must_use]
     pub const fn version(self) -> u16 {
         self.0 >> 12

@@ -1,4 +1,4 @@
-//! What a cell knows by heart: the robot's table, its own pose, its gains and thresholds, as the words
+//! What a cell stores: the robot's table, its own pose, its gains and thresholds, as the words
 //! in which they travel and lie in flash.
 //!
 //! Each parameter is one packet's six words (unused words are not looked at, and are stored and answered as 0):
@@ -54,7 +54,7 @@ pub enum Parameter {
     Sensing,
     /// 8: which changes are events.
     Events,
-    /// 9: which ports are cut, for tests.
+    /// 9: the ports whose links are down, for tests.
     LinksDown,
     /// 16 to 21: one row of the robot's table, counted from 0.
     Row(u8),
@@ -113,7 +113,7 @@ impl Parameter {
         NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
-    /// Whether it is in force as soon as it is written, is not stored, and is forgotten by a start.
+    /// Whether it applies as soon as it is written, is not stored, and is lost at a restart.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
         matches!(self, Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::LinksDown)

@@ -13,12 +13,12 @@ pub enum Reply {
     Sum(Slots),
 }
 
-/// When sums are said.
+/// When sums are sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Slots {
     /// Width of a slot in µs.
     pub slot_us: u16,
-    /// Depth of the deepest cell; a root's is 0. A cell at depth d speaks in slot `deepest - d`.
+    /// Depth of the deepest cell; a root's is 0. A cell at depth d sends in slot `deepest - d`.
     pub deepest: u8,
     /// Whether what rounding took away is carried into a cell's next value.
     pub carry: bool,
@@ -36,7 +36,7 @@ impl Reply {
         }
     }
 
-    /// What the words say; `None` when they cannot be: no such reply, no slot, a depth above 253, or a carry that is
+    /// Decodes the words; `None` when they cannot be: no such reply, no slot, a depth above 253, or a carry that is
     /// neither 0 nor 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
@@ -52,11 +52,11 @@ impl Reply {
     }
 }
 
-/// When a cell sends what it measures without being asked, parameter 7. Volatile: a cell starts with
+/// When a cell sends what it measures without a request, parameter 7. Volatile: a cell starts with
 /// [`Sensing::Off`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Sensing {
-    /// Only when a report asks for it.
+    /// Only for a report.
     #[default]
     Off,
     /// Every so many ms.
@@ -79,7 +79,7 @@ impl Sensing {
         }
     }
 
-    /// What the words say; `None` when they cannot be: no such mode, or a period of 0.
+    /// Decodes the words; `None` when they cannot be: no such mode, or a period of 0.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
@@ -135,7 +135,7 @@ impl Events {
         ])
     }
 
-    /// What the words say; `None` when one is negative, or the hysteresis above 1.
+    /// Decodes the words; `None` when one is negative, or the hysteresis above 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         let [thresholds @ .., _] = words;
@@ -158,7 +158,7 @@ impl LinksDown {
         packet::words([i16::from(self.deaf)])
     }
 
-    /// What the words say; other bits than those of ports are not looked at.
+    /// Decodes the words; other bits than those of ports are not looked at.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Self {
         let [deaf, ..] = words;
@@ -166,10 +166,10 @@ impl LinksDown {
     }
 }
 
-/// Which ports of a cell hear nothing, neither messages nor sums, parameter 9: how a bench cuts a wire, in one
-/// direction at each end. Obeyed in test mode only.
+/// The ports of a cell that receive nothing, neither messages nor sums, parameter 9: how a bench takes a link down, in
+/// one direction at each end. Obeyed in test mode only.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct LinksDown {
-    /// Bit p: port p hears nothing; bit 4 is the wire to the gateway's side.
+    /// Bit p: port p receives nothing; bit 4 is the wire to the gateway's side.
     pub deaf: u8,
 }

@@ -21,19 +21,19 @@ pub enum Format {
     Signed,
     /// A signed word that stands for the name at its place in [`Field::names`].
     Choice,
-    /// So many bits of which the lowest says yes.
+    /// So many bits of which the lowest is the flag.
     Flag(u8),
     /// A word that is written in hexadecimal.
     Hex,
     /// A word with so many fraction bits; to the nearest step.
     Fixed(u32),
-    /// The same, rounded to the least step that is not below.
+    /// The same, rounded to the smallest step that is not below.
     Threshold(u32),
-    /// The same, where the greatest and the least word mean *saturated*.
+    /// The same, where the largest and the smallest word mean *saturated*.
     Saturating(u32),
     /// The sum of three neighbouring words with so many fraction bits; no field of its own.
     Total(u32),
-    /// A word in quarter turns, told in rad.
+    /// A word in quarter turns, shown in rad.
     Angle,
     /// The same, of the joints in use, which byte 13 counts.
     Position,
@@ -45,7 +45,7 @@ pub enum Format {
     State,
     /// A parameter's number, in so many bits.
     Parameter(u8),
-    /// The page's number, in so many bits: it says which layout the words have.
+    /// The page's number, in so many bits: it selects the layout of the words.
     Page(u8),
     /// Why something was refused, [`super::reasons`].
     Reason,
@@ -57,12 +57,12 @@ pub enum Format {
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Range {
-    /// All that the bits can say.
+    /// All values of the bits.
     #[default]
     All,
     /// None below zero.
     NotNegative,
-    /// None below zero, which a cell checks at the commit and nobody before.
+    /// None below zero, which only the cell checks, at the commit.
     NotNegativeAtCommit,
     /// These and what is between.
     Within(u16, u16),
@@ -83,9 +83,9 @@ pub enum Absent {
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Field {
-    /// Its name, the unit at its end: in JSON, and where it is written. Empty: only a DBC tells of it.
+    /// Its name, the unit at its end: in JSON, and where it is written. Empty: only a DBC has it.
     pub name: String,
-    /// What a DBC calls it when the name does not say it; `{}` stands for the label.
+    /// Its name in a DBC, when that differs; `{}` stands for the label.
     pub signal: String,
     /// Where it stands, [`Field::at`].
     word: u8,
@@ -105,14 +105,14 @@ pub struct Field {
     when: Option<[u16; 2]>,
     /// What becomes of it otherwise.
     pub absent: Absent,
-    /// What may be written, if the format and the range do not say it.
+    /// What may be written, beyond the format and the range.
     pub allowed: String,
     /// What it means, in one line.
     pub meaning: String,
 }
 
 impl Field {
-    /// The first bit, counted from the least significant one of byte 0.
+    /// The first bit, counted from the lowest bit of byte 0.
     #[must_use]
     pub fn at(&self) -> usize {
         usize::from(self.word) * 16 + usize::from(self.byte) * 8 + usize::from(self.bit)

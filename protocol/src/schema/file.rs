@@ -27,7 +27,7 @@ pub fn parameters() -> &'static [Layout] {
     &SCHEMA.parameters
 }
 
-/// What is said over wires, by the first byte. What a hello and a return say depends on several fields: they have no
+/// Messages of wires, by the first byte. The fields of hello and return depend on several fields: they have no
 /// text.
 #[must_use]
 pub fn wires() -> &'static [Layout] {
@@ -40,12 +40,12 @@ pub fn reasons() -> &'static [(i16, String)] {
     &SCHEMA.reasons
 }
 
-/// A packet whose words say nothing.
+/// A packet whose words are unused.
 pub(super) fn empty() -> &'static Layout {
     &SCHEMA.empty
 }
 
-/// Words that nobody has given a meaning.
+/// Words without a meaning.
 pub(super) fn unknown() -> &'static Layout {
     &SCHEMA.unknown
 }
@@ -138,7 +138,7 @@ pub struct Layout {
     pub number: u8,
     /// How many numbers in a row have it; `{}` in its name stands for 1, 2 and so on.
     times: Option<u8>,
-    /// What it is called; empty where the packet's name says it.
+    /// What it is called; empty where the packet's name is enough.
     pub name: String,
     /// What stands before the signals of a DBC.
     pub prefix: String,
@@ -166,13 +166,13 @@ pub struct PacketSchema {
     pub kind: Kind,
     /// The command, of the kind of commands.
     pub command: Option<Command>,
-    /// What it says, in a sentence or a few.
+    /// What it means, in a sentence or a few.
     pub meaning: String,
     /// The words for people; the number that selects a part is byte 13.
     pub text: Vec<Part>,
-    /// What bytes 12 and 13 say; in the order in which JSON has them.
+    /// The fields of bytes 12 and 13; in the order in which JSON has them.
     pub end: Vec<Field>,
-    /// What the words say, by page or parameter.
+    /// The fields of the words, by page or parameter.
     pub layouts: Vec<Layout>,
 }
 

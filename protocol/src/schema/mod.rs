@@ -1,10 +1,10 @@
-//! What stands in every packet, said once: each field's name, place, format, unit, range and meaning.
+//! The layout of every packet, in one place: each field's name, place, format, unit, range and meaning.
 //!
 //! ```text
 //!   schema.toml ──> packets, parameters, messages over wires ──> Layout ──> Fields ──> raw bits, real values
 //! ```
 //!
-//! [`crate::message`] reads and writes packets as types. Everything that shows, lists or asks for fields by name reads
+//! [`crate::message`] reads and writes packets as types. Everything that shows, lists or takes fields by name reads
 //! these tables: `dump` (text and JSON), DBC files, `gateway frame`, the tables of `docs/reference/protocol.md`.
 
 mod field;
@@ -31,7 +31,7 @@ impl PacketSchema {
         packets().iter().find(is_it)
     }
 
-    /// What bytes 12 and 13 say, beside what this layout has there.
+    /// The fields of bytes 12 and 13, beside what this layout has there.
     #[must_use]
     pub fn end(&self, layout: &Layout) -> &[Field] {
         if self.kind == Kind::Configured && layout.number == REFUSED { &[] } else { &self.end }

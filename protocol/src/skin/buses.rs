@@ -1,4 +1,4 @@
-//! Buses, from what a file says to what it means.
+//! Buses, from the file's words to checked types.
 
 use std::collections::HashSet;
 
@@ -55,7 +55,7 @@ fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
     }
 }
 
-/// The bit rates of hardware, which need not be said.
+/// The bit rates of hardware, which are optional.
 fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
     let within = |key, got, min, max| at.key(key).within(got, min..=max, " bit/s");
     let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);

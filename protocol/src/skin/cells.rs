@@ -1,4 +1,4 @@
-//! Cells, from what a file says to what it means.
+//! Cells, from the file's words to checked types.
 
 use std::collections::HashMap;
 
@@ -42,7 +42,7 @@ pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Conta
     Ok(cells)
 }
 
-/// By cell and port, whom each cell names as its neighbors.
+/// By cell and port, the neighbors that each cell names.
 fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
     cells.iter().enumerate().flat_map(|(index, cell)| {
         let ports = cell.neighbors.iter().enumerate();
@@ -50,7 +50,7 @@ fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId
     })
 }
 
-/// Every wire has two ends: whom a cell names so often must name it as often.
+/// Every wire has two ends: two cells must name each other equally often.
 fn contradictions(cells: &[Cell]) -> Checked<()> {
     let mut all = HashMap::new();
     for (.., cell, neighbor) in mentions(cells) {

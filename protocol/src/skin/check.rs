@@ -1,4 +1,4 @@
-//! From what a file says to what it means.
+//! From the file's words to checked types.
 
 use core::f64::consts::TAU;
 
@@ -16,7 +16,7 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     }
     let robot = robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
-    // What a skin has that says nothing of contacts: the force is the sum of the three words.
+    // The default for a skin without contacts: the force is the sum of the three words.
     let plain = Contact { alpha_c: Q::nearest(1.0), ..Contact::default() };
     let contact = cells::contact(&Place::named("contact"), raw.contact, plain)?;
     let events = sensing::events(raw.events)?;
@@ -97,7 +97,7 @@ fn robot(raw: raw::Robot) -> Checked<Robot> {
     for (index, [min, max]) in limits_rad.iter().enumerate() {
         // Written so that NaN is refused too.
         if !(min.is_finite() && max.is_finite() && min < max) {
-            let (got, why) = (format!("[{min}, {max}]"), "the least position comes first");
+            let (got, why) = (format!("[{min}, {max}]"), "the smaller position comes first");
             return Err(at.key("limits_rad").nth(index).fault(got, why));
         }
     }

@@ -55,7 +55,7 @@ pub struct Robot {
     pub name: String,
     /// Standard Denavit-Hartenberg rows, base to tip; 1 to 6 of them.
     pub joints: Vec<DenavitHartenberg>,
-    /// Least and greatest position of each joint in rad.
+    /// Minimum and maximum position of each joint in rad.
     pub limits_rad: Vec<[f64; 2]>,
 }
 
@@ -124,7 +124,7 @@ pub struct Bus {
     pub bitrate: Option<u32>,
     /// Bits in a second of an FD frame's data, of hardware.
     pub data_bitrate: Option<u32>,
-    /// When its cells say what they measure.
+    /// When its cells send what they measure.
     pub sensing: Sensing,
 }
 
@@ -133,7 +133,7 @@ pub struct Bus {
 pub struct Controller {
     /// Which one.
     pub kind: ControllerKind,
-    /// The greatest speed of each joint in rad/s.
+    /// The maximum speed of each joint in rad/s.
     pub max_speed_rad_s: Vec<f64>,
 }
 
@@ -168,10 +168,10 @@ pub struct Safety {
 }
 
 /// What is done while some buses are lost and others are not. When all are lost the torque may not be used,
-/// whatever this says.
+/// whatever this is.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum LostBus {
-    /// The torques of a lost bus are let go as those of cells that fell silent, and the robot goes on with the others.
+    /// The torques of a lost bus decay to zero like those of silent cells, and the robot goes on with the others.
     #[default]
     GoOn,
     /// The torque may not be used: bad cycles, which halt the robot.

@@ -1,4 +1,4 @@
-//! What a skin's file says, before anybody asked whether it can be.
+//! A skin's file as it is written, before it is checked.
 
 use serde::Deserialize;
 
@@ -146,7 +146,7 @@ pub(super) struct Safety {
 }
 
 impl Default for Safety {
-    /// Two missed replies are forgotten, four more let go; a twentieth of a second of bad cycles halts.
+    /// Two missing replies are held, four more decay to zero; a twentieth of a second of bad cycles halts.
     fn default() -> Self {
         Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::GoOn.name().to_owned() }
     }

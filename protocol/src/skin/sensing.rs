@@ -1,4 +1,4 @@
-//! When cells say what they measure, as a skin's file has it.
+//! When cells send what they measure, as a skin's file has it.
 
 use super::raw;
 use crate::document::{Fault, Place};
@@ -25,9 +25,9 @@ pub fn continuous(hz: f64) -> Result<Sensing, String> {
     Ok(Sensing::Continuous { period_ms: nearest as u16 })
 }
 
-/// When the cells of a bus say what they measure.
+/// When the cells of a bus send what they measure.
 pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
-    /// What the word alone says.
+    /// The defaults of a mode.
     #[derive(Clone, Copy)]
     enum Mode {
         Off,
@@ -49,9 +49,9 @@ pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
     }
 }
 
-/// Which changes are events; what is not said is as a cell has it from its start.
+/// Which changes are events; what is omitted is a cell's default.
 pub(super) fn events(raw: raw::Events) -> Result<Events, Fault> {
-    /// As an error says it, a threshold's range begins with 0.
+    /// In errors, a threshold's range begins with 0.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }

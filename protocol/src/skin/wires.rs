@@ -1,8 +1,8 @@
-//! The wires of a bus: which port leads where, and on which lane of the bus each end speaks.
+//! The wires of a bus: which port leads where, and the link id that each end sends with.
 //!
 //! Wires are numbered in the order of their first mention: cells in the file's order, ports 0 to 3. After them
 //! comes one wire for each root, to the gateway's side, in the file's order. Two wires between the same two
-//! cells pair in the order of their ports. Whoever is mentioned first speaks on [`LinkId::back`] = false, the
+//! cells pair in the order of their ports. The end mentioned first sends with [`LinkId::back`] = false, the
 //! other end on true; of a root's wire the cell is the first end.
 //!
 //! ```text
@@ -21,13 +21,13 @@ use crate::wire::{LinkId, MAX, PORTS, UPLINK};
 /// A port of a cell; [`UPLINK`] is where a root is wired to the gateway's side.
 type End = (CellId, usize);
 
-// A bus never has more wires than lanes can number.
+// A bus never has more wires than there are link ids.
 const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX);
 
 /// The wires of one bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Wires {
-    /// By cell ([`CellId::index`]) and port, the lane on which it sends.
+    /// By cell ([`CellId::index`]) and port, the link id that it sends with.
     link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
     /// By wire, the end mentioned first and the other one, which is none at the gateway's side.
     ends: Vec<(End, Option<End>)>,
@@ -89,14 +89,14 @@ impl Wires {
         *self.link_ids.get(cell.index())?.get(port)?
     }
 
-    /// The lanes that a cell sends on, by port, with [`UPLINK`] for a root's wire to the gateway's side. What
-    /// it hears there comes on the reversed lane.
+    /// The link ids that a cell sends with, by port, with [`UPLINK`] for a root's wire to the gateway's side. It
+    /// receives with the reversed link id.
     #[must_use]
     pub fn of_cell(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
         self.link_ids.get(cell.index()).copied().unwrap_or_default()
     }
 
-    /// The roots in the file's order, each with the lane on which the gateway's side speaks to it.
+    /// The roots in the file's order, each with the link id that the gateway's side sends with.
     pub fn roots(&self) -> impl Iterator<Item = (CellId, LinkId)> {
         let uplinks = self.ends.iter().filter(|(_, second)| second.is_none());
         uplinks.filter_map(|&((cell, port), _)| Some((cell, self.link_id(cell, port)?.reversed())))
@@ -203,13 +203,13 @@ mod tests {
         #[test]
         fn every_wire_has_two_ends_with_opposite_link_ids(cells in wiring()) {
             let wires = wired(&cells).wires(0);
-            let mut speakers = HashMap::new();
+            let mut senders = HashMap::new();
             for (at, (neighbors, root)) in cells.iter().enumerate() {
                 let cell = id(at + 1);
                 let link_ids = wires.of_cell(cell);
                 prop_assert_eq!(link_ids[UPLINK].is_some(), *root);
                 for (port, link_id) in link_ids.into_iter().enumerate().filter_map(|(port, link_id)| Some((port, link_id?))) {
-                    prop_assert_eq!(speakers.insert(link_id, cell), None, "one speaker a lane");
+                    prop_assert_eq!(senders.insert(link_id, cell), None, "one sender for a link id");
                     if port == UPLINK {
                         continue;
                     }
@@ -222,10 +222,10 @@ mod tests {
                 prop_assert_eq!(link_ids[..PORTS].iter().flatten().count(), wired, "no end is left out");
             }
             for (root, link_id) in wires.roots() {
-                prop_assert_eq!(speakers.insert(link_id, root), None, "the gateway's side has its own lanes");
+                prop_assert_eq!(senders.insert(link_id, root), None, "the gateway's side has its own link ids");
             }
-            prop_assert_eq!(speakers.len(), 2 * wires.count());
-            prop_assert!(speakers.keys().all(|link_id| usize::from(link_id.wire) < wires.count()), "dense");
+            prop_assert_eq!(senders.len(), 2 * wires.count());
+            prop_assert!(senders.keys().all(|link_id| usize::from(link_id.wire) < wires.count()), "dense");
         }
 
         #[test]

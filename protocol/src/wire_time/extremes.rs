@@ -3,7 +3,7 @@
 //! For FD they are worked out: bits that are the same in all such frames are walked through, free ones both ways, and of all ways
 //! to one of the eight states of stuffing only the one with the fewest and the one with the most stuff bits matter. What follows the
 //! data stuffs by a rule of its own. In classic CAN the CRC is stuffed too, and the data decides it, so there is a table, which the
-//! test `every_frame` makes anew from all frames there are. It is one to four bits below the usual formula, which takes the CRC for free.
+//! test `every_frame` computes from all frames there are. It is one to four bits below the usual formula, which takes the CRC for free.
 
 use super::{Bits, CLASSIC_TAIL, fd_dlc, parts, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_len};
@@ -111,7 +111,7 @@ const CLASSIC: [Range; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), 
 /// The same with an identifier of 29 bits.
 const CLASSIC_EXTENDED: [Range; 9] =
     [(1, 11), (1, 13), (1, 15), (1, 17), (0, 19), (0, 21), (0, 23), (0, 25), (0, 27)];
-/// Of requests, by the length that they ask for.
+/// Of remote requests, by the requested length.
 const REMOTE: [Range; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
 /// The same with an identifier of 29 bits.
 const REMOTE_EXTENDED: [Range; 9] =

@@ -45,11 +45,11 @@ pub enum BitRatesError {
 }
 
 impl BitRates {
-    /// The least nominal bit rate, in bit/s; so has a skin's description.
+    /// The lowest nominal bit rate, in bit/s; so has a skin's description.
     pub const MIN_NOMINAL: u32 = 10_000;
-    /// The greatest nominal bit rate, in bit/s.
+    /// The highest nominal bit rate, in bit/s.
     pub const MAX_NOMINAL: u32 = 1_000_000;
-    /// The greatest data bit rate, in bit/s.
+    /// The highest data bit rate, in bit/s.
     pub const MAX_DATA: u32 = 8_000_000;
 
     /// Both rates, in bit/s.

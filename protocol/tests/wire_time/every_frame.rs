@@ -12,7 +12,7 @@ const PAIRS: usize = 8 << 15;
 /// Nothing leads here.
 const NEVER: [u8; 2] = [u8::MAX, 0];
 
-/// The least and the greatest number of stuff bits, for each pair.
+/// The minimum and the maximum number of stuff bits, for each pair.
 type Counts = Vec<[u8; 2]>;
 
 /// A run of one to four equal bits, and one bit more: the run that follows, and whether a stuff bit came.
@@ -48,19 +48,18 @@ impl Steps {
     fn with_a_free_bit(&self, after: &Counts) -> Counts {
         let mut counts = Vec::with_capacity(PAIRS);
         for &[(zero, if_zero), (one, if_one)] in &self.0 {
-            let ([least_zero, most_zero], [least_one, most_one]) =
-                (after[zero as usize], after[one as usize]);
-            let min = (least_zero + if_zero).min(least_one + if_one);
-            counts.push([min, (most_zero + if_zero).max(most_one + if_one)]);
+            let ([min_zero, max_zero], [min_one, max_one]) = (after[zero as usize], after[one as usize]);
+            let min = (min_zero + if_zero).min(min_one + if_one);
+            counts.push([min, (max_zero + if_zero).max(max_one + if_one)]);
         }
         counts
     }
 
     /// Goes forward over some bits: each fixed, or (`None`) both ways.
-    fn forward(&self, mut ways: Counts, bits: impl IntoIterator<Item = Option<usize>>) -> Counts {
+    fn forward(&self, mut reached: Counts, bits: impl IntoIterator<Item = Option<usize>>) -> Counts {
         for bit in bits {
             let mut then = vec![NEVER; PAIRS];
-            for (pair, &counts) in ways.iter().enumerate() {
+            for (pair, &counts) in reached.iter().enumerate() {
                 if counts == NEVER {
                     continue;
                 }
@@ -69,9 +68,9 @@ impl Steps {
                     then[next] = wider(then[next], plus(counts, stuffed));
                 }
             }
-            ways = then;
+            reached = then;
         }
-        ways
+        reached
     }
 
     /// Up to the DLC: of requests and of data frames.
@@ -80,36 +79,36 @@ impl Steps {
         // One recessive bit, which the first bit of the frame ends.
         idle[4] = [0, 0];
         let (one, zero) = (Some(1), Some(0));
-        let ways = self.forward(idle, [zero].into_iter().chain([None; 11]));
+        let reached = self.forward(idle, [zero].into_iter().chain([None; 11]));
         if extended {
-            let ways = self.forward(ways, [one, one].into_iter().chain([None; 18]));
-            [self.forward(ways.clone(), [one, zero, zero]), self.forward(ways, [zero; 3])]
+            let reached = self.forward(reached, [one, one].into_iter().chain([None; 18]));
+            [self.forward(reached.clone(), [one, zero, zero]), self.forward(reached, [zero; 3])]
         } else {
-            [self.forward(ways.clone(), [one, zero, zero]), self.forward(ways, [zero; 3])]
+            [self.forward(reached.clone(), [one, zero, zero]), self.forward(reached, [zero; 3])]
         }
     }
 
     /// Over all identifiers and all that follows the DLC.
     fn over_all(&self, heads: &Counts, dlc: usize, rest: &Counts) -> [u32; 2] {
         let mut over_all = NEVER;
-        for (pair, &[min, most]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
+        for (pair, &[min, max]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
             let (pair, stuffed) = (0..4).rev().fold((pair, 0), |(pair, sum), place| {
                 let (pair, stuffed) = self.follow(pair, dlc >> place & 1);
                 (pair, sum + stuffed)
             });
-            let [rest_least, rest_most] = rest[pair];
-            over_all = wider(over_all, [min + stuffed + rest_least, most + stuffed + rest_most]);
+            let [rest_min, rest_max] = rest[pair];
+            over_all = wider(over_all, [min + stuffed + rest_min, max + stuffed + rest_max]);
         }
         over_all.map(u32::from)
     }
 }
 
-fn wider([min, most]: [u8; 2], [other_least, other_most]: [u8; 2]) -> [u8; 2] {
-    [min.min(other_least), most.max(other_most)]
+fn wider([min, max]: [u8; 2], [other_min, other_max]: [u8; 2]) -> [u8; 2] {
+    [min.min(other_min), max.max(other_max)]
 }
 
-fn plus([min, most]: [u8; 2], stuffed: u8) -> [u8; 2] {
-    [min + stuffed, most + stuffed]
+fn plus([min, max]: [u8; 2], stuffed: u8) -> [u8; 2] {
+    [min + stuffed, max + stuffed]
 }
 
 /// What the 15 bits of the CRC add.
@@ -134,10 +133,10 @@ fn plain(extended: bool, bytes: usize) -> u32 {
 fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     let steps = Steps::all();
     let heads = [steps.heads(false), steps.heads(true)];
-    let compare = |coding, extended, len: usize, bytes, [min, most]: [u32; 2]| {
+    let compare = |coding, extended, len: usize, bytes, [min, max]: [u32; 2]| {
         let shape = Shape { coding, extended, len: u8::try_from(len).unwrap() };
         let plain = plain(extended, bytes);
-        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + min, plain + most), "{shape:?}");
+        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + min, plain + max), "{shape:?}");
         assert_eq!((shape.best().data, shape.worst().data), (0, 0));
     };
     let mut rest = of_the_crc();
@@ -156,7 +155,7 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     }
 }
 
-/// The least and the greatest of all bits, and of the data bits, of some frames.
+/// The minimum and the maximum of all bits, and of the data bits, of some frames.
 fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
     let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
     frames.map(|frame| Bits::of(&frame).unwrap()).fold(start, |(best, worst), bits| {

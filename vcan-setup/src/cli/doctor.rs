@@ -9,10 +9,10 @@ use vcan_setup::look;
 
 use super::{json, named, query};
 
-/// Say what a bench still needs on this machine, and what mends it
+/// Check whether a bench would run on this machine, with a hint for each fault
 ///
-/// Looks at the kernel, the interfaces, permissions, buffers and who is on the buses already (it listens for
-/// 600 ms, and sends nothing), and judges what `gateway run` would meet. Changes nothing. Run it as the user
+/// Looks at the kernel, the interfaces, permissions, buffers and nodes on the buses already (it listens for
+/// 600 ms, and sends nothing), and reports what would stop `gateway run`. Changes nothing. Run it as the user
 /// who runs the gateway. Exit code 0: a bench would run; 1: it would not; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -48,7 +48,7 @@ impl Doctor {
             target.take_format_of_hardware(&present);
         }
         let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
-        let findings = comparator(&facts);
+        let findings = assess(&facts);
         let runs = would_run(&findings);
         if self.json {
             let bus_kind = facts.bus_kind().name();
@@ -71,8 +71,8 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
     text + &match (runs, faults) {
         (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().words()),
-        (false, 1) => "\nNo bench would run: mend the fault first.\n".to_owned(),
-        (false, faults) => format!("\nNo bench would run: mend the {faults} faults first.\n"),
+        (false, 1) => "\nNo bench would run: fix the fault first.\n".to_owned(),
+        (false, faults) => format!("\nNo bench would run: fix the {faults} faults first.\n"),
     }
 }
 

@@ -20,12 +20,12 @@ use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Target;
 
-/// Gives you a bus: makes vcan interfaces, says what a bench still needs, serves embedded buses
+/// Gives you a bus: makes vcan interfaces, checks what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
 #[command(
     version,
     after_help = "Examples:
-  vcan-setup doctor skin.toml      what is missing, and the command that mends it
+  vcan-setup doctor skin.toml      what is missing, and the command that fixes it
   sudo vcan-setup up vcan0         a bus in the kernel
   vcan-setup status                the CAN interfaces of this machine
   sudo vcan-setup down vcan0
@@ -114,7 +114,7 @@ fn target(words: &[String]) -> Result<Vec<Target>, Failure> {
     named(words, Target::of_skin, Target::named)
 }
 
-/// The interfaces that there are, and who told.
+/// The present interfaces, and the socket that listed them.
 fn query() -> Result<(Netlink, Vec<Interface>), Failure> {
     let mut netlink = Netlink::open().map_err(unreadable)?;
     let present = netlink.interfaces().map_err(unreadable)?;

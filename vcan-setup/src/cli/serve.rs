@@ -63,7 +63,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         .context("cannot write to standard output")?;
     let Totals { garbage, refused, .. } = server.run(stopped)?;
     if garbage > 0 || refused > 0 {
-        // Nobody else can tell: a client gets no error for what it sends. Without standard error nobody reads it.
+        // Only the server can report it: a client gets no error for what it sends. Without standard error there is no reader.
         let _ = writeln!(
             std::io::stderr(),
             "vcan-setup: {name}: ignored {garbage} datagrams that were neither frames nor filters, and refused \

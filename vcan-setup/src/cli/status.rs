@@ -42,7 +42,7 @@ impl Status {
             }
             (false, false) => table(&interfaces, &embedded),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
-            // What was named and is not there is said below.
+            // What was named and is not there is reported below.
             (false, true) => String::new(),
         };
         print(&text)?;

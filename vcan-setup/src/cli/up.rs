@@ -20,11 +20,11 @@ use super::{Word, query, target, unreadable, word};
 ///
 /// Makes what is missing, with MTU 72 for CAN FD, and marks it with the alias "skinbus". What is there
 /// already and fits stays as it is, so it may be called again and again. Nothing is touched that it has not
-/// made: of a real interface in a skin it only checks the bit rates, unless it is told to set them. Needs
+/// made: of a real interface in a skin it only checks the bit rates, unless told to set them. Needs
 /// root, unless there is nothing to do.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vcan-setup up --dry-run skin.toml                           say what would be done
+  vcan-setup up --dry-run skin.toml                           print what would be done
   sudo vcan-setup up skin.toml                                all buses of a skin
   sudo vcan-setup up vcan0 vcan1
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
@@ -33,7 +33,7 @@ pub(crate) struct Up {
     /// Names of interfaces, or skins: what ends in .toml or holds a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<String>,
-    /// Say what would be done, and do nothing
+    /// Print what would be done, and do nothing
     #[arg(long)]
     dry_run: bool,
     /// Make a vxcan pair: NAME is one end, PEER the other
@@ -59,7 +59,7 @@ pub(crate) struct Down {
     /// Names of interfaces, or skins: what ends in .toml or holds a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<String>,
-    /// Say what would be done, and do nothing
+    /// Print what would be done, and do nothing
     #[arg(long)]
     dry_run: bool,
 }
@@ -175,7 +175,7 @@ struct Worker<'a> {
 }
 
 impl Worker<'_> {
-    /// Says what is left alone, and does the rest or says what it would do.
+    /// Prints what is left alone, and does the rest or prints what it would do.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
         for line in &plan.unchanged {
@@ -207,12 +207,12 @@ impl Worker<'_> {
                 }
             }
         }
-        // Said when all is done: what is said before a failure has been taken back.
+        // Printed when all is done: a failure undoes the steps before it.
         print(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
     }
 }
 
-/// Why a step fails, and what mends it.
+/// Why a step fails, and how to fix it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         Action::MakeVcan => Some("vcan"),
@@ -246,7 +246,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
-            // Root would only be told this.
+            // Root would only get this error.
             let kernel = Kernel::look();
             let missing = kind.filter(|kind| kernel.module(kind) == Module::Missing);
             missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))

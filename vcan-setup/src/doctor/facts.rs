@@ -14,7 +14,7 @@ use crate::plan::Target;
 /// All that the judgement rests on.
 #[derive(Clone, Debug)]
 pub struct Facts {
-    /// Which kind of bus is wanted.
+    /// Which kind of bus is requested.
     pub choice: Choice,
     /// Whether the cells are there already, as `gateway run --no-spawn` has it.
     pub no_spawn: bool,
@@ -22,23 +22,23 @@ pub struct Facts {
     pub program: String,
     /// The kernel.
     pub kernel: Kernel,
-    /// Who asks.
+    /// The user who runs the doctor.
     pub user: User,
-    /// Bytes of a receive buffer that the kernel grants to whom asks as the gateway does.
+    /// Bytes of a receive buffer that the kernel grants to a request like the gateway's.
     pub receive_buffer: Option<usize>,
-    /// Frames that may wait in the kernel until they are handed on; `None` when it does not say.
+    /// Frames that may wait in the kernel until they are handed on; `None` when it is unknown.
     pub backlog: Option<usize>,
     /// The program of the cells.
     pub cell_node: Program,
     /// Where the embedded buses of this user are, or why none can be used.
     pub embedded: Result<PathBuf, String>,
-    /// The buses that were asked about.
+    /// The buses that were named.
     pub buses: Vec<Bus>,
     /// The CAN interfaces that there are.
     pub present: Vec<Interface>,
 }
 
-/// Who asks.
+/// The user who runs the doctor.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct User {
     /// Whether it is root.
@@ -56,18 +56,18 @@ pub struct Program {
     pub there: bool,
 }
 
-/// A bus that was asked about.
+/// A bus that was named.
 #[derive(Clone, Debug)]
 pub struct Bus {
-    /// What is wanted of it.
+    /// What is required of it.
     pub target: Target,
-    /// Its cells; `None` when no skin says.
+    /// Its cells; `None` without a skin.
     pub cells: Option<BTreeSet<CellId>>,
     /// Whether its cells are to answer with sums.
     pub sums: bool,
     /// The interface of its name.
     pub interface: Option<Interface>,
-    /// What was heard on it; `None` when it was not opened, or why it could not be.
+    /// What was received on it; `None` when it was not opened, or why it could not be.
     pub heard: Result<Option<Heard>, String>,
 }
 
@@ -89,13 +89,13 @@ impl Bus {
         Self::of(Target::named(name))
     }
 
-    /// One that nobody has looked at yet.
+    /// One that has not been looked at yet.
     const fn of(target: Target) -> Self {
         Self { target, cells: None, sums: false, interface: None, heard: Ok(None) }
     }
 }
 
-/// What was heard on a bus.
+/// What was received on a bus.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Heard {
     /// Whether another gateway sends on it.

@@ -1,4 +1,4 @@
-//! What is wrong with interfaces, and what mends it.
+//! What is wrong with interfaces, and how to fix it.
 
 use protocol::can::Format;
 
@@ -46,7 +46,7 @@ impl Facts {
         findings
     }
 
-    /// Without buses that were asked about: whether there is any that could be used.
+    /// Without buses that were named: whether there is any that could be used.
     pub(super) fn any_interface(&self) -> Option<Finding> {
         if !self.buses.is_empty() {
             return None;

@@ -67,7 +67,7 @@ fn complaints(facts: &Facts) -> Vec<String> {
     comparator(facts).into_iter().filter_map(bad).collect()
 }
 
-/// What is said when the bus, its interface or the machine is changed.
+/// The findings when the bus, its interface or the machine is changed.
 fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);

@@ -30,14 +30,14 @@ pub(super) struct Client {
     id: ClientId,
     pub(super) socket: OwnedFd,
     queue: Queue,
-    /// What it said when it came; nothing is routed before.
+    /// Its hello; nothing is routed before.
     pub(super) greeted: bool,
     pub(super) fd: bool,
-    /// Filters that it has begun to put in force.
+    /// Filters of which some parts have arrived.
     pub(super) filters: Option<Vec<Filter>>,
-    /// Its socket is full; `epoll` tells when it is not.
+    /// Its socket is full; `epoll` reports when it is not.
     blocked: bool,
-    /// It is in the list of those to whom something has to be sent.
+    /// It is in the list of clients with something to send.
     dirty: bool,
 }
 
@@ -54,7 +54,7 @@ impl Client {
             post.totals.dropped += 1;
             return false;
         }
-        // Who does not listen any more is found out again, and silenced, at the end of the round.
+        // A client that does not read any more is found again, and muted, at the end of the round.
         if !self.blocked && self.queue.frames() >= BATCH {
             let _ = self.send(post);
         }
@@ -83,7 +83,7 @@ impl Client {
     /// Sends what waits for it until it is all sent or its socket is full; whether it still listens.
     fn send(&mut self, post: &mut Post) -> bool {
         loop {
-            self.queue.tell();
+            self.queue.report_dropped();
             if self.queue.is_empty() {
                 return true;
             }

@@ -37,14 +37,14 @@ pub enum PlaceError {
     /// A file that is no socket.
     #[error("{} is in the way and is no socket: move it away", .0.display())]
     InTheWay(PathBuf),
-    /// Anything else that the system says.
+    /// Any other error of the system.
     #[error("cannot {doing} {}: {source}", path.display())]
     Io {
         /// The socket or the directory.
         path: PathBuf,
         /// What was tried.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -80,7 +80,7 @@ impl Place {
             }
             Ok(_) => {
                 let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
-                // Only a socket that nobody listens on refuses; a full list of waiting clients does not.
+                // Only a socket without a listener refuses; a full list of waiting clients does not.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(PlaceError::Served { name: name.to_owned(), path });
                 }
@@ -111,7 +111,7 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        // Nothing more can be done: somebody else removed it, or the directory has other buses.
+        // Nothing more can be done: another program removed it, or the directory has other buses.
         let _ = self.remove();
     }
 }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use super::parcel::Parcel;
 
-/// The next thing to tell a client.
+/// An entry of the queue.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Entry {
     /// A frame.
@@ -14,21 +14,21 @@ pub enum Entry {
 }
 
 /// A bounded queue. When it is full the newest frame is dropped, as a socket's receive buffer does it, and
-/// the client is told the total before the next frame that it gets.
+/// the client gets the total before the next frame that it gets.
 #[derive(Debug)]
 pub struct Queue {
     entries: VecDeque<Entry>,
     frames: usize,
     limit: usize,
     dropped: u32,
-    told: u32,
+    reported: u32,
 }
 
 impl Queue {
     /// An empty queue for at most `limit` frames.
     #[must_use]
     pub const fn new(limit: usize) -> Self {
-        Self { entries: VecDeque::new(), frames: 0, limit, dropped: 0, told: 0 }
+        Self { entries: VecDeque::new(), frames: 0, limit, dropped: 0, reported: 0 }
     }
 
     /// Appends a frame; `false` when there was no room and it was dropped and counted.
@@ -37,18 +37,18 @@ impl Queue {
             self.dropped = self.dropped.wrapping_add(1);
             return false;
         }
-        self.tell();
+        self.report_dropped();
         self.entries.push_back(Entry::Frame(parcel));
         self.frames += 1;
         true
     }
 
-    /// Appends the total of dropped frames, unless the client knows it. To be called also when the queue has
-    /// run empty: then nothing that was not dropped stands between.
-    pub fn tell(&mut self) {
-        if self.told != self.dropped {
+    /// Appends the total of dropped frames, unless it was reported already. To be called also when the queue has
+    /// run empty, so that the report comes at the right place in the sequence.
+    pub fn report_dropped(&mut self) {
+        if self.reported != self.dropped {
             self.entries.push_back(Entry::Dropped(self.dropped));
-            self.told = self.dropped;
+            self.reported = self.dropped;
         }
     }
 
@@ -57,7 +57,7 @@ impl Queue {
         self.entries.iter()
     }
 
-    /// Forgets the oldest `count` entries, which were sent; how many of them were frames.
+    /// Removes the oldest `count` entries, which were sent; how many of them were frames.
     pub fn sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
         let frames = sent.filter(|entry| matches!(entry, Entry::Frame(_))).count();
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_dropped_and_told_before_the_next_frame() {
+    fn what_does_not_fit_is_dropped_and_reported_before_the_next_frame() {
         let mut queue = Queue::new(2);
         let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id))).collect();
         assert_eq!(kept, [true, true, false, false, false]);
@@ -101,11 +101,11 @@ mod tests {
     #[test]
     fn a_total_is_reported_once() {
         let mut queue = Queue::new(0);
-        queue.tell();
+        queue.report_dropped();
         assert!(queue.is_empty());
         queue.push(parcel(0));
-        queue.tell();
-        queue.tell();
+        queue.report_dropped();
+        queue.report_dropped();
         assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [Entry::Dropped(1)]);
         assert_eq!(queue.sent(1), 0);
     }
@@ -137,7 +137,7 @@ mod tests {
                 }
                 prop_assert!(queue.frames() <= limit);
             }
-            queue.tell();
+            queue.report_dropped();
             while !queue.is_empty() {
                 hear(&mut queue);
             }

@@ -72,11 +72,11 @@ impl Wants {
     }
 }
 
-/// Who wants what.
+/// All subscriptions.
 #[derive(Debug, Default)]
 pub struct Router {
     clients: Vec<Option<Wants>>,
-    /// Who wants exactly a data frame with this identifier.
+    /// The clients that subscribe to exactly a data frame with this identifier.
     exact: HashMap<u32, Vec<ClientId>>,
     /// What every frame is held against.
     walked: Vec<(Class, ClientId)>,
@@ -90,7 +90,7 @@ impl Router {
         Self::default()
     }
 
-    /// Puts a client's wishes in force, in place of those that it had.
+    /// Replaces a client's subscriptions.
     pub fn insert(&mut self, client: ClientId, hello: &Hello) {
         self.remove(client);
         if self.clients.len() <= client.0 {
@@ -104,7 +104,7 @@ impl Router {
         }
     }
 
-    /// Puts other filters in force for a client that there is; the rest of its wishes stays.
+    /// Replaces the filters of a present client; the rest of its subscriptions stays.
     pub fn set_filters(&mut self, client: ClientId, filters: Vec<Filter>) {
         let Some(mut wants) = self.clients.get_mut(client.0).and_then(Option::take) else { return };
         self.unlist(client, &wants);
@@ -185,7 +185,7 @@ mod tests {
         Hello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
     }
 
-    /// Who gets it, in order of their numbers.
+    /// Its receivers, in order of their numbers.
     fn receivers(router: &mut Router, from: usize, id: u32, format: Format) -> Vec<(usize, bool)> {
         let mut receivers = Vec::new();
         router.route(ClientId(from), id, format, |client, own| receivers.push((client.0, own)));
@@ -267,7 +267,7 @@ mod tests {
         (word(), mask).prop_map(|(id, mask)| Filter { id, mask })
     }
 
-    /// A frame's identifier as drivers make it: 11 bits unless the flag says 29.
+    /// A frame's identifier as drivers make it: 11 bits unless the flag for 29 is set.
     fn sound(id: u32) -> u32 {
         if id & (EXTENDED | ERROR) == 0 { id & (STANDARD_MASK | REMOTE) } else { id }
     }

@@ -65,7 +65,7 @@ impl Drop for Served {
     fn drop(&mut self) {
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {
-            // Who wants to know the outcome calls `stop`.
+            // The outcome is returned by `stop`.
             let _ = thread.join();
         }
     }

@@ -22,7 +22,7 @@ use super::routing::{ClientId, Router};
 
 /// Batches taken from one client before the next one's turn: what its send buffer holds, and more.
 const DRAIN: usize = 16;
-/// The most that a client's socket may hold, whatever it asks for.
+/// The most that a client's socket may hold, whatever it requests.
 const BUFFER_MAX: usize = 64 << 20;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
@@ -34,14 +34,14 @@ pub enum ServeError {
     /// It could not begin.
     #[error(transparent)]
     Place(#[from] PlaceError),
-    /// The system does not let it go on.
+    /// A system call failed.
     #[error("cannot {doing} while serving {name}: {source}")]
     Io {
         /// The bus.
         name: String,
         /// What was tried.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -62,7 +62,7 @@ pub struct Totals {
     pub routed: u64,
     /// Frames handed to clients' sockets.
     pub delivered: u64,
-    /// Frames dropped because a client did not read; it was told.
+    /// Frames dropped because a client did not read; reported to it.
     pub dropped: u64,
     /// Frames that waited for a client that went away.
     pub abandoned: u64,
@@ -76,7 +76,7 @@ pub struct Server {
     /// Given up for a moment to turn a client away when there are no file descriptors left.
     spare: Option<OwnedFd>,
     clients: Vec<Option<Client>>,
-    /// To whom something has to be sent at the end of the round.
+    /// Clients with something to send at the end of the round.
     dirty: VecDeque<ClientId>,
     router: Router,
     post: Post,
@@ -129,7 +129,7 @@ impl Server {
     /// Serves until `stop` can be read or is hung up; what the bus has done. Clients then find it closed.
     ///
     /// # Errors
-    /// When the system does not let it go on; no client can bring that about.
+    /// When a system call fails; no client can cause that.
     pub fn run(mut self, stop: impl AsFd) -> Result<Totals, ServeError> {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
@@ -216,7 +216,7 @@ impl Server {
         self.clients.get_mut(id.0).and_then(Option::as_mut)
     }
 
-    /// Reads a client's first datagram and puts its filters in force.
+    /// Reads a client's first datagram and sets its filters.
     fn greet(&mut self, id: ClientId) {
         let Some(client) = self.client(id) else { return };
         let mut bytes = [0; HELLO_MAX + 1];
@@ -335,7 +335,7 @@ impl Server {
         }
     }
 
-    /// Sends nothing more to a client that does not listen; what it still says is heard.
+    /// Sends nothing more to a client that does not read; what it still sends is received.
     fn silence(&mut self, id: ClientId) {
         self.router.remove(id);
         let Self { clients, post, .. } = self;

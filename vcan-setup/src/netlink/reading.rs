@@ -1,4 +1,4 @@
-//! What the kernel says of an interface, read.
+//! Reads the kernel's description of an interface.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use protocol::bus::netlink::attributes;
 
 use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, State};
 
-/// Reads what the kernel says of one interface.
+/// Reads the kernel's description of one interface.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let header = LinkHeader::parse(bytes).ok()?;
     let is_can = header.link_layer_type == LinkLayerType::Can;

@@ -6,7 +6,7 @@ use thiserror::Error;
 use super::widen;
 use crate::link::{FD_MTU, Interface, Rates};
 
-/// Why nothing is done: one line, with the command that mends it.
+/// Why nothing is done: one line, with the command that fixes it.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Refusal {
@@ -30,7 +30,7 @@ pub enum Refusal {
     },
     /// Somebody else's, with too small an MTU.
     #[error(
-        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` mends it",
+        "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` fixes it",
         widen("ip", name)
     )]
     Narrow {
@@ -41,24 +41,24 @@ pub enum Refusal {
     },
     /// Somebody else's, and down.
     #[error(
-        "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` mends it"
+        "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` fixes it"
     )]
     Down(String),
-    /// A pair is wanted where there is something else.
+    /// A pair is requested where there is something else.
     #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {hint}")]
     OtherPair {
         /// Its name.
         name: String,
         /// What it is.
         what: String,
-        /// The other end that was wanted.
+        /// The other end that was requested.
         peer: String,
         /// What to do.
         hint: String,
     },
     /// A pair that is there, and whose other end does not work.
     #[error(
-        "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` mends it"
+        "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` fixes it"
     )]
     OtherEnd {
         /// Its name.
@@ -88,9 +88,9 @@ pub enum Refusal {
     AtOdds {
         /// Its name.
         name: String,
-        /// What one says.
+        /// The value of the one.
         one: String,
-        /// What the other says.
+        /// The value of the other.
         other: String,
     },
     /// Hardware with other bit rates.
@@ -145,7 +145,7 @@ pub enum Refusal {
         /// The skin's file.
         file: String,
     },
-    /// Interfaces that were to be removed and are somebody else's.
+    /// Interfaces that were to be removed and that this program has not made.
     #[error("{name} is {what} that vcan-setup has not made, and is left alone{hint}")]
     NotOurs {
         /// Its name.

@@ -1,4 +1,4 @@
-//! What is done, one thing at a time: in words, and as `ip` would be told.
+//! What is done, one thing at a time: in words, and as an `ip` command.
 
 use core::fmt;
 
@@ -73,7 +73,7 @@ impl Step {
         }
     }
 
-    /// What is said once it is done.
+    /// What is printed once it is done.
     #[must_use]
     pub fn done(&self) -> String {
         let name = &self.name;
@@ -92,7 +92,7 @@ impl Step {
         }
     }
 
-    /// What somebody would type to do the same with `ip`.
+    /// The `ip` command that does the same.
     #[must_use]
     pub fn command(&self) -> String {
         let name = &self.name;

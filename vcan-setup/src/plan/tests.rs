@@ -85,11 +85,11 @@ fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
     assert_eq!(
         refused(&Target::named("vcan0"), &[foreign(16, true)]),
         "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `sudo sh -c \
-         'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` mends it"
+         'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` fixes it"
     );
     assert_eq!(
         refused(&Target::named("vcan0"), &[foreign(72, false)]),
-        "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` mends it"
+        "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` fixes it"
     );
 }
 
@@ -257,7 +257,7 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     assert_eq!(
         error.to_string(),
         "the other end of vcan1, vcan1 in blue, is down, and vcan-setup changes nothing there: `sudo ip -n blue \
-         link set vcan1 up` mends it"
+         link set vcan1 up` fixes it"
     );
     let same = TargetPair { name: "vcan3", peer: "vcan3", there: None };
     assert!(matches!(up_pair(&same, &world.here), Err(Refusal::OneName { .. })));

@@ -3,7 +3,7 @@
 use protocol::bus::Filter;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 
-/// One client with these wishes, one frame, and whether the client receives it.
+/// One client with these subscriptions, one frame, and whether the client receives it.
 #[derive(Clone, Debug)]
 pub(crate) struct Case {
     /// What is shown, as a sentence.

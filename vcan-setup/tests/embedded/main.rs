@@ -55,7 +55,7 @@ impl Bench {
         Bus::open(BUS, Choice::Only(BusKind::Embedded), &options).unwrap()
     }
 
-    /// Connects without [`Bus`], and says nothing yet.
+    /// Connects without [`Bus`], and sends nothing yet.
     fn raw(&self) -> std::os::fd::OwnedFd {
         let socket =
             rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
@@ -161,7 +161,7 @@ fn every_rule_of_can_raw_holds() {
     bench.end();
 }
 
-/// When this returns, what anybody sent before has been routed: it was read in the same or an earlier round.
+/// When this returns, all frames sent before have been routed: it was read in the same or an earlier round.
 fn wait_until_routed(bench: &Bench) {
     let (a, b) = (bench.open(&[]), bench.open(&[exact(MEANWHILE)]));
     for _ in 0..2 {
@@ -399,7 +399,7 @@ fn a_bus_that_ends_is_read_to_its_end_and_then_closed() {
 #[test]
 fn a_server_that_lets_nobody_in_is_given_up_on() {
     let parent = TempDir::new().unwrap();
-    // Bound and never run, as a process that is stopped: clients are let in by nobody.
+    // Bound and never run, as a process that is stopped: no client is accepted.
     let server = vcan_setup::embedded::Server::bind_in(&parent.path().join("skinbus"), BUS).unwrap();
     let directory = Some(parent.path().join("skinbus"));
     let error = Bus::open(BUS, Choice::Only(BusKind::Embedded), &Options { directory, ..Options::default() });

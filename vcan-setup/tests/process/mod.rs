@@ -1,4 +1,4 @@
-//! Commands as processes, and somebody on their bus: what the tests of commands share.
+//! Commands as processes, and a sender on their bus: what the tests of commands share.
 
 use std::process::Command;
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -8,7 +8,7 @@ use protocol::bus::Bus;
 use protocol::can::Frame;
 use protocol::id::Id;
 
-/// What a command said.
+/// The output of a command.
 #[derive(Debug)]
 pub(crate) struct Said {
     pub(crate) code: i32,

@@ -12,7 +12,7 @@ use crate::node::claim::Claim;
 use crate::node::{HEARTBEAT, Node};
 
 const NODE: u8 = 51;
-/// Node 51 speaks a fifth into a period.
+/// Node 51 sends a fifth into a period.
 const PERIOD: Span = Span::from_millis(10);
 const JOINTS: Span = Span::from_millis(16);
 
@@ -98,7 +98,7 @@ impl Cell {
         self.joints()
     }
 
-    /// One contact word feels so many steps; whether it says so, and nothing else.
+    /// One contact word is set to so many steps; whether it sends that, and nothing else.
     fn says(&mut self, bits: i16) -> bool {
         let page = pressed(bits);
         match self.feels(page).as_slice() {
@@ -115,7 +115,7 @@ impl Cell {
         (self.now, self.sends())
     }
 
-    /// The times at which it says page 0 by itself.
+    /// The times at which it sends page 0 by itself.
     fn times(&mut self, count: usize) -> Vec<u64> {
         let mut times = Vec::new();
         while times.len() < count {
@@ -153,7 +153,7 @@ fn eventful() -> Cell {
 
 // SENSE-1, SENSE-2
 #[test]
-fn off_says_nothing_whatever_is_sensed() {
+fn off_sends_nothing_whatever_is_sensed() {
     let mut cell = Cell::new(Mode::Off);
     assert!(!cell.says(2_000) && !cell.says(0));
     for _ in 0..8 {
@@ -173,7 +173,7 @@ fn touch_and_release_have_two_thresholds() {
 }
 
 #[test]
-fn noise_below_the_threshold_says_nothing() {
+fn noise_below_the_threshold_sends_nothing() {
     let mut cell = eventful();
     for bits in [10, 0, 99, 3, 0, 98, 0, 99, 0] {
         assert!(!cell.says(bits), "{bits}");
@@ -182,7 +182,7 @@ fn noise_below_the_threshold_says_nothing() {
 
 // SENSE-9
 #[test]
-fn a_release_is_said_however_softly_it_comes_and_so_is_the_zero_after_it() {
+fn a_slow_release_and_the_zero_after_it_are_sent() {
     let mut cell = eventful();
     assert!(cell.says(100));
     let said: Vec<_> = (0..100).rev().filter(|&bits| cell.says(bits)).collect();
@@ -232,7 +232,7 @@ fn every_sensor_has_its_threshold() {
 
 // SENSE-10
 #[test]
-fn a_heartbeat_in_event_mode_brings_the_present_state_and_every_fourth_the_acceleration() {
+fn a_heartbeat_in_event_mode_carries_the_present_state_and_every_fourth_the_acceleration() {
     let mut cell = eventful();
     assert!(!cell.says(60));
     let beats: Vec<_> = (0..8).map(|_| cell.waits()).collect();
@@ -247,7 +247,7 @@ fn a_heartbeat_in_event_mode_brings_the_present_state_and_every_fourth_the_accel
 
 // SENSE-10
 #[test]
-fn a_heartbeat_with_an_event_does_not_say_it_twice() {
+fn a_heartbeat_with_an_event_does_not_send_it_twice() {
     let mut cell = eventful();
     cell.now = cell.node.poll_timeout() - Span(1_000);
     let to = Address::Everyone;
@@ -265,7 +265,7 @@ fn a_heartbeat_with_an_event_does_not_say_it_twice() {
 
 // SENSE-5
 #[test]
-fn continuous_keeps_its_period_and_the_phase_of_its_number() {
+fn continuous_keeps_its_period_and_the_phase_of_its_node_id() {
     let mut cell = Cell::new(Mode::Off);
     let switched = cell.now;
     let said = cell.switches(Mode::Continuous { period_ms: 10 });
@@ -274,26 +274,26 @@ fn continuous_keeps_its_period_and_the_phase_of_its_number() {
     let first = switched.0 + PERIOD.0 + PERIOD.0 / 5;
     let expected: Vec<_> = (0..60).map(|n| first + n * PERIOD.0).collect();
     assert_eq!(cell.times(60), expected, "heartbeats shift none of them");
-    // Early is harmless, and says nothing.
+    // Early is harmless, and sends nothing.
     cell.node.handle_timeout(cell.node.poll_timeout() - Span(1));
     assert_eq!(cell.sends(), []);
 }
 
 // SENSE-5
 #[test]
-fn a_hang_skips_what_was_missed_and_keeps_the_phase() {
+fn a_hang_skips_overdue_periods_and_keeps_the_phase() {
     let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
     let last = cell.times(3)[2];
     cell.now = Micros(last + 95_000);
     cell.node.handle_timeout(cell.now);
     let skins = cell.sends().into_iter().filter(|page| matches!(page, SensorPage::Skin(_))).count();
-    assert_eq!(skins, 1, "one for all that it missed");
+    assert_eq!(skins, 1, "one for all overdue periods");
     assert_eq!(cell.times(2), [last + 100_000, last + 110_000]);
 }
 
 // SENSE-11
 #[test]
-fn what_is_sensed_during_a_hang_is_told_with_the_next_joints() {
+fn what_is_sensed_during_a_hang_is_sent_with_the_next_joints() {
     let mut cell = eventful();
     let to = Address::Everyone;
     for bits in [500, 700, 900] {
@@ -344,7 +344,7 @@ fn switching_starts_again_and_the_same_again_changes_nothing() {
 
 // SENSE-8
 #[test]
-fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
+fn a_threshold_of_zero_makes_every_change_an_event() {
     let mut cell = eventful();
     cell.write(Parameter::Events, [0; WORDS]);
     assert_eq!(
@@ -355,15 +355,15 @@ fn a_threshold_of_nothing_makes_every_change_an_event_and_what_stays_none() {
 
 // SENSE-11
 #[test]
-fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
+fn nothing_is_sent_before_the_address_claim_is_settled() {
     let mut cell = eventful();
-    cell.node.claim.stage = Claim::Said;
+    cell.node.claim.stage = Claim::Sent;
     assert!(!cell.says(500));
     cell.node.claim.stage = Claim::Settled;
     assert_eq!(cell.joints(), [pressed(500)]);
 
     let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
-    cell.node.claim.stage = Claim::Said;
+    cell.node.claim.stage = Claim::Sent;
     let heartbeat = cell.node.claim.next_heartbeat;
     assert_eq!(cell.node.poll_timeout(), heartbeat, "it is not woken for it");
     cell.now = heartbeat - Span(1);
@@ -373,7 +373,7 @@ fn whose_number_is_in_doubt_says_nothing_and_says_it_when_it_is_settled() {
 
 // SENSE-7, CONF-9
 #[test]
-fn other_thresholds_hold_at_once() {
+fn other_thresholds_apply_at_once() {
     let mut cell = eventful();
     assert!(!cell.says(60));
     let finer = Events { contact: Q5_10::from_bits(50), ..events() };
@@ -382,7 +382,7 @@ fn other_thresholds_hold_at_once() {
 
 // STIM-2, SENSE-7
 #[test]
-fn who_leaves_test_mode_has_released() {
+fn leaving_test_mode_is_a_release() {
     let mut cell = eventful();
     assert!(cell.says(500));
     assert_eq!(cell.write(Parameter::Mode, [0; WORDS]), [pressed(0)]);
@@ -390,7 +390,7 @@ fn who_leaves_test_mode_has_released() {
 
 // SENSE-11, CMD-1
 #[test]
-fn a_halted_cell_goes_on_to_say_what_it_feels() {
+fn a_halted_cell_keeps_sending_its_contact_state() {
     let mut cell = eventful();
     assert_eq!(cell.hears(&Message::Halt, Span(0)), []);
     assert!(cell.says(500) && cell.says(0));

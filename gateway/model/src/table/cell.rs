@@ -157,7 +157,7 @@ impl Cell {
     /// How far its torques were from the central ones, in the joints that move it.
     #[must_use]
     pub const fn errors(&self) -> Errors {
-        self.owed.errors
+        self.outstanding.errors
     }
 
     /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
