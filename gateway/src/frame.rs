@@ -182,13 +182,13 @@ impl Frame {
         let message = self.what.message().map_err(Failure::usage)?;
         match self.bus {
             Some(name) => {
-                let (to, requested) = match message {
-                    Message::Stimulus { to, .. } => (to, None),
-                    Message::Configure { to, tag, .. } => (to, Some(tag)),
-                    _ => {
-                        let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
-                        return ack::send(&bus, &message, self.format);
-                    }
+                let (to, requested) = if let Message::Stimulus { to, .. } = message {
+                    (to, None)
+                } else if let Message::Configure { to, tag, .. } = message {
+                    (to, Some(tag))
+                } else {
+                    let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
+                    return ack::send(&bus, &message, self.format);
                 };
                 // Who hears nothing cannot know that nobody is there.
                 let bus = sensing::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
@@ -245,19 +245,19 @@ impl Answers {
         }
         let line = decoded.to_string();
         let line = line.trim_start_matches(decoded.verdict()).trim_start();
-        match message {
+        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message
+            && heartbeat.state.has(State::CLAIMING)
+        {
             // It has not got that node id yet.
-            Message::Network { page: NetworkPage::Heartbeat(it), .. } if it.state.has(State::CLAIMING) => {
-                return;
+            return;
+        }
+        if let Message::Configured { tag, answer, .. } = message
+            && self.requested == Some(tag)
+        {
+            match answer {
+                Answer::Value { .. } => self.lines += &format!("{line}\n"),
+                Answer::Refused { .. } => self.refused.push(line.to_owned()),
             }
-            Message::Configured { tag, answer: Answer::Value { .. }, .. } if self.requested == Some(tag) => {
-                self.lines += line;
-                self.lines.push('\n');
-            }
-            Message::Configured { tag, .. } if self.requested == Some(tag) => {
-                self.refused.push(line.to_owned())
-            }
-            _ => {}
         }
         self.heard = true;
     }

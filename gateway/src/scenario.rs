@@ -258,12 +258,12 @@ fn bus_fault(fault: &BusFault) -> (&'static str, Map<String, Value>) {
 
 /// The file's keys and their values in words.
 fn described(how: &Map<String, Value>) -> String {
-    let value = |value: &Value| match value {
+    let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
         Value::Array(values) => words(values),
-        other => other.to_string(),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::Object(_) => value.to_string(),
     };
-    list(how.iter().map(|(key, it)| format!("{key} {}", value(it))))
+    list(how.iter().map(|(key, it)| format!("{key} {}", words_of(it))))
 }
 
 fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {

@@ -68,10 +68,8 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
 
 /// What is wrong, by its line; columns have a test of their own.
 fn by_line(error: DocumentError) -> String {
-    match error {
-        DocumentError::Wrong { path, line, what, .. } => format!("{path}:{line}: {what}"),
-        other => other.to_string(),
-    }
+    let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
+    format!("{path}:{line}: {what}")
 }
 
 fn says(from: &str, to: &str) -> String {

@@ -143,6 +143,6 @@ fn errors_name_what_is_allowed() {
     assert_eq!(says(target(100_000, 400)), "100000 cells do not fit on the arm, not even 3 mm apart");
     assert_eq!(
         says(Target { broadcast_hz: 60.0, ..Target::default() }),
-        "generated skin:23: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"
+        "generated skin:23:22: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"
     );
 }

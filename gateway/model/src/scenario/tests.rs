@@ -64,10 +64,8 @@ fn good() -> Scenario {
 
 /// What is wrong, by its line; columns have a test of their own.
 fn by_line(error: DocumentError) -> String {
-    match error {
-        DocumentError::Wrong { path, line, what, .. } => format!("{path}:{line}: {what}"),
-        other => other.to_string(),
-    }
+    let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
+    format!("{path}:{line}: {what}")
 }
 
 fn says(from: &str, to: &str) -> String {
