@@ -55,7 +55,7 @@ mod tests {
     use protocol::fixed::{Q3_12, Q5_10};
     use protocol::message::SkinSensors;
 
-    fn sensed(steps: &[i16]) -> Sensed {
+    fn after(steps: &[i16]) -> Sensed {
         let mut sensed = Sensed::default();
         for (&bits, ms) in steps.iter().zip(0..) {
             let contact = [Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO];
@@ -67,17 +67,17 @@ mod tests {
 
     #[test]
     fn touches_and_releases_are_edges_and_not_frames() {
-        let sensed = sensed(&[0, 101, 102, 300, 60, 51, 50, 30, 0, 200, 0]);
+        let sensed = after(&[0, 101, 102, 300, 60, 51, 50, 30, 0, 200, 0]);
         assert_eq!((sensed.touches, sensed.releases, sensed.frames), (2, 2, 11));
-        let mut sensed = sensed(&[500]);
+        let mut sensed = after(&[500]);
         sensed.restart();
         assert_eq!((sensed.touches, sensed.releases), (1, 0), "no release was reported");
     }
 
     #[test]
     fn a_rate_needs_two_frames_and_pages_of_either_kind_count() {
-        assert_eq!(sensed(&[]).rate_hz(), None);
-        let mut sensed = sensed(&[0]);
+        assert_eq!(after(&[]).rate_hz(), None);
+        let mut sensed = after(&[0]);
         assert_eq!(sensed.rate_hz(), None);
         sensed.hear(Micros(4_000), &SensorPage::Acceleration([Q3_12::ZERO; 3]), &Events::default());
         assert!(sensed.rate_hz().is_some_and(|hz| (hz - 250.0).abs() < 1e-9));
