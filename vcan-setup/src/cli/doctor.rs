@@ -4,7 +4,7 @@ use clap::Args;
 use protocol::bus::{BusKind, Choice};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use vcan_setup::doctor::{Bus, Facts, Finding, Level, comparator, would_run};
+use vcan_setup::doctor::{Bus, Facts, Finding, Level, assess, would_run};
 use vcan_setup::look;
 
 use super::{json, named, query};

@@ -64,7 +64,7 @@ fn complaints(facts: &Facts) -> Vec<String> {
         let hints = finding.hints.iter().map(|hint| format!(" | {hint}")).collect::<String>();
         (finding.level != Level::Ok).then(|| format!("{}: {}{hints}", finding.level.name(), finding.text))
     };
-    comparator(facts).into_iter().filter_map(bad).collect()
+    assess(facts).into_iter().filter_map(bad).collect()
 }
 
 /// The findings when the bus, its interface or the machine is changed.
@@ -72,11 +72,7 @@ fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);
     let said = complaints(&facts);
-    assert_eq!(
-        would_run(&comparator(&facts)),
-        !said.iter().any(|line| line.starts_with("fault")),
-        "{said:?}"
-    );
+    assert_eq!(would_run(&assess(&facts)), !said.iter().any(|line| line.starts_with("fault")), "{said:?}");
     said
 }
 
@@ -124,7 +120,7 @@ fn cells(nodes: impl IntoIterator<Item = i64>) -> Heard {
 #[test]
 fn a_machine_on_which_all_is_well() {
     assert_eq!(complaints(&good()), Vec::<String>::new());
-    assert!(comparator(&good()).len() > 4, "and says what it looked at");
+    assert!(assess(&good()).len() > 4, "and says what it looked at");
 }
 
 #[test]
@@ -147,7 +143,7 @@ fn no_can_in_the_kernel_matters_by_what_was_chosen() {
     let mut facts = no_can(Choice::Auto);
     facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
     assert!(complaints(&facts).contains(&"fault: /tmp/skinbus-1 has mode 0755".to_owned()));
-    assert!(!would_run(&comparator(&facts)));
+    assert!(!would_run(&assess(&facts)));
 }
 
 #[test]
