@@ -59,7 +59,7 @@ def main():
                 lines.append((what, f"{ratio:.3g}", bar, f"{values[above]:.0f} / {values[below]:.0f}{unit}"))
     if not lines:
         sys.exit(f"ratios: no benchmark has run below {target}; run `cargo bench --workspace`")
-    print(f"\n{'ratio':<58} {'':>8}  {'wanted':<7} of")
+    print(f"\n{'ratio':<58} {'':>8}  {'bar':<7} of")
     for what, ratio, bar, of in lines:
         print(f"{what:<58} {ratio:>8}  {bar:<7} {of}")
 

@@ -37,7 +37,7 @@ def on_axes(name, text):
     return {f"{name}_{axis}": value for axis, value in zip(AXES, numbers(text))}
 
 
-def felt(fields):
+def sensors_of(fields):
     if "acceleration" in fields:
         return {"page": 1} | on_axes("acceleration", fields["acceleration"])
     return (
@@ -131,7 +131,7 @@ def meaning(kind, fields):
         case "torque":
             return f"torque_{who}", epoch | numbered("torque", fields["torque"]) | {"count": 1}
         case "sensors":
-            return f"sensors_{who}", epoch | felt(fields)
+            return f"sensors_{who}", epoch | sensors_of(fields)
         case "heartbeat":
             said = {"page": 0, "serial": int(fields["serial"]), "configuration": int(fields["configuration"], 16)}
             said |= {"sent": int(fields["sent"]), "rejected": int(fields["rejected"])}
@@ -160,7 +160,7 @@ def meaning(kind, fields):
             return f"configured_{who}", said
         case "stimulus":
             when = {"from_next": 1} if fields["from"] == "next" else {"from_next": 0, "epoch": int(fields["from"])}
-            return f"stimulus_{fields['to']}", when | felt(fields)
+            return f"stimulus_{fields['to']}", when | sensors_of(fields)
     raise SystemExit(f"what is {kind}?")
 
 
@@ -192,10 +192,10 @@ def main(dbc, golden):
                 continue
             raise SystemExit(f"{comment}: decoded")
         said = message.decode(data, decode_choices=False)
-        name, wanted = meaning(kind, fields)
+        name, expected = meaning(kind, fields)
         assert message.name == name, f"{comment}: {message.name}"
-        wanted["crc"] = int.from_bytes(data[14:], "little")
-        for signal, value in wanted.items():
+        expected["crc"] = int.from_bytes(data[14:], "little")
+        for signal, value in expected.items():
             assert abs(said[signal] - value) < 1e-9, f"{comment}: {signal} is {said[signal]}, not {value}"
         assert message.encode(said, strict=False) == data, f"{comment}: encoded otherwise"
         compared[kind] = compared.get(kind, 0) + 1

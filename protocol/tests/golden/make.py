@@ -58,7 +58,7 @@ TEMPERATURE = 6  # Q9.6
 
 
 def nearest(value, bits):
-    """The word of the nearest step, halves away from zero; must be in range."""
+    """The word of the nearest step, ties away from zero; must be in range."""
     steps = Fraction(value) * 2**bits
     word = math.floor(abs(steps) + Fraction(1, 2)) * (1 if steps >= 0 else -1)
     assert -(2**15) <= word < 2**15, f"{value} does not fit"
@@ -66,7 +66,7 @@ def nearest(value, bits):
 
 
 def at_least(value, bits):
-    """The word of the least step that is not below the value: how thresholds are rounded."""
+    """The word of the smallest step that is not below the value: how thresholds are rounded."""
     word = math.ceil(Fraction(value) * 2**bits)
     assert -(2**15) <= word < 2**15, f"{value} does not fit"
     return word
@@ -114,7 +114,7 @@ class Packet:
     def fd(self, flags=5):
         return f"{self.id:03X}##{flags:X}{self.bytes().hex().upper()}"
 
-    def halves(self):
+    def segments(self):
         data = self.bytes().hex().upper()
         return f"{self.id:03X}#{data[:16]}", f"{self.id:03X}#{data[16:]}"
 
@@ -211,7 +211,7 @@ NOBODY = 255
 
 
 def tree(sender, epoch, parent, up, depth, round_, children, works, counters_of_sums):
-    """`parent` is a cell's number, 0 for the gateway's side, or None."""
+    """`parent` is a node id, 0 for the gateway's side, or None."""
     byte = NOBODY if parent is None else parent
     sent, taken, dropped = counters_of_sums
     words = [byte | up << 8, depth | round_ << 8, children | works << 8, sent, taken, dropped]
@@ -354,8 +354,8 @@ def refusal(sender, tag, parameter, reason):
 def configuration_hash(parameters):
     """Over the words of parameters 1, 2, 3, 4, 16..21, six each."""
     image = b""
-    for wanted in (1, 2, 3, 4, 16, 17, 18, 19, 20, 21):
-        words = next((words for found, _, words in parameters if found == wanted), [])
+    for number in (1, 2, 3, 4, 16, 17, 18, 19, 20, 21):
+        words = next((words for found, _, words in parameters if found == number), [])
         image += struct.pack("<6h", *words, *[0] * (6 - len(words)))
     assert len(image) == 120
     return crc16(image)
@@ -367,12 +367,12 @@ def configuration_hash(parameters):
 class Wire:
     """Eight bytes under an identifier of 29 bits: kind, five bytes, CRC over identifier and kind to byte 5."""
 
-    def __init__(self, meaning, lane, kind, *rest):
-        self.meaning, self.lane = meaning, lane
+    def __init__(self, meaning, link, kind, *rest):
+        self.meaning, self.link = meaning, link
         self.body = bytes([kind, *rest, *[0] * (5 - len(rest))])
 
     def id(self):
-        wire, back = self.lane
+        wire, back = self.link
         return 0x10000000 | wire << 1 | back
 
     def crc(self):
@@ -385,47 +385,47 @@ class Wire:
         return f"{self.id():08X}#{self.bytes().hex().upper()}"
 
 
-def over(lane, text):
+def over(link, text):
     name, *fields = text.split(" ", 1)
-    return " ".join([name, f"wire={lane[0]}", f"back={lane[1]}", *fields])
+    return " ".join([name, f"wire={link[0]}", f"back={link[1]}", *fields])
 
 
 HELLO = {"hears": 3, "up": 4, "unnumbered": 5}
 
 
-def hello(lane, number_here, port, flags=(), label=None, version=1):
+def hello(link, number_here, port, flags=(), label=None, version=1):
     """`label` is (round, depth), or None."""
     bits = port | sum(1 << HELLO[flag] for flag in flags) | (label is not None) << 6
     text = "none" if label is None else f"{label[0]}/{label[1]}"
     meaning = (
         f"hello version={version} node_id={number_here} port={port} flags={'+'.join(flags) or 'none'} label={text}"
     )
-    return Wire(over(lane, meaning), lane, 1, version, number_here, bits, *(label or (0, 0)))
+    return Wire(over(link, meaning), link, 1, version, number_here, bits, *(label or (0, 0)))
 
 
-def bare_wire(lane, name):
-    return Wire(over(lane, name), lane, {"join": 2, "refuse": 4, "leave": 5, "leave_ack": 6, "probe": 12}[name])
+def bare_wire(link, name):
+    return Wire(over(link, name), link, {"join": 2, "refuse": 4, "leave": 5, "leave_ack": 6, "probe": 12}[name])
 
 
-def grant(lane, round_, depth):
-    return Wire(over(lane, f"grant label={round_}/{depth}"), lane, 3, round_, depth)
+def grant(link, round_, depth):
+    return Wire(over(link, f"grant label={round_}/{depth}"), link, 3, round_, depth)
 
 
-def state_of(lane, epoch):
-    return Wire(over(lane, f"state epoch={epoch}"), lane, 7, epoch)
+def state_of(link, epoch):
+    return Wire(over(link, f"state epoch={epoch}"), link, 7, epoch)
 
 
-def nack(lane, epoch):
-    return Wire(over(lane, f"nack epoch={epoch}"), lane, 8, epoch)
+def nack(link, epoch):
+    return Wire(over(link, f"nack epoch={epoch}"), link, 8, epoch)
 
 
-def repair(lane, round_):
-    return Wire(over(lane, f"repair round={round_}"), lane, 9, round_)
+def repair(link, round_):
+    return Wire(over(link, f"repair round={round_}"), link, 9, round_)
 
 
-def walk(lane, name, which, first, last):
+def walk(link, name, which, first, last):
     kind = {"node_id": 10, "result": 11}[name]
-    return Wire(over(lane, f"{name} walk={which} first={first} last={last}"), lane, kind, which, first, last)
+    return Wire(over(link, f"{name} walk={which} first={first} last={last}"), link, kind, which, first, last)
 
 
 # --- What a cell computes ------------------------------------------------------------------------
@@ -717,7 +717,7 @@ def bad():
     for length in (0, 8, 12, 15, 20, 24, 64):
         body = (data * 4)[:length].hex().upper()
         log.add(f"bad length expected=16 got={length}", f"20C##5{body}")
-    first, second = good.halves()
+    first, second = good.segments()
     log.add("bad length expected=16 got=8", first)
     log.add("bad length expected=16 got=8", second)
 
@@ -764,7 +764,7 @@ def classic():
 
     def half(packet, index, outcome, after_us):
         meaning = f"whole {packet.meaning}" if outcome == "whole" else outcome
-        log.add(meaning, packet.halves()[index], after_us)
+        log.add(meaning, packet.segments()[index], after_us)
 
     a = [torque(12, epoch, [epoch * 100, -epoch, 3, 4, 5, 6]) for epoch in range(20)]
     b = [torque(13, epoch, [-epoch * 100, epoch, 3, 4, 5, 6]) for epoch in range(20)]
@@ -785,7 +785,7 @@ def classic():
         half(packet, 0, first, 500)
         half(packet, 1, second, 150)
 
-    log.title("two cells speak at once: halves pair by identifier")
+    log.title("two cells speak at once: segments are reassembled by identifier")
     half(a[1], 0, first, 1000)
     half(b[1], 0, first, 120)
     half(a[1], 1, second, 120)
@@ -827,15 +827,15 @@ def classic():
 
     log.title("a wrong CRC drops the older half; the newer one waits, falls to the next first half and is not counted")
     half(a[11], 0, first, 1000)
-    spoilt = a[11].halves()[1]
+    spoilt = a[11].segments()[1]
     log.add("incomplete", spoilt[:-1] + ("0" if spoilt[-1] != "0" else "1"), 150)
     half(a[12], 0, first, 1000)
     half(a[12], 1, second, 150)
 
     log.title("a whole pair without a meaning")
     odd = Packet("", 0, 9, [], 0, 0)
-    log.add("waiting", odd.halves()[0])
-    log.add("whole bad command node=9", odd.halves()[1], 150)
+    log.add("waiting", odd.segments()[0])
+    log.add("whole bad command node=9", odd.segments()[1], 150)
     return log
 
 
@@ -884,7 +884,7 @@ def session():
         "cell's may differ by a step or two of 2^-14, and its torque accordingly.",
     )
     value_of = configuration_hash(PARAMETERS)
-    log.title("the cell claims its number, and is there 250 ms later")
+    log.title("the cell claims its node id, and is there 250 ms later")
     log.put(heartbeat(CELL, 0, SERIAL, 0, 0, 0, ("claiming",)), heartbeat(CELL, 0, SERIAL, 0, 1, 0))
     log.title("the gateway writes every parameter")
     for tag, parameter in enumerate(PARAMETERS, 1):
@@ -894,7 +894,7 @@ def session():
     log.put(write(CELL, 12, commit(value_of)), value(CELL, 12, commit(value_of), True))
     log.title("test mode")
     log.put(write(CELL, 13, mode(1)), value(CELL, 13, mode(1), True))
-    log.title("pressed with 3 N from epoch 7 on, and let go from the next joints on")
+    log.title("pressed with 3 N from epoch 7 on, and released from the next joints on")
     words = [angle(q) for q in ANGLES]
     log.put(
         stimulus(CELL, 7, PRESSED),
@@ -937,7 +937,7 @@ class Exchange:
         self.test = test
 
     def put(self, who, at, packet):
-        frames = [packet.fd()] if self.form == "fd" else packet.halves()
+        frames = [packet.fd()] if self.form == "fd" else packet.segments()
         for index, frame in enumerate(frames):
             part = "" if self.form == "fd" else f"{index + 1}/2 "
             self.frame(f"{who} {part}{packet.meaning}", at + 200 * index * (who == "bus"), frame)
@@ -1135,7 +1135,7 @@ def exchange():
     x.settle()
 
     def segment(at, packet, index):
-        x.frame(f"bus {index}/2 {packet.meaning}", at, packet.halves()[index - 1])
+        x.frame(f"bus {index}/2 {packet.meaning}", at, packet.segments()[index - 1])
 
     x.bus(300_000, stimulus(CELL, None, PRESSED), joints(1, words))
     x.cell(301_200, torque(CELL, 1, pressed))
@@ -1143,8 +1143,8 @@ def exchange():
     segment(317_000, joints(2, words), 1)
     x.bus(333_000, joints(3, words))
     x.cell(333_200, torque(CELL, 3, pressed))
-    let_go = stimulus(CELL, None, skin([0, 0, 0]))
-    for at, packet, index in ((349_000, let_go, 1), (349_100, joints(4, words), 1), (349_200, let_go, 2)):
+    release = stimulus(CELL, None, skin([0, 0, 0]))
+    for at, packet, index in ((349_000, release, 1), (349_100, joints(4, words), 1), (349_200, release, 2)):
         segment(at, packet, index)
     segment(349_300, joints(4, words), 2)
     x.cell(349_300, torque(CELL, 4, [0] * 6))
@@ -1203,12 +1203,12 @@ def forces():
     ]
     jacobians = [[-1433, 4260, 0, 0, 0, 0], [MAX, MIN, 1, -1, 8191, -8192], [3, -3, 7, -7, 13_926, 0]]
     rows = []
-    for index, (rule, felt) in enumerate(cases):
-        f_z, active = fused_force(rule, felt[:3], felt[3])
+    for index, (rule, sensors) in enumerate(cases):
+        f_z, active = fused_force(rule, sensors[:3], sensors[3])
         f_z = max(0, (f_z + (1 << 7)) >> 8) if active else 0
         jacobian = jacobians[index % len(jacobians)]
         words = [max(MIN, min(MAX, (j * f_z + (1 << 17)) >> 18)) for j in jacobian]
-        rows.append({"contact": rule, "sensors": [*felt, 0, 0], "force": f_z, "jacobian": jacobian, "torque": words})
+        rows.append({"contact": rule, "sensors": [*sensors, 0, 0], "force": f_z, "jacobian": jacobian, "torque": words})
     return rows
 
 
@@ -1341,7 +1341,7 @@ def wire():
         bare_wire(here, "leave_ack"),
         bare_wire(here, "refuse"),
     )
-    log.title("the greatest and the least of everything")
+    log.title("the largest and the smallest of everything")
     log.say(
         hello((0, 0), 0, 0, version=0),
         hello((65535, 1), 254, 7, list(HELLO), (255, 255), version=255),
@@ -1355,7 +1355,7 @@ def wire():
     log.title("a label that nobody says is there is not looked at; the highest bit of a hello's flags neither")
 
     def odd(meaning_of, *rest):
-        log.add(meaning_of.meaning, Wire("", meaning_of.lane, *rest).classic())
+        log.add(meaning_of.meaning, Wire("", meaning_of.link, *rest).classic())
 
     odd(hello(there, 7, 2), 1, 1, 7, 2, 9, 9)
     odd(hello(there, 7, 2), 1, 1, 7, 2 | 0x80, 0, 0)
@@ -1365,7 +1365,7 @@ def wire():
     log.title("kinds that do not exist")
     for kind in (0, 13, 255):
         log.add("bad wire", Wire("", there, kind, 1, 2, 3).classic())
-    log.title("damaged, on another lane, of another length")
+    log.title("damaged, on another link, of another length")
     good = hello(there, 7, 2, ["hears", "up"], (3, 1))
     for bit in (0, 7, 8, 47, 48, 63):
         flipped = bytearray(good.bytes())

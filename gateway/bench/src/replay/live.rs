@@ -113,7 +113,9 @@ impl Stage for Live {
 
     fn wait_for_answers(&mut self, bus_link: usize, open: &Open) {
         self.wait_until_done(bus_link);
-        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else { return };
+        let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
+            return;
+        };
         // On a slow machine a cell skips joints that it processes more than one period late, and does not answer.
         // They are resent under the epoch before, and then under their own; and the sync comes later, because on
         // such a machine the heartbeats of some cells delay others.

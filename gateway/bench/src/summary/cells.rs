@@ -23,7 +23,7 @@ pub struct RepliesSummary {
     pub not_heard: u64,
     /// Sent by the cell and lost or damaged on the way.
     pub lost: u64,
-    /// Of cells that were dead or started anew, or whose bus was lost.
+    /// Of cells that were dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
     /// Missing, and nobody knows why.
     pub unknown: u64,
