@@ -23,7 +23,8 @@ const SKIN_MD: &str = include_str!("../../docs/reference/skin.md");
 
 /// The two cells of `docs/reference/skin.md`.
 fn skin() -> Skin {
-    let text = SKIN_MD.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+    let text = SKIN_MD.split("```toml\n").find(|block| block.starts_with("# skin.toml:")).unwrap();
+    let text = text.split("```").next().unwrap();
     Skin::parse("docs/reference/skin.md", text).unwrap()
 }
 

@@ -17,7 +17,7 @@ const EVERYWHERE: &[(&str, &str)] = &[
     ("in force", "latched"),
     ("trunk|trunks", "root sums"),
     ("ledger|ledgers", "accounts"),
-    ("cell number|cell numbers|cell s number|cells numbers|cells s numbers", "node id"),
+    ("cell number|cell numbers|cell s number|cells s numbers", "node id"),
     (
         "claim a number|claims a number|claiming a number|claimed a number|claim its number|claims its number",
         "address claim",

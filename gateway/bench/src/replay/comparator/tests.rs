@@ -490,15 +490,5 @@ fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     assert!(comparator.is_done(0), "no cell is waited for on a bus that is down");
 }
 
-#[test]
-fn another_sender_of_joints_is_another_gateway() {
-    let mut comparator =
-        Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
-    comparator.hear(1, &Message::Resume);
-    assert_eq!(comparator.other_gateway(), None, "anybody may resume");
-    comparator.hear(1, &joints(0));
-    assert_eq!(comparator.other_gateway(), Some(1));
-}
-
 mod claims;
 mod tolerance;

@@ -72,3 +72,13 @@ fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
         assert_eq!(surveyed(&[before, &[claim()], after].concat()), without, "after {at}");
     }
 }
+
+#[test]
+fn another_sender_of_joints_is_another_gateway() {
+    let mut comparator =
+        Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
+    comparator.hear(1, &Message::Resume);
+    assert_eq!(comparator.other_gateway(), None, "anybody may resume");
+    comparator.hear(1, &joints(0));
+    assert_eq!(comparator.other_gateway(), Some(1));
+}
