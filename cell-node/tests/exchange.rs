@@ -1,6 +1,6 @@
 //! The cell against `protocol/tests/golden/exchange.log`, which another program wrote from the document: it gets the frames
 //! of the log, and has to send the log's frames, at the log's times, and no others.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, VecDeque};
 

@@ -103,7 +103,7 @@ fn exchanges() -> Vec<Value> {
         title = line.strip_prefix("## ").unwrap_or(title);
         if let Some(fields) = line.strip_prefix("# start ") {
             let fields = fields.split(' ').map(|field| field.split_once('=').unwrap());
-            let number = |text: &str| text.parse::<u32>().map_or(Value::from(text), Value::from);
+            let number = |text: &str| text.parse::<u32>().map_or_else(|_| Value::from(text), Value::from);
             let start: Map<_, _> = fields.map(|(key, value)| (key.to_owned(), number(value))).collect();
             rows.push(json!({ "exchange": title, "start": start }));
         } else if line.starts_with('(') {
