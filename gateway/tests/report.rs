@@ -67,7 +67,8 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
 #[test]
 fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_read() {
     let folder = tempfile::tempdir().unwrap();
-    fs::write(folder.path().join("run.mcap"), "").unwrap();
+    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap");
+    fs::copy(recording, folder.path().join("run.mcap")).unwrap();
     fs::write(folder.path().join("run.html"), "mine").unwrap();
     let exists = "-o run.html: it exists: name another file, or overwrite it with --force";
     assert_eq!(refuses(&folder, "run.mcap", 2), exists);
