@@ -157,7 +157,7 @@ fn arm_in_reach() -> impl Strategy<Value = Parameters> {
         let rows = parameters.chain().iter().flat_map(|row| [row.a, row.d]);
         let all: f64 = rows.chain(parameters.pose.position).map(|word| word.to_f64().abs()).sum();
         let scale = if all > reach { reach / all } else { 1.0 };
-        let shorter = |word: Q1_14| Q1_14::from_bits((f64::from(word.to_bits()) * scale) as i16);
+        let shorter = |word: Q1_14| Q1_14::nearest((f64::from(word.to_bits()) * scale).trunc() / 16_384.0);
         for row in &mut parameters.rows {
             (row.a, row.d) = (shorter(row.a), shorter(row.d));
         }

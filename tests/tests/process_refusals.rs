@@ -125,12 +125,12 @@ fn files_that_are_not_there_are_named() {
         ("run .", ".: Is a directory (os error 21)"),
         (
             "run skin.toml --cell-node /nowhere",
-            "cell-node is not at /nowhere: build it with `cargo build --release`, or say where it is with \
+            "cell-node is not at /nowhere: build it with `cargo build --release`, or name its path with \
              --cell-node",
         ),
         (
             "run skin.toml --vcan-setup /nowhere",
-            "vcan-setup is not at /nowhere: build it with `cargo build --release`, or say where it is with \
+            "vcan-setup is not at /nowhere: build it with `cargo build --release`, or name its path with \
              --vcan-setup",
         ),
     ] {

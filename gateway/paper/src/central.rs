@@ -1,6 +1,6 @@
 //! Fig. 9 and 10: what the central computation costs, over cells and over active cells.
 //!
-//! What is timed is [`Central::frames`] and [`Central::feel`], which a comparing tick runs for each bus, here over one
+//! What is timed is [`Central::frames`] and [`Central::total`], which a comparing tick runs for each bus, here over one
 //! list of cells. Every measurement is of several computations in a row, so reading the clock does not count, and
 //! code and data lie in the caches as well as they can.
 
