@@ -151,9 +151,10 @@ fn torques() -> Vec<Value> {
 fn file() -> String {
     let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean, and cell.md what a cell \
                  does. packets: frames and what they say. refused: frames that are none. reassembly: segments in their order, and \
-                 what each comes to. session: a cell is configured and pressed. refusals: a write to that cell, and its answer (of \
-                 parameter 127: of a commit after it). exchanges: from each start on all that one cell receives (bus) and has to \
-                 send (cell), in names of requirements; flash is empty, or what session commits. wires: messages over wires. All \
+                 what each comes to. session: a cell is configured and pressed. refusals: each a write to the cell of session after \
+                 its commit, out of test mode, and the answer (of parameter 127: to a commit after that write). exchanges: a start, \
+                 then all frames that one cell receives (bus) and has to send (cell); the title names the requirements, cell.md the \
+                 options that it needs; flash is empty, or what session commits. wires: messages over wires. All \
                  other numbers are words as they stand in packets. forces: parameter 3, sensors page 0, F_z with 16 fraction bits, \
                  J, torque. sums: epochs of one cell, whose own J and F_z, children's sums and sum. torques: parameters 1, 16 to 21, \
                  2, 3, joints, sensors page 0, and what the cell of this project answers; another cell's jacobian may differ from \
