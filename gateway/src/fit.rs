@@ -12,7 +12,8 @@ use protocol::usage::{Failure, print};
 use protocol::wire_time::{BitRates, bit_rate};
 
 use super::arguments::{FORMATS, one_of};
-use super::print::json;
+use super::output::note;
+use super::print::{json, list};
 
 /// Compute whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
 ///
@@ -64,6 +65,12 @@ impl Fit {
                 (buses, whole, Vec::new())
             }
         };
+        let is_partly_described = !rows.is_empty() && skin.buses.iter().any(|bus| bus.bitrate.is_some());
+        if is_partly_described && !self.table && !self.json {
+            let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
+            let (without, skin) = (list(without), &skin.name);
+            note(format_args!("no bitrate of {without}: these are common bit rates, not those of {skin}"));
+        }
         print(&match self.json {
             true => json(&fit::json(&skin, &buses, whole.as_ref(), &rows))?,
             false => text::table(&skin, &rows) + &text::buses(&skin, &buses, whole.as_ref()),

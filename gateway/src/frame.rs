@@ -3,6 +3,7 @@
 use std::fmt::Write;
 use std::time::{Duration, Instant};
 
+use bench::answers::Answers;
 use bench::listen::Listener;
 use bench::sensing;
 use clap::{Args, Subcommand};
@@ -11,10 +12,8 @@ use model::scenario::contact_words;
 use protocol::bus::{BusError, Choice};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::id::{Kind, Node};
-use protocol::message::{
-    Answer, From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
-};
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::{Answer, From, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
 use protocol::schema::packets;
 use protocol::usage::{Failure, print};
@@ -182,7 +181,7 @@ impl Frame {
         let message = self.what.message().map_err(Failure::usage)?;
         match self.bus {
             Some(name) => {
-                let (to, requested) = if let Message::Stimulus { to, .. } = message {
+                let (to, tag) = if let Message::Stimulus { to, .. } = message {
                     (to, None)
                 } else if let Message::Configure { to, tag, .. } = message {
                     (to, Some(tag))
@@ -193,93 +192,64 @@ impl Frame {
                 // Who hears nothing cannot know that nobody is there.
                 let bus = sensing::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
                 ack::send(&bus, &message, self.format)?;
-                let mut answers =
-                    Answers { to, requested, heard: false, lines: String::new(), refused: Vec::new() };
-                answers.hear(Listener::new(bus, Some(self.format))).map_err(Failure::run)?;
-                print(&answers.lines)?;
-                answers.verdict(&name, self.format)
+                let only = if let Node::Cell(cell) = to { Some(cell) } else { None };
+                let answers = wait(Listener::new(bus, Some(self.format)), only, tag).map_err(Failure::run)?;
+                verdict(&answers, only, tag, (&name, self.format))
             }
             None => print(&text(&message, self.format)),
         }
     }
 }
 
-/// What comes back of a packet for cells.
-struct Answers {
-    to: Node,
-    /// The tag of a request, which comes back in its answers; a packet without one is answered by nobody.
-    requested: Option<u8>,
-    /// Whether any cell that it is for is there.
-    heard: bool,
-    lines: String,
-    refused: Vec<String>,
+/// Waits until nothing more is to come; how many cells everyone is shows in the time alone.
+fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result<Answers, BusError> {
+    let mut answers = Answers::new(only, tag);
+    let are_complete = |answers: &Answers| match (only, tag) {
+        (_, None) => !answers.present().is_empty(),
+        (Some(_), Some(_)) => !answers.received().is_empty(),
+        (None, Some(_)) => false,
+    };
+    let began = Instant::now();
+    while began.elapsed() < ANSWER && !are_complete(&answers) {
+        answers.hear(&mut listener)?;
+    }
+    Ok(answers)
 }
 
-impl Answers {
-    /// Hears until nothing more is to come; how many cells everyone is shows in the time alone.
-    fn hear(&mut self, mut listener: Listener) -> Result<(), BusError> {
-        let began = Instant::now();
-        while began.elapsed() < ANSWER && !self.are_complete() {
-            listener.hear(Duration::from_millis(20))?;
-            for (_, decoded) in listener.decoded() {
-                self.take(decoded);
-            }
-        }
-        Ok(())
-    }
-
-    fn are_complete(&self) -> bool {
-        let answered = !self.lines.is_empty() || !self.refused.is_empty();
-        match (self.to, self.requested) {
-            (_, None) => self.heard,
-            (Node::Cell(_), Some(_)) => answered,
-            (Node::Gateway | Node::Everyone, Some(_)) => false,
-        }
-    }
-
-    fn take(&mut self, decoded: Decoded) {
-        let Decoded::Message(message) = decoded else { return };
-        let Some(from) = message.sender() else { return };
-        if matches!(self.to, Node::Cell(to) if to != from) {
-            return;
-        }
+/// Prints the values that cells answered; an error if one refused, or none is there or answered.
+fn verdict(
+    answers: &Answers,
+    only: Option<CellId>,
+    tag: Option<u8>,
+    (bus, format): (&str, Format),
+) -> Result<(), Failure> {
+    let (mut lines, mut refused) = (String::new(), Vec::new());
+    for &(from, answer) in answers.received() {
+        let decoded = Decoded::Message(Message::Configured { from, tag: tag.unwrap_or_default(), answer });
         let line = decoded.to_string();
         let line = line.trim_start_matches(decoded.verdict()).trim_start();
-        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message
-            && heartbeat.state.has(State::CLAIMING)
-        {
-            // It has not got that node id yet.
-            return;
-        }
-        if let Message::Configured { tag, answer, .. } = message
-            && self.requested == Some(tag)
-        {
-            match answer {
-                Answer::Value { .. } => self.lines += &format!("{line}\n"),
-                Answer::Refused { .. } => self.refused.push(line.to_owned()),
-            }
-        }
-        self.heard = true;
-    }
-
-    fn verdict(&self, bus: &str, format: Format) -> Result<(), Failure> {
-        let who = match self.to {
-            Node::Cell(cell) => format!("cell {cell}"),
-            Node::Gateway | Node::Everyone => "cell".to_owned(),
-        };
-        let (waited, other) = (ANSWER.as_secs_f64(), format.other().name());
-        match (self.heard, self.requested) {
-            _ if !self.refused.is_empty() => Err(Failure::run(list(&self.refused))),
-            (false, _) => Err(Failure::run(format!(
-                "no {who} was heard on {bus} for {waited} s: `gateway cells {bus}` lists who is there; the bus' format \
-                 may be --format {other}"
-            ))),
-            (true, Some(_)) if self.lines.is_empty() => {
-                Err(Failure::run(format!("{who} is on {bus} and did not answer for {waited} s: ask again")))
-            }
-            (true, _) => Ok(()),
+        match answer {
+            Answer::Value { .. } => lines += &format!("{line}\n"),
+            Answer::Refused { .. } => refused.push(line.to_owned()),
         }
     }
+    print(&lines)?;
+    let who = only.map_or_else(|| "cell".to_owned(), |cell| format!("cell {cell}"));
+    let (waited, other) = (ANSWER.as_secs_f64(), format.other().name());
+    if !refused.is_empty() {
+        return Err(Failure::run(list(&refused)));
+    }
+    if answers.present().is_empty() {
+        return Err(Failure::run(format!(
+            "no {who} was heard on {bus} for {waited} s: `gateway cells {bus}` lists who is there; the bus' format \
+             may be --format {other}"
+        )));
+    }
+    if tag.is_some() && lines.is_empty() {
+        let why = format!("{who} is on {bus} and did not answer for {waited} s: ask again");
+        return Err(Failure::run(why));
+    }
+    Ok(())
 }
 
 /// The lines for cansend.

@@ -228,6 +228,9 @@ impl Run {
             let (file, path) = in_memory(skin_text.as_bytes()).map_err(Failure::run)?;
             (Some(file), path)
         };
+        for remark in scenario.remarks(&skin) {
+            note(format_args!("remark: {remark}"));
+        }
         let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;

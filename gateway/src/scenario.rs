@@ -5,9 +5,7 @@ use std::path::PathBuf;
 use bench::run::RunError;
 use bench::run::launch::groups;
 use clap::{Args, Subcommand};
-use model::scenario::{
-    BusFault, FaultKind, Mode, MotionKind, ProcessAction, Scenario as Description, SensorFault,
-};
+use model::scenario::{BusFault, FaultKind, MotionKind, Scenario as Description, SensorFault};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use protocol::usage::{Failure, print};
@@ -60,8 +58,8 @@ impl Check {
         let scenario = Description::read(&self.file, &skin).map_err(Failure::usage)?;
         let plan = Plan::of(&scenario, &skin);
         print(&if self.json { pretty(&plan)? } else { plan.text(&self.file.display().to_string()) })?;
-        if scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
-            return Err(Failure::usage(RunError::BusFault));
+        if let Some(error) = RunError::bus_fault(&scenario, &skin) {
+            return Err(Failure::usage(error));
         }
         Ok(())
     }
@@ -75,6 +73,8 @@ struct Plan {
     seed: u64,
     motion: Motion,
     events: Vec<Event>,
+    /// What has no effect.
+    remarks: Vec<String>,
 }
 
 #[derive(Serialize)]
@@ -102,24 +102,18 @@ impl Plan {
     fn of(scenario: &Description, skin: &Skin) -> Self {
         let joints = skin.robot.joints.len();
         let each = |values: &[f64]| values.iter().take(joints).copied().collect::<Vec<_>>();
-        let (kind, how) = match scenario.motion.kind {
-            MotionKind::Hold => ("hold", Map::new()),
-            MotionKind::Kinesthetic => ("kinesthetic", Map::new()),
+        let how = match scenario.motion.kind {
+            MotionKind::Hold | MotionKind::Kinesthetic => Map::new(),
             MotionKind::Sine { amplitude_rad, period_s } => {
-                let amplitude_rad = each(&amplitude_rad);
-                ("sine", map([("amplitude_rad", json!(amplitude_rad)), ("period_s", json!(period_s))]))
+                map([("amplitude_rad", json!(each(&amplitude_rad))), ("period_s", json!(period_s))])
             }
         };
         let mut events = Vec::new();
         for change in &scenario.modes {
-            let what = match change.mode {
-                Mode::Compare => "compare",
-                Mode::Distributed => "distributed",
-            };
             events.push(Event {
                 at_s: seconds(change.at),
                 for_s: None,
-                what,
+                what: change.mode.name(),
                 bus: None,
                 cells: vec![],
                 how: Map::new(),
@@ -140,13 +134,15 @@ impl Plan {
             events.extend(broken(skin, fault.at, &fault.kind));
         }
         events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
-        let motion = Motion { kind, start_rad: each(&scenario.motion.start_rad), how };
+        let motion =
+            Motion { kind: scenario.motion.kind.name(), start_rad: each(&scenario.motion.start_rad), how };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
-        Self { skin: skin.name.clone(), duration_s, seed, motion, events }
+        let remarks = scenario.remarks(skin);
+        Self { skin: skin.name.clone(), duration_s, seed, motion, events, remarks }
     }
 
     fn text(&self, file: &str) -> String {
-        let Self { skin, duration_s, seed, motion, events } = self;
+        let Self { skin, duration_s, seed, motion, events, remarks } = self;
         let moves = match motion.kind {
             "hold" => "the robot stays at",
             "sine" => "every joint swings about",
@@ -159,12 +155,13 @@ impl Plan {
             "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start} rad{how}\n",
             count(events.len(), "event")
         );
+        let remarks: String = remarks.iter().map(|remark| format!("remark: {remark}\n")).collect();
         if events.is_empty() {
-            return head + "nobody touches the skin, and nothing breaks\n";
+            return head + "nobody touches the skin, and nothing breaks\n" + &remarks;
         }
         let rows = events.iter().map(Event::row);
         head + &format!(
-            "{}\n",
+            "{}\n{remarks}",
             table(["at s", "for s", "what", "bus", "cells", "how"], rows, |column| column < 2)
         )
     }
@@ -209,49 +206,40 @@ fn on_cells(
 
 /// What a fault does.
 fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
+    let what = kind.name();
     match kind {
-        FaultKind::Process { action, cells } => {
-            let what = match action {
-                ProcessAction::Kill => "kill",
-                ProcessAction::Stop => "stop",
-                ProcessAction::Continue => "continue",
-                ProcessAction::Restart => "restart",
-            };
-            on_cells(skin, at, None, what, cells, &Map::new())
-        }
+        FaultKind::Process { cells, .. } => on_cells(skin, at, None, what, cells, &Map::new()),
         FaultKind::Sensor { fault, length: span, cells } => {
-            let (what, how) = match fault {
-                SensorFault::Stuck => ("stuck", Map::new()),
-                SensorFault::Drift { n_per_s } => ("drift", map([("n_per_s", json!(n_per_s))])),
+            let how = match fault {
+                SensorFault::Stuck => Map::new(),
+                SensorFault::Drift { n_per_s } => map([("n_per_s", json!(n_per_s))]),
             };
             on_cells(skin, at, length(*span), what, cells, &how)
         }
-        FaultKind::Wire { link_down, from, to, both_ways } => {
-            let what = if *link_down { "link_down" } else { "link_up" };
+        FaultKind::Wire { from, to, both_ways, .. } => {
             on_cells(skin, at, None, what, &[*from, *to], &map([("one_way", json!(!both_ways))]))
         }
         FaultKind::Bus { fault, length: span, bus, cells } => {
-            let (what, how) = bus_fault(fault);
             let nodes = cells.iter().filter_map(|&cell| skin.cells.get(cell));
             let cells = nodes.map(|cell| cell.node.get()).collect();
             let bus = skin.buses.get(*bus).map(|bus| bus.name.clone());
-            vec![Event { at_s: seconds(at), for_s: length(*span), what, bus, cells, how }]
+            vec![Event { at_s: seconds(at), for_s: length(*span), what, bus, cells, how: parameters(fault) }]
         }
     }
 }
 
-fn bus_fault(fault: &BusFault) -> (&'static str, Map<String, Value>) {
-    let hit = |probability: f64| map([("probability", json!(probability))]);
+/// The values of a bus fault, by the file's keys.
+fn parameters(fault: &BusFault) -> Map<String, Value> {
     match *fault {
-        BusFault::Drop { probability } => ("drop", hit(probability)),
+        BusFault::Drop { probability }
+        | BusFault::Duplicate { probability }
+        | BusFault::Corrupt { probability }
+        | BusFault::Reorder { probability } => map([("probability", json!(probability))]),
         BusFault::Delay { probability, delay } => {
-            ("delay", map([("probability", json!(probability)), ("delay_us", json!(delay.0))]))
+            map([("probability", json!(probability)), ("delay_us", json!(delay.0))])
         }
-        BusFault::Duplicate { probability } => ("duplicate", hit(probability)),
-        BusFault::Corrupt { probability } => ("corrupt", hit(probability)),
-        BusFault::Reorder { probability } => ("reorder", hit(probability)),
         BusFault::Babble { frames_per_s, id } => {
-            ("babble", map([("frames_per_s", json!(frames_per_s)), ("id", json!(id))]))
+            map([("frames_per_s", json!(frames_per_s)), ("id", json!(id))])
         }
     }
 }

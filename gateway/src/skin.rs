@@ -1,6 +1,7 @@
 //! `gateway skin generate` and `gateway skin check`.
 
-use std::collections::BTreeMap;
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
@@ -158,17 +159,44 @@ fn describe(skin: &Description) -> String {
             [root] => format!("root {root}"),
             roots => format!("roots {}", words(roots)),
         };
-        text += &format!("bus {} ({format}, {reply}): {cells}: {parts}; {roots}\n", bus.name);
+        let rates = bus.bitrate.map(|nominal| match bus.data_bitrate {
+            Some(data) => format!(", {nominal} and {data} bit/s"),
+            None => format!(", {nominal} bit/s"),
+        });
+        let rates = or(rates, "");
+        text += &format!("bus {} ({format}{rates}, {reply}): {cells}: {parts}; {roots}\n", bus.name);
+    }
+    for [first, second] in at_one_place(skin) {
+        let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
+        text += &format!("remark: cells {} and {} sit at one place\n", name(first), name(second));
     }
     let images: Vec<u8> = cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
     let hash = crc16(&images);
     text + &format!("hash: {hash:04X} over the parameters of all cells; --cells lists each cell's\n")
 }
 
+/// Cells that sit where a cell before them sits.
+fn at_one_place(skin: &Description) -> Vec<[&Cell; 2]> {
+    let mut known = HashMap::new();
+    let place = |cell: &Cell| (cell.joint, cell.position.map(|metres| (metres + 0.0).to_bits()));
+    let pair = |cell| match known.entry(place(cell)) {
+        Entry::Occupied(first) => Some([*first.get(), cell]),
+        Entry::Vacant(free) => {
+            free.insert(cell);
+            None
+        }
+    };
+    skin.cells.iter().filter_map(pair).collect()
+}
+
+fn bus_name<'a>(skin: &'a Description, cell: &Cell) -> &'a str {
+    skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str())
+}
+
 /// One line for each cell, or for those with one node id.
 fn cells(skin: &Description, node: Option<u8>) -> String {
     let line = |cell: &Cell| {
-        let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+        let on_bus = bus_name(skin, cell);
         let Cell { bus: _, node, serial, joint, position, normal, neighbors, root, contact: _ } = cell;
         let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
         // What comes of a quaternion has more digits than anybody measured.
@@ -176,7 +204,7 @@ fn cells(skin: &Description, node: Option<u8>) -> String {
         let root = if *root { " root" } else { "" };
         let hash = skin.parameters(cell).hash();
         format!(
-            "{bus} {node} joint {joint} at {position} m normal {normal} ports {ports}{root} serial {serial} hash \
+            "{on_bus} {node} joint {joint} at {position} m normal {normal} ports {ports}{root} serial {serial} hash \
              {hash:04X}\n"
         )
     };

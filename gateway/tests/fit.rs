@@ -65,6 +65,9 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
     for arguments in [path("plain"), path("mixed"), format!("{} --table", path("rates"))] {
         assert_eq!(names(&json(&format!("fit {arguments} --json")), "table"), all);
     }
+    let said = |name: &str| String::from_utf8(gateway(&format!("fit {}", path(name))).stderr).unwrap();
+    assert_eq!(said("mixed"), "no bitrate of vcan0: these are common bit rates, not those of ur5-90\n");
+    assert_eq!(said("plain") + &said("rates"), "");
     let only = json(&format!("fit {} --format classic --json", path("plain")));
     assert_eq!(names(&only, "table"), all[..2]);
     // A cell that computes longer answers later by that.

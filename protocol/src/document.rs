@@ -5,6 +5,8 @@
 //! makes of it what it means, or a [`Fault`]. The file is read without positions, which is quick; only
 //! when something is wrong is it read again with them.
 
+mod mistakes;
+
 use core::fmt;
 use core::ops::RangeInclusive;
 use std::fs::File;
@@ -238,8 +240,8 @@ pub fn parse<Raw: DeserializeOwned, T>(
 /// Parses a document; the error is where it stands, in bytes, and one line of text.
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
-        let at = error.span().map_or(0, |span| span.start);
-        (at, error.message().lines().collect::<Vec<_>>().join("; "))
+        let at = error.span().unwrap_or_default();
+        (at.start, mistakes::explained(text, at, &error.message().lines().collect::<Vec<_>>().join("; ")))
     })
 }
 

@@ -80,10 +80,7 @@ fn a_fault_that_processes_cannot_make_is_refused() {
         "{PRESSED}\n[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\nbus = \"vcan0\"\n"
     ));
     let said = refusal(&place, "gateway", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
-    assert!(
-        said.starts_with("gateway: the scenario has a fault of a bus, which a run with processes"),
-        "{said}"
-    );
+    assert!(said.starts_with("gateway: the fault \"drop\" of vcan0 at 1 s: a run with processes"), "{said}");
 }
 
 #[test]

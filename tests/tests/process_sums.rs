@@ -26,7 +26,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     let said = bench.stderr();
     end(&place, bench);
-    assert!(said.contains("the cells of vcan0 are a tree, "), "{said}");
+    assert!(said.contains("the cells of vcan0 are a tree of depth "), "{said}");
     let summary = place.summary();
     let sums = |key: &str| summary.of_bus(&format!("/sums/{key}"));
     let broadcasts = summary.number("/loop/broadcasts");
@@ -44,7 +44,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
         summary.0
     );
     assert!((2..=11).contains(&summary.of_bus("/network/deepest")), "{:#}", summary.0);
-    assert!(summary.figure("/buses/0/network/organised_s") >= 0.0);
+    assert!(summary.figure("/buses/0/network/tree_ready_s") >= 0.0);
     assert_eq!(summary.0["buses"][0]["network"]["differences"].as_array().unwrap().len(), 0);
     // Half a step of each cell, and what is carried.
     let errors = ["mean", "max"].map(|which| summary.figure(&format!("/accuracy/sums/{which}_nm")));

@@ -10,6 +10,7 @@
 //! | [`view`] | the state of a bus' cells that a receiver shows |
 //! | [`signals`] | signals that end a command |
 
+pub mod answers;
 pub mod cells;
 pub mod commission;
 pub mod listen;

@@ -3,16 +3,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use model::decode::Decoded;
 use model::repeat::Repeats;
 use protocol::bus::{Bus, BusError, Choice, Filter, Options};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
-use protocol::message::{Answer, Message, NetworkPage, Request, State};
+use protocol::message::{Answer, Message, Request};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::time::Span;
 use thiserror::Error;
 
+use crate::answers::Answers;
 use crate::listen::{self, Listener, send};
 use crate::setup::since;
 
@@ -78,7 +78,7 @@ pub enum SensingError {
 /// # Errors
 /// When not all of them confirm it, or the bus fails.
 pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> Result<String, SensingError> {
-    let mut answers = Answers { only, ..Answers::default() };
+    let mut answers = Answers::new(only, Some(TAG));
     let mut listener = Listener::new(bus, Some(format));
     let tell = |bus: &Bus, to| {
         let request = Request::Write { number: Parameter::Sensing.number(), words: mode.words() };
@@ -88,82 +88,50 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     let began = Instant::now();
     let mut requests = Repeats::new(AGAIN);
     requests.said_to_all(since(began));
-    while began.elapsed() < TIMEOUT && !answers.are_complete(began.elapsed() >= LISTEN) {
-        listener.hear(Duration::from_millis(20))?;
-        for (_, decoded) in listener.decoded() {
-            if let Decoded::Message(message) = decoded {
-                answers.take(&message);
-            }
-        }
+    while began.elapsed() < TIMEOUT && !are_complete(&answers, only, began.elapsed() >= LISTEN) {
+        answers.hear(&mut listener)?;
         for cell in requests.due(since(began), answers.missing()) {
             tell(listener.bus(), Node::Cell(cell))?;
         }
     }
-    answers.verdict(listener.bus().name(), format)
+    verdict(&answers, only, listener.bus().name(), format)
 }
 
-/// The cells that are there, and their answers.
-#[derive(Debug, Default)]
-struct Answers {
-    /// The one cell that is asked; else all.
+/// Whether no cell is waited for any more; while `listened` is not set, further cells may show up.
+fn are_complete(answers: &Answers, only: Option<CellId>, listened: bool) -> bool {
+    answers.missing().is_empty() && (only.is_some() || (listened && !answers.present().is_empty()))
+}
+
+/// The cells that were switched, as text; or why some were not.
+fn verdict(
+    answers: &Answers,
     only: Option<CellId>,
-    heard: BTreeSet<CellId>,
-    confirmed: BTreeSet<CellId>,
-    refused: BTreeMap<CellId, i16>,
-}
-
-impl Answers {
-    fn take(&mut self, message: &Message) {
-        let target = |cell: CellId| self.only.is_none_or(|only| only == cell);
-        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } =
-            *message
-            && target(cell)
-            && !heartbeat.state.has(State::CLAIMING)
-        {
-            self.heard.insert(cell);
-        }
-        if let Message::Configured { from, tag: TAG, answer } = *message
-            && target(from)
-        {
-            match answer {
-                Answer::Value { .. } => _ = self.confirmed.insert(from),
-                Answer::Refused { reason, .. } => _ = self.refused.insert(from, reason),
-            }
-            self.heard.insert(from);
+    bus: &str,
+    format: Format,
+) -> Result<String, SensingError> {
+    let (bus, missing) = (bus.to_owned(), answers.missing());
+    if answers.received().is_empty() {
+        let who = only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
+        return Err(SensingError::Nobody { who, bus, other: format.other().name() });
+    }
+    let (mut confirmed, mut refused) = (BTreeSet::new(), BTreeMap::new());
+    for &(cell, answer) in answers.received() {
+        match answer {
+            Answer::Value { .. } => _ = confirmed.insert(cell),
+            Answer::Refused { reason, .. } => _ = refused.insert(cell, reason),
         }
     }
-
-    /// Those that are there and have not answered, or the one that is asked.
-    fn missing(&self) -> Vec<CellId> {
-        let known = self.heard.iter().copied().chain(self.only).collect::<BTreeSet<_>>();
-        let answered = |cell: &CellId| self.confirmed.contains(cell) || self.refused.contains_key(cell);
-        known.into_iter().filter(|cell| !answered(cell)).collect()
+    if let Some((_, &reason)) = refused.first_key_value() {
+        return Err(SensingError::Refused { cells: names(refused.keys()), bus, reason });
     }
-
-    /// Whether no cell is waited for any more; while `listened` is not set, further cells may show up.
-    fn are_complete(&self, listened: bool) -> bool {
-        self.missing().is_empty() && (self.only.is_some() || (listened && !self.heard.is_empty()))
+    if !missing.is_empty() {
+        let (cells, done) = (names(missing.iter()), confirmed.len());
+        return Err(SensingError::Silent { cells, bus, done });
     }
-
-    /// The cells that were switched, as text; or why some were not.
-    fn verdict(&self, bus: &str, format: Format) -> Result<String, SensingError> {
-        let (bus, missing) = (bus.to_owned(), self.missing());
-        if self.confirmed.is_empty() && self.refused.is_empty() {
-            let who = self.only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
-            return Err(SensingError::Nobody { who, bus, other: format.other().name() });
-        }
-        if let Some((_, &reason)) = self.refused.iter().next() {
-            return Err(SensingError::Refused { cells: names(self.refused.keys()), bus, reason });
-        }
-        if !missing.is_empty() {
-            let (cells, done) = (names(missing.iter()), self.confirmed.len());
-            return Err(SensingError::Silent { cells, bus, done });
-        }
-        Ok(match self.confirmed.len() {
-            1 => names(self.confirmed.iter()),
-            count => format!("{count} cells"),
-        })
-    }
+    Ok(match confirmed.len() {
+        1 => names(confirmed.iter()),
+        count => format!("{count} cells"),
+    })
 }
 
 fn names<'a>(cells: impl Iterator<Item = &'a CellId>) -> String {
@@ -178,12 +146,12 @@ fn names<'a>(cells: impl Iterator<Item = &'a CellId>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::message::Heartbeat;
+    use protocol::message::{Heartbeat, NetworkPage};
     use protocol::packet::{Epoch, WORDS};
 
     /// The final verdict, on an FD bus.
-    fn verdict(answers: &Answers) -> Result<String, String> {
-        answers.verdict("vcan0", Format::Fd).map_err(|error| error.to_string())
+    fn says(answers: &Answers, only: Option<CellId>) -> Result<String, String> {
+        verdict(answers, only, "vcan0", Format::Fd).map_err(|error| error.to_string())
     }
 
     fn cell(node: i64) -> CellId {
@@ -202,38 +170,39 @@ mod tests {
 
     #[test]
     fn all_cells_that_send_have_to_answer() {
-        let mut answers = Answers::default();
-        assert!(!answers.are_complete(true), "no cell is there yet");
+        let mut answers = Answers::new(None, Some(TAG));
+        assert!(!are_complete(&answers, None, true), "no cell is there yet");
         for message in [beat(1), confirms(1, TAG), confirms(2, TAG), beat(3), confirms(3, TAG ^ 1)] {
             answers.take(&message);
         }
-        assert!(!answers.are_complete(true));
-        assert_eq!(answers.missing(), [cell(3)], "the answer to another sender does not count");
+        assert!(!are_complete(&answers, None, true));
+        assert_eq!(answers.missing(), [cell(3)].into(), "the answer to another sender does not count");
         let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
-        assert_eq!(verdict(&answers), Err(why.to_owned()));
+        assert_eq!(says(&answers, None), Err(why.to_owned()));
         answers.take(&confirms(3, TAG));
-        assert!(!answers.are_complete(false) && answers.are_complete(true));
-        assert_eq!(verdict(&answers), Ok("3 cells".to_owned()));
+        assert!(!are_complete(&answers, None, false) && are_complete(&answers, None, true));
+        assert_eq!(says(&answers, None), Ok("3 cells".to_owned()));
     }
 
     #[test]
     fn one_cell_is_requested_and_waited_for_alone() {
-        let mut answers = Answers { only: Some(cell(7)), ..Answers::default() };
+        let only = Some(cell(7));
+        let mut answers = Answers::new(only, Some(TAG));
         answers.take(&confirms(1, TAG));
-        assert_eq!(answers.missing(), [cell(7)]);
+        assert_eq!(answers.missing(), [cell(7)].into());
         let why = "no cell 7 answers on vcan0: start it, or name the bus' format with --format classic";
-        assert_eq!(verdict(&answers), Err(why.to_owned()));
+        assert_eq!(says(&answers, only), Err(why.to_owned()));
         answers.take(&confirms(7, TAG));
-        assert!(answers.are_complete(false));
-        assert_eq!(verdict(&answers), Ok("cell 7".to_owned()));
+        assert!(are_complete(&answers, only, false));
+        assert_eq!(says(&answers, only), Ok("cell 7".to_owned()));
     }
 
     #[test]
     fn a_cell_that_refuses_is_named() {
-        let mut answers = Answers::default();
+        let mut answers = Answers::new(None, Some(TAG));
         let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
         answers.take(&Message::Configured { from: cell(9), tag: TAG, answer });
         let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
-        assert_eq!(verdict(&answers), Err(why.to_owned()));
+        assert_eq!(says(&answers, None), Err(why.to_owned()));
     }
 }

@@ -187,7 +187,7 @@ impl Place {
 }
 
 /// Algorithm 1. Every word, sum and product is exact in `f64`.
-fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
+pub(crate) fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
     let above = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
     let touch = sensors.contact.iter().map(|word| word.to_f64()).sum();
     let touch = above(touch, contact.contact_threshold.to_f64());

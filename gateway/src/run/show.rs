@@ -145,9 +145,14 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     rows.row("replies due", replies.due, complete);
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
-    let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, why.replace('_', " ")));
+    let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
     rows.row("  missing", missing, explained(&reasons, replies.unknown));
     rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+}
+
+/// A key of the summary in words.
+fn spoken(key: &str) -> String {
+    key.replace('_', " ")
 }
 
 /// How many there are of each kind.
@@ -177,7 +182,7 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     for cell in worst.iter().take(CELLS) {
         let CellSummary { due, in_time, late, restarts, .. } = **cell;
         let late = (late > 0).then(|| format!("{late} late"));
-        let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", why.replace('_', " ")));
+        let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", spoken(why)));
         let restarts = (restarts > 0).then(|| count(restarts, "restart"));
         let error =
             cell.error.mean().filter(|_| is_off(cell)).map(|mean| format!("mean error {mean:.1e} Nm"));

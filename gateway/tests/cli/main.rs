@@ -318,6 +318,20 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     assert!(said.ends_with("has no such cell on vcan0, vcan1; --cells lists all"), "{said}");
 }
 
+#[test]
+fn a_check_shows_bit_rates_and_cells_at_one_place() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("skin.toml");
+    let text = output(gateway("skin generate --cells 3 --buses 2"));
+    let text = text.replacen("format = \"fd\"", "format = \"fd\"\nbitrate = 500000", 1);
+    let last = &text[text.rfind("[[cell]]").unwrap()..];
+    let another = last.replace("node = 1", "node = 7").replace("serial = 200001", "serial = 200007");
+    std::fs::write(&file, format!("{text}\n{another}")).unwrap();
+    let shown = output(gateway(&format!("skin check {}", file.display())));
+    assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
+    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at one place"), "{shown}");
+}
+
 /// A scenario's file beside a skin of three cells, and what is said of it.
 fn checked(scenario: &str, options: &str) -> Output {
     let directory = TempDir::new().unwrap();
@@ -363,7 +377,8 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
     let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
     assert_eq!(wrong, "gateway: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
-    assert!(said(drop).starts_with("gateway: the scenario has a fault of a bus"), "a run would refuse it");
+    let refused = said(drop);
+    assert!(refused.starts_with("gateway: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");
 }
 
 #[test]

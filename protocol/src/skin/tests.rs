@@ -267,9 +267,19 @@ fn a_broken_file_says_where_in_one_line() {
     let error = says("version = 1", "version = = 1");
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
     let error = says("joint = 2", "joint = \"two\"");
-    assert_eq!(error, "skin.toml:33: invalid type: string \"two\", expected i64");
+    assert_eq!(error, "skin.toml:33: cell[0].joint = \"two\": a whole number is needed");
+    for (from, to, said) in [
+        ("joint = 2\n", "", "skin.toml:30: cell[0]: key `joint` is missing"),
+        ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
+        ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
+        ("[[bus]]", "[bus]", "bus: it is a list of tables: write [[bus]]"),
+        ("alpha_c = 1.0", "alpha_c = pi/2", "; a number has neither unit nor formula, as 5000000 or 1.5708"),
+    ] {
+        let got = says(from, to);
+        assert!(got.ends_with(said) && got.lines().count() == 1, "{got}");
+    }
     let error = Skin::parse("skin.toml", "name = \"nobody\"\n").unwrap_err().to_string();
-    assert_eq!(error, "skin.toml:1:1: missing field `robot`");
+    assert_eq!(error, "skin.toml:1:1: key `robot` is missing");
     let error =
         Skin::parse("skin.toml", &GOOD.replacen("[1.0, 1.0]", "[1.0, 0.0]", 1)).unwrap_err().to_string();
     assert_eq!(error, "skin.toml:26:17: controller.inertia[1] = 0: must be above 0");

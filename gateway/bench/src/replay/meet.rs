@@ -1,4 +1,4 @@
-//! Before anything is sent: the cells are there, organised, and as they have to be.
+//! Before anything is sent: the cells are there, their tree is complete, and they are as they have to be.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

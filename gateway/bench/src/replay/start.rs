@@ -178,7 +178,7 @@ pub(super) fn open(
         let spawned_skin = spawned_skin.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
         let receive_filter = spawned_skin
             .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::of(skin, bus, true).filters);
-        let selected = BusOptions {
+        let bus_options = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
             filters: if options.hears() { receive_filter } else { Vec::new() },
             receive_buffer: options.receive_buffer,
@@ -186,8 +186,10 @@ pub(super) fn open(
             ..BusOptions::default()
         };
         let (bus, of_ours) = match skin_override {
-            Some(_) => open_or_serve(name, options.kinds.of(name), &selected, options.vcan_setup.as_deref())?,
-            None => (Bus::open(name, options.kinds.of(name), &selected)?, None),
+            Some(_) => {
+                open_or_serve(name, options.kinds.of(name), &bus_options, options.vcan_setup.as_deref())?
+            }
+            None => (Bus::open(name, options.kinds.of(name), &bus_options)?, None),
         };
         // On a real bus the wires are real.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);

@@ -4,8 +4,11 @@ use std::error::Error;
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
+use model::scenario::{FaultKind, Scenario};
 use protocol::bus::{BusError, BusKind};
 use protocol::document::DocumentError;
+use protocol::skin::Skin;
+use protocol::time::Span;
 use thiserror::Error;
 
 use super::launch::LaunchError;
@@ -44,10 +47,17 @@ pub enum RunError {
     NoFlash(PathBuf),
     /// A scenario requests what only a simulated bus can do.
     #[error(
-        "the scenario has a fault of a bus, which a run with processes cannot make; kill, stop, continue, restart, \
+        "the fault {kind:?} of {bus} at {at_s} s: a run with processes cannot make it; kill, stop, continue, restart, \
          link_down, link_up, stuck and drift it can"
     )]
-    BusFault,
+    BusFault {
+        /// Its kind in the file.
+        kind: &'static str,
+        /// The bus.
+        bus: String,
+        /// When, in s.
+        at_s: f64,
+    },
     /// Simulated wires must not be used on a real bus.
     #[error(
         "{0} is real hardware, and the wires between cells that answer with sums are simulated by frames that may not \
@@ -140,6 +150,19 @@ pub enum RunError {
 }
 
 impl RunError {
+    /// The first fault of a bus in a scenario, if there is one.
+    #[must_use]
+    pub fn bus_fault(scenario: &Scenario, skin: &Skin) -> Option<Self> {
+        scenario.faults.iter().find_map(|fault| match &fault.kind {
+            FaultKind::Bus { bus, .. } => Some(Self::BusFault {
+                kind: fault.kind.name(),
+                bus: skin.buses.get(*bus)?.name.clone(),
+                at_s: Span(fault.at.0).seconds(),
+            }),
+            FaultKind::Process { .. } | FaultKind::Sensor { .. } | FaultKind::Wire { .. } => None,
+        })
+    }
+
     /// 2 for wrong use or configuration, 1 for a run that failed.
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
@@ -151,7 +174,7 @@ impl RunError {
             | Self::Controller(_)
             | Self::TooDeep(_)
             | Self::NoFlash(_)
-            | Self::BusFault
+            | Self::BusFault { .. }
             | Self::RealWires(_) => 2,
             Self::Signal(_)
             | Self::Interrupted

@@ -9,6 +9,7 @@ use protocol::time::Span;
 use super::halts::Halts;
 use control::cycle::turn::Timed;
 use model::quantiles::{Quantiles, histogram};
+use model::scenario::Mode;
 
 /// The sums of the loop's records.
 #[derive(Debug)]
@@ -78,7 +79,7 @@ impl Measured {
     ) -> String {
         let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
         let (seconds, of) = (elapsed.as_secs_f64(), duration.seconds());
-        let mode = if comparing { "compare" } else { "distributed" };
+        let mode = if comparing { Mode::Compare } else { Mode::Distributed }.name();
         let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
         let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
         let halted = self.halts.why().map(|why| format!("  HALTED: {why}")).unwrap_or_default();

@@ -30,7 +30,6 @@ use control::cycle::turn::{Line, Shared, Timed};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::quantiles::Quantiles;
-use model::scenario::FaultKind;
 use model::table::Table;
 use trace::recording::layout::Layout;
 use trace::recording::series::Head;
@@ -108,8 +107,8 @@ fn refuse(options: &Options) -> Result<(), RunError> {
     if let Some(flash) = options.flash.as_ref().filter(|flash| !flash.is_dir()) {
         return Err(RunError::NoFlash(flash.clone()));
     }
-    if options.scenario.faults.iter().any(|fault| matches!(fault.kind, FaultKind::Bus { .. })) {
-        return Err(RunError::BusFault);
+    if let Some(error) = RunError::bus_fault(&options.scenario, &options.skin) {
+        return Err(error);
     }
     let buses = options.skin.buses.len();
     let clients =

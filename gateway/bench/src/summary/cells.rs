@@ -17,7 +17,7 @@ pub struct RepliesSummary {
     pub late: u64,
     /// Dropped, because they came when their epoch was long over.
     pub too_late: u64,
-    /// Skipped by the cell, because the joints were older than a period when it got to them.
+    /// Skipped by the cell, because the joints were older than a period when it took them.
     pub skipped: u64,
     /// Not heard by the cell.
     pub not_heard: u64,
@@ -25,14 +25,14 @@ pub struct RepliesSummary {
     pub lost: u64,
     /// Of cells that were dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
-    /// Missing, and nobody knows why.
+    /// Missing, for no known reason.
     pub unknown: u64,
-    /// Torques that nobody waited for: ends of contacts, and cells whose sensors are unknown.
+    /// Torques that were not due: ends of contacts, and of cells whose sensors are unknown.
     pub unasked: u64,
 }
 
 impl RepliesSummary {
-    /// Adds a cell's, and finds for its missing ones what is known to have become of them.
+    /// Adds those of a cell, and explains its missing ones as far as reasons are known.
     pub(super) fn add(&mut self, cell: &Cell) {
         let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
         let mut rest = missing.saturating_sub(in_doubt);
@@ -54,7 +54,7 @@ impl RepliesSummary {
         self.unasked += unasked;
     }
 
-    /// The missing ones by reason, those that nobody can explain last.
+    /// The missing ones by reason, those without a known reason last.
     #[must_use]
     pub const fn missing(&self) -> [(&'static str, u64); 6] {
         [

@@ -95,11 +95,9 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     {
         // Written so that NaN is refused too.
         if !(start - reach >= *min && start + reach <= *max) {
-            let why = format!(
-                "joint {} may go from {min} to {max}, and comes as far as {reach} from its start",
-                index + 1
-            );
-            return Err(at.key("start_rad").nth(index).fault(start, why));
+            let swings = if reach > 0.0 { format!(", and it swings by {reach} rad") } else { String::new() };
+            let why = format!("joint {} may go from {min:.4} to {max:.4} rad{swings}", index + 1);
+            return Err(at.key("start_rad").nth(index).fault(format_args!("{start} rad"), why));
         }
     }
     Ok(Motion { start_rad, kind })
@@ -128,7 +126,7 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
         if modes.last().is_some_and(|last| last.at >= at) {
             return Err(path.key("at_s").fault(raw.at_s, "modes come in the order of time"));
         }
-        let kinds = [("compare", Mode::Compare), ("distributed", Mode::Distributed)];
+        let kinds = [Mode::Compare, Mode::Distributed].map(|mode| (mode.name(), mode));
         modes.push(ModeChange { at, mode: path.key("kind").word(&raw.kind, &kinds)? });
     }
     Ok(modes)

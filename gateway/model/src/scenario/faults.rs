@@ -6,7 +6,7 @@ use protocol::time::Span;
 use super::check::{Checked, EndS, Names, length};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
-const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
+pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
      \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// The faults, in the order of time.

@@ -7,6 +7,7 @@
 mod check;
 mod faults;
 mod raw;
+mod remarks;
 mod touches;
 
 use std::path::Path;
@@ -64,6 +65,18 @@ pub enum MotionKind {
     Kinesthetic,
 }
 
+impl MotionKind {
+    /// The word in the file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Hold => "hold",
+            Self::Sine { .. } => "sine",
+            Self::Kinesthetic => "kinesthetic",
+        }
+    }
+}
+
 /// From when on the gateway computes what.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ModeChange {
@@ -81,6 +94,17 @@ pub enum Mode {
     Compare,
     /// `distributed`: it takes the cells' torques.
     Distributed,
+}
+
+impl Mode {
+    /// The word in the file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Compare => "compare",
+            Self::Distributed => "distributed",
+        }
+    }
 }
 
 /// Something touches some cells.
@@ -175,6 +199,29 @@ pub enum FaultKind {
         /// Only frames of these cells; empty means all frames.
         cells: Vec<usize>,
     },
+}
+
+impl FaultKind {
+    /// The word in the file.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Process { action: ProcessAction::Kill, .. } => "kill",
+            Self::Process { action: ProcessAction::Stop, .. } => "stop",
+            Self::Process { action: ProcessAction::Continue, .. } => "continue",
+            Self::Process { action: ProcessAction::Restart, .. } => "restart",
+            Self::Wire { link_down: true, .. } => "link_down",
+            Self::Wire { link_down: false, .. } => "link_up",
+            Self::Sensor { fault: SensorFault::Stuck, .. } => "stuck",
+            Self::Sensor { fault: SensorFault::Drift { .. }, .. } => "drift",
+            Self::Bus { fault: BusFault::Drop { .. }, .. } => "drop",
+            Self::Bus { fault: BusFault::Delay { .. }, .. } => "delay",
+            Self::Bus { fault: BusFault::Duplicate { .. }, .. } => "duplicate",
+            Self::Bus { fault: BusFault::Corrupt { .. }, .. } => "corrupt",
+            Self::Bus { fault: BusFault::Reorder { .. }, .. } => "reorder",
+            Self::Bus { fault: BusFault::Babble { .. }, .. } => "babble",
+        }
+    }
 }
 
 /// What is done to a process.

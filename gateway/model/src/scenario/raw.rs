@@ -3,7 +3,7 @@
 use serde::Deserialize;
 
 use super::check::LONGEST_S;
-use super::{IDLE, Profile};
+use super::{IDLE, MotionKind, Profile};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -55,7 +55,12 @@ pub(super) struct Motion {
 
 impl Default for Motion {
     fn default() -> Self {
-        Self { kind: "kinesthetic".to_owned(), start_rad: None, amplitude_rad: None, period_s: None }
+        Self {
+            kind: MotionKind::Kinesthetic.name().to_owned(),
+            start_rad: None,
+            amplitude_rad: None,
+            period_s: None,
+        }
     }
 }
 

@@ -112,6 +112,65 @@ fn most_keys_have_defaults() {
 }
 
 #[test]
+fn every_kind_of_fault_and_motion_is_named_as_it_is_read() {
+    let skin = three();
+    let faults = [
+        ("kill", ""),
+        ("stop", ""),
+        ("continue", ""),
+        ("restart", ""),
+        ("stuck", ""),
+        ("drift", "n_per_s = -0.5"),
+        ("drop", "probability = 0.5"),
+        ("delay", "probability = 0.5\ndelay_us = 20"),
+        ("duplicate", "probability = 0.5"),
+        ("corrupt", "probability = 0.5"),
+        ("reorder", "probability = 0.5"),
+        ("babble", "frames_per_s = 10"),
+    ];
+    for (kind, more) in faults {
+        let text = format!("version = 1\n[[fault]]\nat_s = 0.5\nkind = \"{kind}\"\ncells = [1]\n{more}\n");
+        let scenario = Scenario::parse("s.toml", &text, &skin).unwrap();
+        assert_eq!(scenario.faults.first().map(|fault| fault.kind.name()), Some(kind));
+        assert!(faults::KINDS.contains(&format!("{kind:?}")), "{kind}");
+    }
+    for motion in [
+        "kind = \"hold\"",
+        "kind = \"kinesthetic\"",
+        "kind = \"sine\"\namplitude_rad = [0.0, 0.1, 0.0, 0.0, 0.0, 0.0]\nperiod_s = 4.0",
+    ] {
+        let scenario =
+            Scenario::parse("s.toml", &format!("version = 1\n[motion]\n{motion}\n"), &skin).unwrap();
+        assert!(motion.contains(&format!("{:?}", scenario.motion.kind.name())), "{motion}");
+    }
+}
+
+#[test]
+fn what_has_no_effect_is_remarked() {
+    let skin = three();
+    let remarks = |text: &str, skin: &Skin| {
+        Scenario::parse("s.toml", &format!("version = 1\n{text}"), skin).unwrap().remarks(skin)
+    };
+    let touch = |force: &str| format!("[[touch]]\nat_s = 0.5\ncells = [1, 2]\nforce_n = {force}\n");
+    assert!(remarks(&touch("3.0"), &skin).is_empty());
+    assert!(remarks(&touch("0.0\nproximity = 0.5"), &skin).is_empty(), "it presses nobody");
+    assert_eq!(
+        remarks(&touch("0.01"), &skin),
+        ["the touch at 0.5 s: force_n = 0.01 is below the thresholds of its cells: they send no torque"]
+    );
+    let external = SKIN.replace("\"kinesthetic\"", "\"external\"\nsocket = \"arm.sock\"");
+    let external =
+        external.lines().filter(|line| !line.starts_with("inertia") && !line.starts_with("damping"));
+    let external = Skin::parse("skin.toml", &external.collect::<Vec<_>>().join("\n")).unwrap();
+    assert!(remarks("", &external).is_empty());
+    let said = remarks("[motion]\nkind = \"hold\"\n", &external);
+    assert!(
+        said[0].starts_with("motion.kind = \"hold\": the scenario moves the robot, and the external"),
+        "{said:?}"
+    );
+}
+
+#[test]
 fn what_comes_and_goes_needs_a_length_and_a_skin_is_no_scenario() {
     let said = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap_err().to_string();
     let endless = "[[touch]]\nall = true\nforce_n = 3.0\nprofile = \"half-sine\"\n";
@@ -137,8 +196,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("start_rad = [0.0", "start_rad = [6.0"),
-        "s.toml:7: motion.start_rad[0] = 6: joint 1 may go from -6.283185307179586 to \
-         6.283185307179586, and comes as far as 0.5 from its start"
+        "s.toml:7: motion.start_rad[0] = 6 rad: joint 1 may go from -6.2832 to 6.2832 rad, and it swings by 0.5 rad"
     );
     assert_eq!(
         says("[0.5, 0.1", "[1.5, 0.1"),

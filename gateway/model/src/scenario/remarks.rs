@@ -1,0 +1,48 @@
+//! What is allowed in a scenario and probably not meant.
+
+use protocol::message::SkinSensors;
+use protocol::skin::{ControllerKind, Skin};
+use protocol::time::Span;
+
+use super::{MotionKind, Scenario, Touch, contact_words};
+use crate::central::force;
+
+impl Scenario {
+    /// What will have no effect, one line each.
+    #[must_use]
+    pub fn remarks(&self, skin: &Skin) -> Vec<String> {
+        let controller = unused_controller(self.motion.kind, skin);
+        let touches = self.touches.iter().filter_map(|touch| weak(touch, skin));
+        controller.into_iter().chain(touches).collect()
+    }
+}
+
+fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
+    let ControllerKind::External { socket } = &skin.controller.kind else { return None };
+    let unused = !matches!(motion, MotionKind::Kinesthetic);
+    unused.then(|| {
+        format!(
+            "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not asked; \
+             with \"kinesthetic\" it moves it",
+            motion.name()
+        )
+    })
+}
+
+/// A touch that presses, and of whose cells none computes a force.
+fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
+    let sensors = SkinSensors {
+        contact: contact_words(touch.force_n),
+        proximity: touch.proximity,
+        temperature: touch.temperature.unwrap_or_default(),
+    };
+    let mut cells = touch.cells.iter().filter_map(|&cell| skin.cells.get(cell));
+    let in_vain = touch.force_n > 0.0 && cells.all(|cell| force(&cell.contact, &sensors) <= 0.0);
+    in_vain.then(|| {
+        let at_s = Span(touch.at.0).seconds();
+        format!(
+            "the touch at {at_s} s: force_n = {} is below the thresholds of its cells: they send no torque",
+            touch.force_n
+        )
+    })
+}

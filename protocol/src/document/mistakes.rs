@@ -1,0 +1,86 @@
+//! What the parser of TOML says is wrong, in the words of the file: which key, its value, and what is allowed.
+
+use core::ops::Range;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+/// The most characters of a value that are quoted.
+const QUOTED: usize = 40;
+
+/// The parser's message about what stands at these bytes.
+pub(super) fn explained(text: &str, at: Range<usize>, message: &str) -> String {
+    let found = DeTable::parse(text).ok().and_then(|root| find(root.get_ref(), at.start));
+    if let Some(field) = message.strip_prefix("missing field ") {
+        // A key that is missing in the file itself has no table.
+        let table = found.filter(|found| found.value == at).map(|found| format!("{}: ", found.path));
+        return format!("{}key {field} is missing", table.unwrap_or_default());
+    }
+    let Some(Found { path, value }) = found else { return unparsed(message) };
+    let value = text.get(value).unwrap_or_default().lines().next().unwrap_or_default();
+    let quoted = value.chars().take(QUOTED).collect::<String>();
+    let Some(allowed) = allowed(&path, message) else { return message.to_owned() };
+    match quoted.starts_with('[') && allowed.contains("[[") {
+        true => format!("{path}: {allowed}"),
+        false => format!("{path} = {quoted}: {allowed}"),
+    }
+}
+
+/// What a value of the right type is.
+fn allowed(path: &str, message: &str) -> Option<String> {
+    if let Some((got, target)) = message
+        .strip_prefix("invalid length ")
+        .and_then(|rest| rest.split_once(", expected an array of length "))
+    {
+        return Some(format!("{target} values are needed, not {got}"));
+    }
+    let (got, expected) = message.strip_prefix("invalid type: ")?.split_once(", expected ")?;
+    Some(match expected {
+        "a sequence" if got == "map" => format!("it is a list of tables: write [[{path}]]"),
+        "f64" => "a number is needed".to_owned(),
+        "i64" | "u64" | "u32" | "u8" => "a whole number is needed".to_owned(),
+        "a string" => "text in quotes is needed".to_owned(),
+        "a boolean" => "true or false is needed".to_owned(),
+        list if list == "a sequence" || list.starts_with("an array") || list.starts_with("a tuple") => {
+            "a list of values in brackets is needed".to_owned()
+        }
+        _ => return None,
+    })
+}
+
+/// What is no TOML at all; the parser's advice fits texts only.
+fn unparsed(message: &str) -> String {
+    let more = if message.starts_with("string values must be quoted") {
+        "; a number has neither unit nor formula, as 5000000 or 1.5708"
+    } else if message.starts_with("duplicate key") {
+        "; of several buses, cells, touches or faults each begins with [[bus]], [[cell]], [[touch]] or [[fault]]"
+    } else {
+        ""
+    };
+    format!("{message}{more}")
+}
+
+/// A value and where it stands.
+struct Found {
+    path: String,
+    value: Range<usize>,
+}
+
+/// The innermost value of a table at this byte.
+fn find(table: &DeTable<'_>, at: usize) -> Option<Found> {
+    table.iter().find_map(|(key, value)| within(key.get_ref(), value, at))
+}
+
+fn within(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<Found> {
+    let inner = match value.get_ref() {
+        DeValue::Table(table) => {
+            find(table, at).map(|found| Found { path: format!("{path}.{}", found.path), ..found })
+        }
+        DeValue::Array(values) => values
+            .iter()
+            .enumerate()
+            .find_map(|(index, value)| within(&format!("{path}[{index}]"), value, at)),
+        _ => None,
+    };
+    inner.or_else(|| value.span().contains(&at).then(|| Found { path: path.to_owned(), value: value.span() }))
+}
