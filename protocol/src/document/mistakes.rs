@@ -80,7 +80,11 @@ fn within(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<Found> 
             .iter()
             .enumerate()
             .find_map(|(index, value)| within(&format!("{path}[{index}]"), value, at)),
-        _ => None,
+        DeValue::String(_)
+        | DeValue::Integer(_)
+        | DeValue::Float(_)
+        | DeValue::Boolean(_)
+        | DeValue::Datetime(_) => None,
     };
     inner.or_else(|| value.span().contains(&at).then(|| Found { path: path.to_owned(), value: value.span() }))
 }

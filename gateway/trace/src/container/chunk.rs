@@ -1,8 +1,9 @@
 //! A chunk: unpacked, checked, and then its records.
 
 use std::fmt;
-use std::io::Read;
+use std::io::{self, Read};
 
+use lz4_flex::frame::FrameDecoder;
 use zstd::zstd_safe::{self, DCtx, ErrorCode, get_error_name};
 
 use super::field::Fields;
@@ -149,13 +150,13 @@ impl Chunk {
     }
 
     fn unpack_lz4(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
-        let wrong = |error: std::io::Error| Damage::Unpack(error.to_string());
+        let wrong = |error: io::Error| Damage::Unpack(error.to_string());
         while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
             let before = (packed.len(), self.bytes.len());
-            let mut decoder = lz4::Decoder::new(packed).map_err(wrong)?;
+            let mut decoder = FrameDecoder::new(packed);
             let leftover = claimed - self.bytes.len() as u64;
             (&mut decoder).take(leftover).read_to_end(&mut self.bytes).map_err(wrong)?;
-            packed = decoder.finish().0;
+            packed = decoder.into_inner();
             if before == (packed.len(), self.bytes.len()) {
                 break;
             }
@@ -198,6 +199,12 @@ mod tests {
         [&[5][..], &claimed.to_le_bytes(), body].concat()
     }
 
+    fn lz4(bytes: &[u8]) -> Vec<u8> {
+        let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
+        io::Write::write_all(&mut encoder, bytes).unwrap();
+        encoder.finish().unwrap()
+    }
+
     fn unpacked(record: &[u8]) -> Result<Vec<(u8, Vec<u8>)>, Damage> {
         let mut chunk = Chunk::default();
         chunk.unpack(record, 1_000)?;
@@ -213,9 +220,10 @@ mod tests {
         // In two frames, and with something behind them.
         let (first, second) = two.split_at(7);
         let frames = [first, second].map(|part| zstd::bulk::compress(part, 1).unwrap()).concat();
+        let lz4 = [first, second].map(lz4).concat();
         let expected = Ok(vec![(5, b"abc".to_vec()), (5, Vec::new())]);
         for (compression, packed) in
-            [("", two.clone()), ("zstd", zstd), ("zstd", [&frames[..], b"more"].concat())]
+            [("", two.clone()), ("zstd", zstd), ("zstd", [&frames[..], b"more"].concat()), ("lz4", lz4)]
         {
             assert_eq!(unpacked(&chunk(length, checksum, compression, &packed)), expected);
             assert_eq!(unpacked(&chunk(length, 0, compression, &packed)), expected, "no checksum");
@@ -236,9 +244,21 @@ mod tests {
         assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(Damage::Unpack(_))));
         assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(Damage::Unpack(_))));
         assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(Damage::Compression("br".to_owned())));
-        let whole = chunk(12, 0, "zstd", &zstd::bulk::compress(&one, 1).unwrap());
-        for end in 0..whole.len() {
-            assert!(unpacked(&whole[..end]).is_err(), "{end}");
+        // Behind the last byte of an LZ4 block come four that end its frame, and that no chunk needs.
+        for (compression, packed, spare) in
+            [("zstd", zstd::bulk::compress(&one, 1).unwrap(), 0), ("lz4", lz4(&one), 4)]
+        {
+            let whole = chunk(12, 0, compression, &packed);
+            let length = 32 + compression.len();
+            for end in 0..whole.len() - spare {
+                let mut cut = whole[..end].to_vec();
+                assert!(unpacked(&cut).is_err(), "{compression} {end}");
+                // The same, with the length of what is left.
+                if let Some((bytes, left)) = cut.split_at_mut_checked(length + 8) {
+                    bytes[length..].copy_from_slice(&(left.len() as u64).to_le_bytes());
+                }
+                assert!(unpacked(&cut).is_err(), "{compression} {end}");
+            }
         }
     }
 
