@@ -113,7 +113,7 @@ fn wrong_use_is_said_in_one_line() {
             "\".x\" is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0",
         ),
         ("up nosuch.toml", "nosuch.toml: No such file or directory (os error 2)"),
-        ("status ./broken.toml", "./broken.toml:1:1: missing field `robot`"),
+        ("status ./broken.toml", "./broken.toml:1:1: key `robot` is missing"),
         ("doctor rates.toml", "rates.toml:36:11: bus[0].bitrate = 5: 10000 to 1000000 bit/s are possible"),
         (
             "doctor --bus-kind vcan",
